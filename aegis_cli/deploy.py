@@ -21,6 +21,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
+from aegis_cli.data.lerobot import layout
 from aegis_cli.evaluation.rollout import Acting, load_run
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import is_robot_stream_run
@@ -36,27 +37,38 @@ class DeployedPolicy:
         task: the task that it was trained on; None for a dataset of no simulated task.
         cameras: names of the pictures that it takes, in their order; empty for a single picture
             without a name.
+        sizes: (height, width) of the pictures that it was trained on, one a camera; empty where
+            that is not known, or the backbone reads squares of `image_size`.
         positions, actions: P and A, how many numbers each of them has.
         chunk: how many actions are predicted at once, of which `replan` are executed.
     """
 
     def __init__(
-        self, policy: Policy, task: str | None, cameras: Sequence[str], replan: int, seed: int = 0
+        self,
+        policy: Policy,
+        task: str | None,
+        cameras: Sequence[str],
+        replan: int,
+        seed: int = 0,
+        sizes: Sequence[tuple[int, int]] = (),
     ) -> None:
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self.replan, self._seed = task, tuple(cameras), replan, seed
+        self.sizes = tuple(sizes)
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
         self.chunk = policy.expert.shape.chunk
         self.reset()
 
     @property
     def image_size(self) -> int | None:
-        """The side in pixels that pictures are fitted to; None: the backbone takes any size."""
+        """The side in pixels of the squares that the backbone reads; None: it reads any size."""
         return self._policy.backbone.image_size
 
     def begin(self) -> DeployedPolicy:
         """The same policy at the beginning of an episode of its own; the weights are shared."""
-        return DeployedPolicy(self._policy, self.task, self.cameras, self.replan, self._seed)
+        return DeployedPolicy(
+            self._policy, self.task, self.cameras, self.replan, self._seed, self.sizes
+        )
 
     def reset(self) -> None:
         """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
@@ -84,8 +96,9 @@ class DeployedPolicy:
         """The next actions [H, A] float32.
 
         Args:
-            pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the backbone as in
-                training; one picture, or a mapping of several cameras' names to theirs.
+            pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the size that the
+                backbone was trained on; one picture, or a mapping of the cameras' names to theirs,
+                with or without LeRobot's `observation.images.` before them.
             instruction: a text in words that the backbone knows.
             positions: proprioception [P], in the demonstrations' order.
 
@@ -94,7 +107,7 @@ class DeployedPolicy:
                 does not know.
         """
         shown, given = self._checked(pictures, instruction, positions)
-        frames = [torch.from_numpy(self._fitted(picture)) for picture in shown]
+        frames = [torch.from_numpy(self._fitted(p, camera)) for camera, p in enumerate(shown)]
         images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
         proprio = torch.from_numpy(given)[None]
         return self._policy.act(images, [instruction], proprio, self._generator)[0].cpu().numpy()
@@ -125,14 +138,16 @@ class DeployedPolicy:
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
         """The pictures in the order in which the backbone takes them."""
         if isinstance(pictures, Mapping):
-            if set(pictures) != set(self.cameras):
+            named = {layout.short(name): picture for name, picture in pictures.items()}
+            names = [layout.short(name) for name in self.cameras]
+            if len(named) != len(pictures) or set(named) != set(names):
                 expected = ", ".join(self.cameras) or "one picture without a name"
                 raise AegisError(
                     f"pictures of {', '.join(pictures) or 'no camera'}",
                     expected,
                     "name them as training did",
                 )
-            return [pictures[name] for name in self.cameras]
+            return [named[name] for name in names]
         if len(self.cameras) > 1:
             expected = f"{{name: picture}} with {', '.join(self.cameras)}"
             raise AegisError(
@@ -142,9 +157,12 @@ class DeployedPolicy:
             )
         return [pictures]
 
-    def _fitted(self, picture: np.ndarray) -> np.ndarray:
-        size = self.image_size
-        return np.ascontiguousarray(picture if size is None else fit(picture, size, size))
+    def _fitted(self, picture: np.ndarray, camera: int) -> np.ndarray:
+        """The picture of the camera of that number in the size that training showed."""
+        side = self.image_size
+        if side is not None:
+            return np.ascontiguousarray(fit(picture, side, side))
+        return np.ascontiguousarray(fit(picture, *self.sizes[camera]) if self.sizes else picture)
 
 
 def _picture(given: np.ndarray) -> np.ndarray:
@@ -182,7 +200,12 @@ def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> Depl
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
         raise AegisError(said, "its own", "leave out the task")
     return DeployedPolicy(
-        policy.to(devices.pick()), meta["task"], meta.get("cameras", ()), meta["replan"], seed
+        policy.to(devices.pick()),
+        meta["task"],
+        meta.get("cameras", ()),
+        meta["replan"],
+        seed,
+        checkpoint.sizes_of(meta),
     )
 
 

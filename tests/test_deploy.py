@@ -116,6 +116,31 @@ def test_pictures_of_several_cameras_come_in_the_order_of_training() -> None:
     np.testing.assert_array_equal(wrist, frame(1))
 
 
+@pytest.mark.parametrize("name", ["wrist", "observation.images.wrist"])
+@pytest.mark.parametrize("given", ["wrist", "observation.images.wrist", None])
+def test_the_picture_of_a_single_camera_may_have_its_name(name: str, given: str | None) -> None:
+    policy = Cameras()
+    own = DeployedPolicy(policy, None, (name,), 1)  # type: ignore[arg-type]
+    own.select_action(frame(1) if given is None else {given: frame(1)}, TEXT, POSITIONS)
+    np.testing.assert_array_equal(policy.seen[0][0], frame(1))
+
+
+def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
+    """Each camera has its own, also in a further episode; unknown ones are shown as they are."""
+    policy = Cameras()
+    policy.backbone.image_size = None
+    sizes = ((40, 60), (30, 30))
+    pictures = {name: np.zeros((90, 70, 3), np.uint8) for name in ("top", "wrist")}
+    own = DeployedPolicy(policy, None, ("top", "wrist"), 1, sizes=sizes)  # type: ignore[arg-type]
+    for each in (own, own.begin()):
+        each.select_action(pictures, TEXT, POSITIONS)
+        ((top, wrist),) = policy.seen.pop()
+        assert (top.shape[:2], wrist.shape[:2]) == sizes
+    unknown = DeployedPolicy(policy, None, (), 1)  # type: ignore[arg-type]
+    unknown.select_action(pictures["top"], TEXT, POSITIONS)
+    assert policy.seen[0].shape[1:3] == (90, 70)
+
+
 @pytest.mark.parametrize(
     ("cameras", "pictures", "positions", "told"),
     [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data import demonstrations
+from aegis_cli.data.selection import ALL, Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.models import backbones
@@ -71,8 +72,7 @@ def run(
     out: Path,
     on_event: OnEvent = ignore,
     demos: Path | None = None,
-    camera: demonstrations.Cameras = None,
-    only: str | None = None,
+    selection: Selection = ALL,
 ) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
@@ -82,8 +82,7 @@ def run(
     Args:
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
-        camera: one or several of a LeRobot folder's.
-        only: episodes of `demos`, as the recipes' key `demos.only` names them; None: all.
+        selection: which of their frames; nothing but pictures and instructions is read.
 
     Where torchrun has started several processes, each calls this, and they share the passes.
 
@@ -92,8 +91,8 @@ def run(
     """
     with joined() as ranks:
         if settings.source == "demos":
-            shown = (demos, camera, only)
-            measured = _on_frames(backbone, settings, Path(out), shown, on_event, ranks)
+            shown = replace(selection, state=(), action=())
+            measured = _on_frames(backbone, settings, Path(out), demos, shown, on_event, ranks)
         else:
             measured = _on_questions(backbone, settings, Path(out), on_event, ranks)
         _warn_of_sure_answers(measured.entropy, settings.temperature, on_event)
@@ -193,19 +192,19 @@ def _on_frames(
     backbone: str,
     settings: Settings,
     out: Path,
-    shown: tuple[Path | None, demonstrations.Cameras, str | None],
+    demos: Path | None,
+    selection: Selection,
     on_event: OnEvent,
     ranks: Ranks,
 ) -> _Measured:
     """The moments of frames of episodes, drawn without repetition, with their instructions."""
-    demos, camera, only = shown
     demos = _check_frames(settings, demos)
     files.check_writable(out)
     files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
     # None: all episodes are held out from training, so that all their frames are in `validation`.
     found = demonstrations.load(
-        demos, None, 0, camera, model.image_size, on_event=on_event, only=only, cache=False
+        demos, None, 0, selection, model.image_size, on_event=on_event, cache=False
     )
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
@@ -224,7 +223,7 @@ def _on_frames(
         0,
         {"moments": time.perf_counter() - start},
         {"demos": found.sha256},
-        {"demos": demos.name} | ({} if only is None else {"only": only}),
+        {"demos": demos.name} | ({} if selection.only is None else {"only": selection.only}),
     )
 
 

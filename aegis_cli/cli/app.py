@@ -58,6 +58,7 @@ from aegis_cli.cli.options import (
 from aegis_cli.common import files, interrupts, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
+from aegis_cli.data.selection import Selection
 from aegis_cli.merging.settings import DAMPING, MergeSettings
 from aegis_cli.recipes import (
     ANCHOR_PARTS,
@@ -297,8 +298,7 @@ def anchor(
         settings,
         out,
         demos=demos,
-        camera=cameras,
-        only=only,
+        selection=Selection(cameras, only),
         device=device,
         as_json=as_json,
     )
@@ -883,7 +883,9 @@ def export(
     camera: Annotated[
         str | None,
         Option(
-            metavar="NAME", help="What LeRobot calls the picture of a single camera; default: top."
+            metavar="NAME",
+            help="What LeRobot calls the picture of a single camera; default: as in training, else "
+            "top.",
         ),
     ] = None,
     as_json: Json = False,

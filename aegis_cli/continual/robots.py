@@ -438,8 +438,7 @@ def _demos(
         path,
         recipe.train.validation_share,
         recipe.seed,
-        None,
-        backbone.image_size,
+        image_size=backbone.image_size,
         on_event=on_event,
     )
     if found.task != task:
@@ -449,9 +448,8 @@ def _demos(
             "one and the same task",
             f"record with: aegis demos {task}",
         )
-    picture = found.images(torch.zeros(1, dtype=torch.int64))
-    for text in found.instructions:  # an unknown word must end no training half-way
-        backbone.prepare(picture, [text])
+    # An unknown word must end no training half-way.
+    backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
 
 

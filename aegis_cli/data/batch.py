@@ -17,9 +17,15 @@ Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
 # Some images, a question about each, and the reference answers.
 Asked = tuple[Images, Sequence[str], Sequence[str]]
 
-# A dimension that varies less than this share of its own magnitude (or of 1) is left unscaled:
-# dividing by a deviation of almost nothing would turn sensor noise into the largest input.
-NEAR_CONSTANT = 1e-4
+# A dimension that varies less than this share of its own magnitude is left unscaled: dividing by a
+# deviation of almost nothing would turn sensor noise into the largest input. Around zero there is no
+# magnitude, and units may be large: of slow motions in metres a frame, a deviation is 1e-5.
+_NEAR_CONSTANT, _LEAST = 1e-4, 1e-6
+
+
+def least_spread(middle: Tensor) -> Tensor:
+    """Deviations [D] above which dimensions with these means [D] count as varying."""
+    return (_NEAR_CONSTANT * middle.abs()).clamp(min=_LEAST)
 
 
 class Normalizer(nn.Module):
@@ -64,7 +70,7 @@ class Normalizer(nn.Module):
         Args:
             still: [D] bool, the dimensions that are known never to vary.
         """
-        varies = scale > NEAR_CONSTANT * middle.abs().clamp(min=1)
+        varies = scale > least_spread(middle)
         std = torch.where(varies, scale, 1.0)
         if still is not None:
             std = torch.where(still, 0.0, std)
@@ -84,7 +90,7 @@ def _never_varies(rows: Tensor) -> Tensor:
     Their quantiles do not tell: a gripper that closes in one frame of two hundred has equal ones.
     """
     low, high = rows.aminmax(dim=0)
-    return high - low <= NEAR_CONSTANT * rows.mean(0).abs().clamp(min=1)
+    return high - low <= least_spread(rows.mean(0))
 
 
 @dataclass(frozen=True)

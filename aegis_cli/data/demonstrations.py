@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +21,13 @@ from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.lerobot import dataset, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
-from aegis_cli.data.lerobot.layout import ACTION, STATE
+from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
+from aegis_cli.data.lerobot.source import Source
+from aegis_cli.data.selection import ALL, Selection
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
-Cameras = str | Sequence[str] | None  # names of a LeRobot folder's cameras; None: its only one
 Frames = Tensor | FramesOnDemand  # of one camera, [N, H, W, 3] uint8
 
 
@@ -66,6 +69,16 @@ class Demonstrations:
         """Raise AegisError if somebody has written to what the frames are read from."""
         for watched in self.watched:
             watched.check()
+
+    @cached_property
+    def read(self) -> Tensor:
+        """[*] int64, the frames that were read: those to train and to validate on."""
+        return torch.cat([self.train, self.validation]).sort().values
+
+    @cached_property
+    def texts(self) -> list[str]:
+        """The instructions of these frames, each once."""
+        return [self.instructions[i] for i in self.instruction_of[self.read].unique().tolist()]
 
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
@@ -109,22 +122,22 @@ def load(
     path: Path,
     validation_share: float | None,
     seed: int,
-    camera: Cameras = None,
+    selection: Selection = ALL,
     image_size: int | None = None,
     workers: int | None = None,
     on_event: OnEvent = ignore,
-    only: str | None = None,
     cache: bool = True,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
 
+    Nothing of a LeRobot folder's other episodes is read. All frames and episodes keep their numbers
+    whatever is selected.
+
     Args:
         validation_share: share of the episodes that is held out; None: no episode is trained on.
-        camera: one or several of a LeRobot folder's cameras; None: the only one there is.
         image_size: side in pixels of the squares that a LeRobot folder's frames are fitted into;
             None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
-        only: the episodes to train and validate on, as `demos.only` names them; None: all.
         cache: whether all frames of a LeRobot folder's videos are decoded first, into a cache.
             Otherwise each is decoded when it is asked for, unless the cache has them already.
 
@@ -133,26 +146,49 @@ def load(
     """
     path = Path(path)
     _check_there(path)
+    split = (validation_share, seed, selection.only)
     if path.is_dir():
-        split = (validation_share, seed, only)
-        return _load_folder(path, split, camera, image_size, workers, cache, on_event)
-    if camera is not None:
-        named = camera if isinstance(camera, str) else ", ".join(camera)
-        found = f"demos.camera: {named} with the file '{path}'"
-        raise AegisError(found, "a LeRobot folder, to choose a camera of", "leave demos.camera out")
-    return _load_file(path, (validation_share, seed, only))
+        return _load_folder(path, split, selection, image_size, workers, cache, on_event)
+    selection.check_file(path)
+    return _load_file(path, split)
 
 
-def digest(path: Path, camera: Cameras) -> str:
+def digest(path: Path, selection: Selection = ALL) -> str:
     """sha256 of everything that `load` would read."""
     _check_there(path)
     if not Path(path).is_dir():
         return artifacts.sha256_file(path)
     found = dataset.load(Path(path))
-    return dataset.joined_digest(dataset.digests(found, found.cameras(camera)))
+    cameras = found.cameras(selection.camera)
+    return sources.joined_digest(sources.digests(_source(found, selection.only), cameras))
 
 
-def playable_task(path: Path, camera: Cameras) -> str | None:
+def _source(found: dataset.Dataset, only: str | None) -> Source:
+    if only is None:
+        return sources.find(found)
+    count = len(found.episodes)
+    return sources.find(found, _chosen(found.folder, count, only, found.info.splits).tolist())
+
+
+def is_same(path: Path, selection: Selection, sha256: str) -> bool:
+    """Whether these are the demonstrations of that digest, of which `selection` was read."""
+    folder = Path(path)
+    if folder.is_dir() and selection.only is not None:
+        info = layout.read_info(folder)
+        if not episodes_of.are_there(selection.only, info.episodes, info.splits):
+            return False
+    return digest(folder, selection) == sha256
+
+
+def count_episodes(path: Path) -> int:
+    """How many episodes there are in a file of `aegis demos` or a LeRobot folder."""
+    _check_there(path)
+    if Path(path).is_dir():
+        return layout.read_info(Path(path)).episodes
+    return len(artifacts.load(path, "demos").tensors["episode_starts"]) - 1
+
+
+def playable_task(path: Path, camera: str | tuple[str, ...] | None) -> str | None:
     """The simulated task that a policy of these demonstrations can act in.
 
     It is None where another robot was recorded, or by cameras that the task does not have.
@@ -205,30 +241,31 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
 def _load_folder(
     path: Path,
     split: Split,
-    camera: Cameras,
+    selection: Selection,
     image_size: int | None,
     workers: int | None,
     cache: bool,
     on_event: OnEvent,
 ) -> Demonstrations:
     found = dataset.load(path)
-    cameras = found.cameras(camera)
+    cameras = found.cameras(selection.camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, split, found.info.splits)
-    index = rows.read_index(found)
-    proprio = torch.from_numpy(rows.read_vectors(found, STATE))
-    actions = torch.from_numpy(rows.read_vectors(found, ACTION))
-    digests = dataset.digests(found, cameras)
+    source = _source(found, selection.only)
+    index = rows.read_index(source)
+    proprio, proprio_names = _vectors(source, selection.state)
+    actions, action_names = _vectors(source, selection.action)
+    digests = sources.digests(source, cameras)
     frames: list[Frames] = []
     mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):
         is_video = found.info.features[name].dtype != "image"
-        if is_video and not cache and not camera_frames.are_kept(name, image_size, own):
-            parts = list(camera_frames.split(found, index, name))
-            frames.append(FramesOnDemand(parts, image_size))
+        if is_video and not cache and not camera_frames.are_kept(source, name, image_size, own):
+            parts = list(camera_frames.split(source, index, name))
+            frames.append(FramesOnDemand(parts, found.info.frames, image_size))
             videos.update(part.path for part in parts)
         else:
-            made = camera_frames.load(found, index, name, image_size, own, workers, on_event)
+            made = camera_frames.load(source, index, name, image_size, own, workers, on_event)
             frames.append(torch.from_numpy(made))
             mapped.append(Path(made.filename))
     return Demonstrations(
@@ -240,13 +277,26 @@ def _load_folder(
         episode_of,
         train,
         validation,
-        dataset.joined_digest(digests),
+        sources.joined_digest(digests),
         cameras,
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
         (WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
-        found.info.features[ACTION].components,
-        found.info.features[STATE].components,
+        action_names,
+        proprio_names,
     )
+
+
+def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, tuple[str, ...]]:
+    """Features side by side [N, D] float32, and the names of their D numbers.
+
+    The names are empty where one of the features has none.
+    """
+    chosen = (features,) if isinstance(features, str) else features
+    read = [rows.read_vectors(source, name) for name in chosen]
+    joined = np.concatenate([np.zeros((source.dataset.info.frames, 0), np.float32), *read], axis=1)
+    names = [source.dataset.info.features[name].components for name in chosen]
+    named = tuple(itertools.chain(*names)) if all(names) else ()
+    return torch.from_numpy(joined), named
 
 
 def _split(

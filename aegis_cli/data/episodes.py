@@ -40,7 +40,7 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
         AegisError: neither, or episodes that are not there.
     """
     try:
-        numbers = _of_split(splits[text]) if text in splits else listed(text)
+        numbers = _named(text, splits)
     except ValueError:
         names = f", or a split: {', '.join(splits)}" if splits else ""
         raise AegisError(
@@ -55,6 +55,23 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
             f"e.g. 0-{count - 1}",
         )
     return sorted(set(numbers))
+
+
+def are_there(text: str, count: int, splits: Mapping[str, str]) -> bool:
+    """Whether `chosen` would find all episodes of that name."""
+    try:
+        return all(number < count for number in _named(text, splits))
+    except ValueError:
+        return False
+
+
+def _named(text: str, splits: Mapping[str, str]) -> list[int]:
+    """The numbers that a list of them or a split's name stands for.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    return _of_split(splits[text]) if text in splits else listed(text)
 
 
 def _of_split(said: str) -> list[int]:

@@ -21,6 +21,7 @@ from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.palette import COLORS, SEEN
 from aegis_cli.data import demonstrations, keeping
 from aegis_cli.data.lerobot import layout, write
+from aegis_cli.data.selection import Selection
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 
@@ -176,7 +177,7 @@ def _report(
         frames_per_s=seen.frames / seconds,
         workers=workers,
         out=str(out),
-        sha256=demonstrations.digest(Path(out), cameras),
+        sha256=demonstrations.digest(Path(out), Selection(cameras and tuple(cameras))),
         preview=None if preview is None else str(preview),
     )
 

@@ -20,9 +20,10 @@ from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data import demonstrations
-from aegis_cli.data.batch import NEAR_CONSTANT
+from aegis_cli.data.batch import least_spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.models import lerobot_folder
@@ -146,12 +147,20 @@ def run(
     """
     source = _Source.find(Path(run))
     policy, meta = checkpoint.load_policy(source.checkpoint)
-    camera = source.camera(meta, Path(data)) if Path(data).is_dir() else None
+    learned = source.selection(meta, Path(data))
+    split, chosen, trained_on = source.choose(learned, data, episodes)
+    # The frames of the episodes that were learned from may have been decoded by the training.
+    only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
     shown = demonstrations.load(
-        data, None, 0, camera, policy.backbone.image_size, on_event=on_event, cache=False
+        data,
+        None,
+        0,
+        dataclasses.replace(learned, only=only),
+        policy.backbone.image_size,
+        on_event=on_event,
+        cache=False,
     )
     _check_fit(policy, shown, meta, data)
-    split, chosen, trained_on = source.choose(shown, data, episodes)
     at = _spread(shown, chosen, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
@@ -201,17 +210,27 @@ class _Source:
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
         return cls(chosen, recipe, header.inputs.get("demos"))
 
-    def camera(self, meta: Mapping[str, Any], data: Path) -> demonstrations.Cameras:
-        """The camera or cameras of a LeRobot folder that training saw; None: its only one.
+    def selection(self, meta: Mapping[str, Any], data: Path) -> Selection:
+        """What training read of demonstrations like these, as far as it is known.
 
         Raises:
-            AegisError: the folder has several, and not those.
+            AegisError: a folder of several cameras, and not those of the training.
         """
+        known = {name: meta[name] for name in ("only", "state", "action") if name in meta}
+        if self.recipe is not None:
+            known = recipes.selected(self.recipe)
+        known = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
+        return Selection(self._camera(meta, data) if data.is_dir() else None, **known)
+
+    def _camera(self, meta: Mapping[str, Any], data: Path) -> str | tuple[str, ...] | None:
+        """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
         if self.recipe is not None and self.recipe.demos.camera is not None:
             return self.recipe.demos.camera
-        named, known = tuple(meta.get("cameras", ())), layout.read_info(data).cameras
-        if named and set(named) <= set(known):
-            return named
+        named, known = meta.get("cameras", ()), layout.read_info(data).cameras
+        by_name = {layout.short(camera): camera for camera in known}
+        found = tuple(by_name.get(layout.short(camera)) for camera in named)
+        if found and None not in found:
+            return found
         if len(known) > 1:
             raise AegisError(
                 f"the cameras {', '.join(known)} in '{data}'",
@@ -222,11 +241,11 @@ class _Source:
         return None
 
     def choose(
-        self, shown: Demonstrations, data: Path, asked: Sequence[int] | None
+        self, learned: Selection, data: Path, asked: Sequence[int] | None
     ) -> tuple[str, list[int], list[int]]:
-        """How the episodes were chosen, which they are, and which of them were trained on."""
-        count = len(shown.tensors["episode_starts"]) - 1
-        if self.digest != shown.sha256:
+        """How the episodes are chosen, which they are, and which of them were trained on."""
+        count = demonstrations.count_episodes(data)
+        if self.digest is None or not demonstrations.is_same(data, learned, self.digest):
             everything = UNKNOWN if self.digest is None else OTHER
             return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
         if self.recipe is None:
@@ -275,8 +294,7 @@ def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], d
             "the cameras that it was trained on",
             "give the run's folder, whose recipe names them",
         )
-    for text in shown.instructions:
-        policy.backbone.prepare(shown.images(torch.zeros(1, dtype=torch.int64)), [text])
+    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
 
 
 def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.Tensor:
@@ -375,7 +393,7 @@ def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float]
 def _spread_of(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Each dimension's standard deviation [A] over rows [N, A], and whether it varies at all."""
     spread = rows.std(axis=0)
-    return spread, spread > NEAR_CONSTANT * np.maximum(1, np.abs(rows.mean(axis=0)))
+    return spread, spread > least_spread(torch.from_numpy(rows.mean(axis=0))).numpy()
 
 
 def _are_positions(shown: Demonstrations) -> bool:

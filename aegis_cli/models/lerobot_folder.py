@@ -10,7 +10,7 @@ backbone/                  a Hugging Face model's configuration and its processo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,26 +32,39 @@ MODEL, CONFIG, BACKBONE = "model.safetensors", "config.json", "backbone"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
 CAMERA = "top"  # that of our own tasks
-# LeRobot wants a size; a backbone that reads pictures of any size has none.
+# LeRobot wants a size. A policy that was exported before sizes were kept does not know its own.
 _ANY_SIZE = 224
-_SAID = ("method", "task", "replan", "normalization", "cameras")  # of a checkpoint's meta
+# What is kept of a checkpoint's meta.
+_SAID = (
+    "method",
+    "task",
+    "replan",
+    "normalization",
+    "cameras",
+    "pictures",
+    "state",
+    "action",
+)
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 
 is_policy = model_folder.is_policy
 
 
-def write(folder: Path, policy: Policy, meta: Mapping[str, Any], camera: str = CAMERA) -> None:
+def write(
+    folder: Path, policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str] = ()
+) -> None:
     """Write everything into an existing folder.
 
     Args:
-        meta: what a policy's user has to know: method, task, replan, normalization and, if there
-            are several, the cameras in their order.
-        camera: the name of a single camera.
+        meta: what a policy's user has to know: method, task, replan, normalization and, where they
+            are known, the cameras and the sizes of their pictures.
+        cameras: other names of the pictures, in the order in which the backbone takes them.
     """
-    if named := meta.get("cameras"):  # a LeRobot dataset's own names begin so already
-        meta = {**meta, "cameras": [name.removeprefix(IMAGES) for name in named]}
-    write_model(folder, policy, meta)
-    config = _config(policy, meta, camera)
+    named = cameras or meta.get("cameras") or (CAMERA,)
+    # A LeRobot dataset's own names begin so already.
+    named = [name.removeprefix(IMAGES) for name in named]
+    write_model(folder, policy, {**meta, "cameras": named})
+    config = _config(policy, meta, named)
     files.save_json(folder / CONFIG, config)
     for name, content in _processors(config).items():
         files.save_json(folder / name, content)
@@ -137,11 +150,14 @@ def _unit(size: int) -> Normalizer:
 # --- LeRobot's own files --------------------------------------------------------------------------
 
 
-def _config(policy: Policy, meta: Mapping[str, Any], camera: str) -> dict[str, Any]:
+def _config(policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     """The fields of the plugin's configuration that are not at their defaults."""
-    size = policy.backbone.image_size or _ANY_SIZE
-    cameras = meta.get("cameras") or [camera]
-    pictures = {f"{IMAGES}{name}": _feature("VISUAL", 3, size, size) for name in cameras}
+    side = policy.backbone.image_size or _ANY_SIZE
+    sizes = meta.get("pictures") or [(side, side)] * len(cameras)
+    pictures = {
+        f"{IMAGES}{name}": _feature("VISUAL", 3, *size)
+        for name, size in zip(cameras, sizes, strict=True)
+    }
     return {
         "type": TYPE,
         "n_obs_steps": 1,

@@ -69,7 +69,8 @@ def run(
     Args:
         out: a new folder; nothing is left of it where the export fails.
         form: the layout, LeRobot's or that of our checkpoints.
-        camera: what LeRobot calls the picture of a policy with a single camera.
+        camera: what LeRobot calls the picture of a policy with a single camera; None: as in
+            training, `top` where it had no name.
         repo: where others will find the policy, for the card.
         dtype: of the backbone's weights, SOURCE or one of `STORED_TYPES`.
 
@@ -96,7 +97,7 @@ def run(
         with checkpoint.writing(out):
             aside.mkdir()
             if form == card.LEROBOT:
-                lerobot_folder.write(aside, policy, meta, cameras[0])
+                lerobot_folder.write(aside, policy, meta, cameras)
             else:
                 _write_checkpoint(aside, run, policy, meta)
             stored = card.Stored(meta.get("stored", FLOAT32), rounded)
@@ -124,16 +125,16 @@ def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:
     Raises:
         AegisError: a name where the policy has several cameras.
     """
-    several = meta.get("cameras")
-    if not several:
-        return [camera or lerobot_folder.CAMERA]
-    if camera is not None:
+    named = list(meta.get("cameras", ())) or [lerobot_folder.CAMERA]
+    if camera is None:
+        return named
+    if len(named) > 1:
         raise AegisError(
-            f"--camera {camera} for a policy of {', '.join(several)}",
+            f"--camera {camera} for a policy of {', '.join(named)}",
             "a policy of one camera",
             "leave --camera out",
         )
-    return list(several)
+    return [camera]
 
 
 def refuse_stream(run: Path) -> None:

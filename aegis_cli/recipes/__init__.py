@@ -51,6 +51,7 @@ from aegis_cli.recipes.reader import (
     options,
     read,
     read_anchor,
+    selected,
     to_yaml,
     training_part,
 )
@@ -160,6 +161,7 @@ __all__ = [
     "read",
     "read_anchor",
     "recorded",
+    "selected",
     "take_kind",
     "to_yaml",
     "training_part",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
+from aegis_cli.data.selection import Selection
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     EVEN,
@@ -109,6 +110,18 @@ class Demos:
         doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
         "each.",
     )
+    state: str | tuple[str, ...] = key(
+        NOT_EMPTY,
+        "observation.state",
+        later=True,
+        doc="Feature of a LeRobot dataset that has the robot's positions; a list joins several.",
+    )
+    action: str | tuple[str, ...] = key(
+        NOT_EMPTY,
+        "action",
+        later=True,
+        doc="Feature of a LeRobot dataset that has the actions; a list joins several.",
+    )
     only: str | None = key(
         NOT_EMPTY,
         None,
@@ -129,6 +142,11 @@ class Demos:
         doc="Suite tasks only: episodes whose return is below this quantile of all returns are "
         "dropped. Null drops the lowest quarter.",
     )
+
+    @property
+    def selection(self) -> Selection:
+        """What is learned from the demonstrations in `path`."""
+        return Selection(self.camera, self.only, self.state, self.action)
 
 
 @section

@@ -10,10 +10,10 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
+from aegis_cli.data.lerobot import layout
 from aegis_cli.deploy import DeployedPolicy, Pictures
 
 STATE, PROMPT, IMAGE = "observation/state", "prompt", "observation/image"
-_CAMERA = "observation.images."  # what LeRobot's names of cameras begin with
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Reader:
     def __init__(self, policy: DeployedPolicy, prompt: str | None = None) -> None:
         self._policy, self._prompt = policy, prompt
         names = policy.cameras or ("image",)
-        self.images = {f"observation/{name.removeprefix(_CAMERA)}": name for name in names}
+        self.images = {f"observation/{layout.short(name)}": name for name in names}
 
     def greeting(self) -> dict[str, Any]:
         """The metadata that a client gets when it connects."""
@@ -61,6 +61,8 @@ class Reader:
         """
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
+        if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
+            message = {**message, next(iter(self.images)): message[IMAGE]}
         wanted = [*self.images, STATE, *([PROMPT] if self._prompt is None else [])]
         missing = [key for key in wanted if key not in message]
         if missing:

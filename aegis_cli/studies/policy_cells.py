@@ -18,6 +18,7 @@ from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
@@ -253,8 +254,7 @@ def cell_key(
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
-        only = {} if cell.recipe.demos.only is None else {"only": cell.recipe.demos.only}
-        key["demos"] = {"sha256": demos_sha256, **only}
+        key["demos"] = {"sha256": demos_sha256, **recipes.selected(cell.recipe)}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
@@ -290,7 +290,7 @@ class PolicyRunner:
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event)
-        self._given: dict[str, Made] = {}
+        self._given: dict[tuple[str, Selection], Made] = {}
         self._sha256: dict[str, str] = {}
         self._sources: dict[tuple[str, bool, str], sets.Scenes | sets.Listed] = {}
         self._questions: dict[tuple[object, ...], VQASet] = {}
@@ -307,17 +307,17 @@ class PolicyRunner:
         """The demonstrations that the recipe names, or those of its task and settings."""
         settings = recipe.demos
         if settings.path is not None:
-            return self._given_demos(settings.path, settings.camera)
+            return self._given_demos(settings.path, settings.selection)
         plain = self.plain is not None and (recipe.task, settings) == (
             self.plain.task,
             self.plain.demos,
         )
         return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
 
-    def _given_demos(self, path: str, camera: demonstrations.Cameras) -> Made:
-        name = f"{path} {camera}"
+    def _given_demos(self, path: str, selection: Selection) -> Made:
+        name = (path, selection)
         if name not in self._given:
-            self._given[name] = Made(Path(path), demonstrations.digest(Path(path), camera))
+            self._given[name] = Made(Path(path), demonstrations.digest(Path(path), selection))
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:
@@ -334,7 +334,6 @@ class PolicyRunner:
 
         def make(out: Path, on_event: OnEvent) -> object:
             frames = None if shown is None else shown.path
-            camera = recipe.demos.camera
             return leading.together(
                 measure.run,
                 recipe.backbone,
@@ -342,8 +341,7 @@ class PolicyRunner:
                 out,
                 on_event=on_event,
                 demos=frames,
-                camera=camera,
-                only=only,
+                selection=recipe.demos.selection,
             )
 
         return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
@@ -667,6 +665,6 @@ def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
     cameras = {layout.short(name) for name in meta.get("cameras", ())}
-    if task is None or not cameras <= {*sim.cameras(task)}:
+    if task is None or (len(cameras) > 1 and not cameras <= {*sim.cameras(task)}):
         return ()
     return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

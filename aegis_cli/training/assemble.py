@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli import recipes, sim
+from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import devices, launch
 from aegis_cli.common.errors import AegisError
@@ -22,7 +22,6 @@ from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations
-from aegis_cli.data.lerobot import layout
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -100,19 +99,14 @@ class TrainingRun:
             "replan": self.recipe.rollout.replan,
             "normalization": self.recipe.train.normalization,
         }
-        if self._looks_elsewhere:
+        found |= recipes.selected(self.recipe)
+        if self.demos.cameras:
             found["cameras"] = list(self.demos.cameras)
+        if self.policy.backbone.image_size is None:
+            found["pictures"] = [list(frames.shape[1:3]) for frames in self.demos.frames]
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
         return found
-
-    @property
-    def _looks_elsewhere(self) -> bool:
-        """Whether a user has to know the cameras: several, or another than a task's own."""
-        named, task = self.demos.cameras, self.demos.task
-        if len(named) != 1 or task is None:
-            return len(named) > 1
-        return layout.short(named[0]) in sim.cameras(task)[1:]
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
         """Write a checkpoint, and the ledger so far; of several processes, the first does it.
@@ -317,10 +311,9 @@ def load_demonstrations(
         path,
         recipe.train.validation_share,
         recipe.seed,
-        recipe.demos.camera,
+        recipe.demos.selection,
         backbone.image_size,
         on_event=on_event,
-        only=recipe.demos.only,
         cache=recipe.demos.cache,
     )
     if found.task not in (None, recipe.task):
@@ -330,8 +323,7 @@ def load_demonstrations(
             f"--set task={found.task}, or record with: aegis demos {recipe.task}",
         )
     # A word that the backbone does not know is found here, and ends no training half-way.
-    for text in found.instructions:
-        backbone.prepare(found.images(torch.zeros(1, dtype=torch.int64)), [text])
+    backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
 
 
@@ -426,7 +418,7 @@ def _start(
         options,
         anchor,
         vqa_loss,
-        demos.instructions,
+        demos.texts,
         policy.action_scale,
         owners,
     )

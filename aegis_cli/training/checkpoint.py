@@ -349,9 +349,12 @@ def _load_expert(
 
 def _check_user_meta(meta: Mapping[str, Any]) -> None:
     """Raise ValueError unless what a policy's user has to know is of the types that they read."""
-    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str}
+    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str, "only": str}
     for name, kind in kinds.items():
         if name in meta and not isinstance(meta[name], kind):
+            raise ValueError(f"'{name}' is {meta[name]!r}")
+    for name in ("state", "action"):
+        if not isinstance(meta.get(name, ""), str | list):
             raise ValueError(f"'{name}' is {meta[name]!r}")
     if "replan" in meta and meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
@@ -359,6 +362,17 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
         raise ValueError(f"'stored' is {meta['stored']!r}")
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
+    for size in meta.get("pictures", []):
+        if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
+            raise ValueError(f"'pictures' has the size {size!r}")
+
+
+def sizes_of(meta: Mapping[str, Any]) -> tuple[tuple[int, int], ...]:
+    """(height, width) of the pictures that each camera showed in training; () where none is known.
+
+    Only a backbone that reads pictures of any size has to know.
+    """
+    return tuple((height, width) for height, width in meta.get("pictures", ()))
 
 
 def cameras_of(meta: Mapping[str, Any], task: str | None) -> tuple[str, ...]:
@@ -370,6 +384,8 @@ def cameras_of(meta: Mapping[str, Any], task: str | None) -> tuple[str, ...]:
     named = meta.get("cameras", ())
     found = tuple(layout.short(name) for name in named)
     known = () if task is None else sim.cameras(task)
+    if len(found) == 1 and found[0] not in known[1:]:
+        return ()  # whatever the only camera is called
     if not set(found) <= {*known}:
         expected = "cameras of a simulated task"
         raise AegisError(

@@ -18,6 +18,7 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, merge
 from aegis_cli.data import demonstrations
+from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS
@@ -240,7 +241,9 @@ def test_only_frames_of_the_chosen_episodes_are_read(
 ) -> None:
     out = tmp_path / "a.safetensors"
     whole = dataclasses.replace(FRAMES, samples=10_000)
-    report = measure.run(str(tiny_folder), whole, out, demos=demos_file, only="0,2-3")
+    report = measure.run(
+        str(tiny_folder), whole, out, demos=demos_file, selection=Selection(only="0,2-3")
+    )
     shown = demonstrations.load(demos_file, 0.5, 0)
     frames = torch.isin(shown.episode_of, torch.tensor([0, 2, 3])).nonzero().squeeze(1)
     assert 0 < report.samples == len(frames) < len(shown.episode_of)

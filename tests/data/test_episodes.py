@@ -13,6 +13,7 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations, episodes, record
+from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies.cells import Cell
@@ -58,7 +59,7 @@ def test_a_split_may_have_more_than_there_is() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_training_and_validation_are_of_the_chosen_episodes(seed: int, demos_file: Path) -> None:
-    found = demonstrations.load(demos_file, 0.3, seed, only="1-3,6")
+    found = demonstrations.load(demos_file, 0.3, seed, selection=Selection(only="1-3,6"))
     train, validation = (
         set(found.episode_of[rows].tolist()) for rows in (found.train, found.validation)
     )
@@ -68,19 +69,22 @@ def test_training_and_validation_are_of_the_chosen_episodes(seed: int, demos_fil
 
 def test_all_episodes_are_those_of_no_choice(demos_file: Path) -> None:
     whole = demonstrations.load(demos_file, 0.3, 0)
-    named = demonstrations.load(demos_file, 0.3, 0, only="0-7")
+    named = demonstrations.load(demos_file, 0.3, 0, selection=Selection(only="0-7"))
     assert torch.equal(whole.train, named.train)
     assert torch.equal(whole.validation, named.validation)
 
 
 def test_scales_are_of_the_chosen_episodes(demos_file: Path) -> None:
-    one, other = (demonstrations.load(demos_file, 0.3, 0, only=only) for only in ("0-3", "4-7"))
+    one, other = (
+        demonstrations.load(demos_file, 0.3, 0, selection=Selection(only=only))
+        for only in ("0-3", "4-7")
+    )
     assert not torch.equal(one.scales()[0].mean, other.scales()[0].mean)
 
 
 def test_one_episode_is_too_few(demos_file: Path) -> None:
     with pytest.raises(AegisError, match=r"1 episode .* by demos.only: 3") as caught:
-        demonstrations.load(demos_file, 0.3, 0, only="3")
+        demonstrations.load(demos_file, 0.3, 0, selection=Selection(only="3"))
     assert "demos.only" in caught.value.fix
 
 
@@ -92,10 +96,10 @@ def test_a_lerobot_datasets_splits_have_names(tmp_path: Path) -> None:
     info["splits"] = {"train": "0:3", "later": "2:4", "strange": [1, 2]}
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     assert demonstrations.learned_from(folder, 4, "later").tolist() == [2, 3]
-    found = demonstrations.load(folder, 0.5, 0, image_size=32, only="later")
+    found = demonstrations.load(folder, 0.5, 0, image_size=32, selection=Selection(only="later"))
     assert set(found.episode_of[torch.cat([found.train, found.validation])].tolist()) == {2, 3}
     with pytest.raises(AegisError, match="strange"):
-        demonstrations.load(folder, 0.5, 0, image_size=32, only="strange")
+        demonstrations.load(folder, 0.5, 0, image_size=32, selection=Selection(only="strange"))
 
 
 def test_a_choice_is_part_of_the_record_and_none_is_not() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from samples import lerobot
@@ -17,8 +18,10 @@ from samples.training_runs import SETTINGS
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
 from aegis_cli.models import lerobot_folder
+from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, train
 
@@ -210,25 +213,54 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
     data = lerobot.save(tmp_path / "arm", known)
     seen = dataclasses.replace(recipe, demos=Demos(camera="side"))
     train.run(seen, "naive", data, None, tmp_path / "run")
-    trained = demonstrations.load(data, SETTINGS.validation_share, 0, "side")
+    trained = demonstrations.load(data, SETTINGS.validation_share, 0, Selection("side"))
     found = open_loop.run(tmp_path / "run", data)
     assert found.split == open_loop.VALIDATION
     assert found.episodes == episodes_of(trained, trained.validation)
     assert [(d.name, d.unit) for d in found.dimensions] == [("dx", None), ("dy", None)]
+    report = export.run(tmp_path / "run", tmp_path / "policy")
+    assert report.pictures == ("observation.images.side",)
+    exported = open_loop.run(tmp_path / "policy", data, episodes=found.episodes)
+    assert exported.split == open_loop.CHOSEN
+    assert exported.relative_error == pytest.approx(found.relative_error)
 
 
-def test_a_policy_of_a_lone_camera_takes_another_lone_one_and_cannot_choose_among_several(
+def test_only_the_episodes_that_are_asked_for_have_to_be_there(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """Also of data that the policy was trained on, of which the recipe names some."""
+    made = lerobot.episodes(8, smooth=True, size=(64, 64))
+    known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+    data = lerobot.save(tmp_path / "arm", known)
+    some = dataclasses.replace(recipe, demos=Demos(only="1-4,6"))
+    train.run(some, "naive", data, None, tmp_path / "run")
+    found = open_loop.run(tmp_path / "run", data)
+    assert found.split == open_loop.VALIDATION and set(found.episodes) < {1, 2, 3, 4, 6}
+
+    def spoil(table: pa.Table) -> pa.Table:
+        rows = table.column("action").to_pylist()
+        rows[0][1] = float("nan")
+        return lerobot.replaced(table, "action", pa.array(rows, table.field("action").type))
+
+    lerobot.edit_table(lerobot.data_files(data)[0], spoil)
+    asked = open_loop.run(tmp_path / "run", data, episodes=[1, 5])
+    assert (asked.split, asked.episodes) == (open_loop.CHOSEN, [1, 5])
+    assert "NaN" in refusal(tmp_path / "run", data, episodes=[0, 5])
+
+
+def test_a_policy_of_one_camera_takes_that_one_or_another_lone_one_and_chooses_no_other(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
     folders = {}
-    for cameras in (("side",), ("front",), ("top", "side")):
+    for cameras in (("side",), ("front",), ("top", "front"), ("top", "side")):
         made = lerobot.episodes(6, cameras=cameras)
         known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
         folders[cameras] = lerobot.save(tmp_path / "-".join(cameras), known)
     train.run(recipe, "naive", folders["side",], None, tmp_path / "run")
     assert open_loop.run(tmp_path / "run", folders["front",]).split == open_loop.OTHER
-    said = refusal(tmp_path / "run", folders["top", "side"])
-    assert "observation.images.top" in said and "the only one that there was" in said
+    assert open_loop.run(tmp_path / "run", folders["top", "side"]).split == open_loop.OTHER
+    said = refusal(tmp_path / "run", folders["top", "front"])
+    assert "observation.images.top" in said and "observation.images.side, as the policy" in said
 
 
 def test_an_exported_policy_does_not_say_what_it_was_trained_on(

@@ -22,8 +22,9 @@ from aegis_cli import load_policy
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations
-from aegis_cli.data.lerobot import dataset
+from aegis_cli.data.lerobot import dataset, source
 from aegis_cli.data.lerobot.write import NewEpisode
+from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
@@ -62,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_row_holds_each_cameras_frame_in_the_order_asked_for(folder: Path) -> None:
     loaded, wanted = (
-        demonstrations.load(folder, 0.3, 0, BOTH),
+        demonstrations.load(folder, 0.3, 0, Selection(BOTH)),
         [frames(recorded(), name) for name in BOTH],
     )
     numbers = np.array([3, 0, 7])
@@ -76,12 +77,14 @@ def test_a_row_holds_each_cameras_frame_in_the_order_asked_for(folder: Path) -> 
 
 @pytest.mark.parametrize("name", BOTH)
 def test_a_list_of_one_is_that_one(name: str, folder: Path) -> None:
-    one, listed = (demonstrations.load(folder, 0.3, 0, camera) for camera in (name, (name,)))
+    one, listed = (
+        demonstrations.load(folder, 0.3, 0, Selection(camera)) for camera in (name, (name,))
+    )
     assert (
         one.sha256
         == listed.sha256
-        == demonstrations.digest(folder, name)
-        == demonstrations.digest(folder, [name])
+        == demonstrations.digest(folder, Selection(name))
+        == demonstrations.digest(folder, Selection((name,)))
     )
     images = [d.batch(np.arange(4), 2).images for d in (one, listed)]
     assert isinstance(images[0], torch.Tensor) and torch.equal(*images)
@@ -89,19 +92,20 @@ def test_a_list_of_one_is_that_one(name: str, folder: Path) -> None:
 
 def test_the_digest_knows_the_cameras_and_their_order(folder: Path) -> None:
     digests = [
-        demonstrations.digest(folder, camera) for camera in ("top", "wrist", BOTH, BOTH[::-1])
+        demonstrations.digest(folder, Selection(camera))
+        for camera in ("top", "wrist", BOTH, BOTH[::-1])
     ]
     assert len(set(digests)) == 4
     found = dataset.load(folder)
-    assert digests[:2] == dataset.digests(
-        found, ["observation.images.top", "observation.images.wrist"]
+    assert digests[:2] == source.digests(
+        source.find(found), ["observation.images.top", "observation.images.wrist"]
     )
-    assert demonstrations.load(folder, 0.3, 0, BOTH).sha256 == digests[2]
+    assert demonstrations.load(folder, 0.3, 0, Selection(BOTH)).sha256 == digests[2]
 
 
 def test_cameras_share_their_decoded_frames(folder: Path, frame_cache: Path) -> None:
     for camera in (BOTH, "top", "wrist", BOTH[::-1]):
-        demonstrations.load(folder, 0.3, 0, camera)
+        demonstrations.load(folder, 0.3, 0, Selection(camera))
     assert len(list((frame_cache / "frames").iterdir())) == 2
 
 
@@ -113,9 +117,11 @@ def test_cameras_share_their_decoded_frames(folder: Path, frame_cache: Path) -> 
         (None, r"--set 'demos.camera=\[observation.images.top, observation.images.wrist\]'"),
     ],
 )
-def test_cameras_that_cannot_be(camera: demonstrations.Cameras, says: str, folder: Path) -> None:
+def test_cameras_that_cannot_be(
+    camera: str | tuple[str, ...] | None, says: str, folder: Path
+) -> None:
     with pytest.raises(AegisError, match=says):
-        demonstrations.load(folder, 0.3, 0, camera)
+        demonstrations.load(folder, 0.3, 0, Selection(camera))
 
 
 # --- a run ----------------------------------------------------------------------------------------
@@ -141,14 +147,16 @@ def run(
 def test_what_was_seen_is_written_down(run: Path, aegis: Command) -> None:
     card = (checkpoint.last(run) / "backbone" / "README.md").read_text()
     assert f"seen by `{FULL[0]}`, then `{FULL[1]}`" in card and "None" not in card
-    assert checkpoint.load_policy(run)[1]["cameras"] == list(FULL)
+    _, meta = checkpoint.load_policy(run)
+    assert meta["cameras"] == list(FULL) and checkpoint.sizes_of(meta) == ((12, 12), (16, 24))
+    assert load_policy(run).sizes == ((12, 12), (16, 24))
     code, out, err = aegis("inspect", run, "--json")
     assert code == 0 and json.loads(out)["facts"]["cameras"] == list(FULL), err
 
 
 def test_the_policy_acts_on_both(run: Path, folder: Path) -> None:
     policy, _ = checkpoint.load_policy(run)
-    batch = demonstrations.load(folder, 0.3, 0, BOTH).batch(np.arange(3), 2)
+    batch = demonstrations.load(folder, 0.3, 0, Selection(BOTH)).batch(np.arange(3), 2)
     other = [(image, 255 - second) for image, second in batch.images]
     chunks = [
         policy.act(rows, batch.instructions, batch.proprio, torch.Generator().manual_seed(0))

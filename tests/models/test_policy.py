@@ -46,13 +46,27 @@ def test_a_dimension_that_never_varied_is_only_centred_and_keeps_its_value(
     fit: Callable[[Tensor], Normalizer], level: float
 ) -> None:
     noise = torch.randn(200, 1, generator=generator())
-    rows = torch.cat([level + 1e-6 * max(1.0, abs(level)) * noise, noise], dim=1)
+    still = level + (1e-6 * abs(level) if level else 1e-7) * noise
+    rows = torch.cat([still, noise], dim=1)
     scale = fit(rows)
     # Whatever is predicted of it, a robot is told the value that it always had.
     predicted = scale.invert(torch.randn(50, 2, generator=generator(1)))
     assert (predicted[:, 0] == scale.mean[0]).all() and predicted[:, 1].std() > 0.1
     # sensor noise a thousand times larger than any seen still is a small input
     assert scale(rows + 1e-3)[:, 0].abs().max() < 0.01
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-5])
+@pytest.mark.parametrize("fit", [Normalizer.fit, Normalizer.fit_quantiles])
+def test_small_units_are_scaled_as_large_ones(
+    fit: Callable[[Tensor], Normalizer], unit: float
+) -> None:
+    """As of motions in metres a frame, which are a hundredth of a millimetre."""
+    rows = torch.randn(300, 2, generator=generator()) + torch.tensor([0.0, 2.0])
+    one, other = fit(rows), fit(rows * unit)
+    torch.testing.assert_close(other(rows * unit), one(rows), rtol=1e-4, atol=1e-4)
+    predicted = torch.randn(20, 2, generator=generator(1))
+    torch.testing.assert_close(other.invert(predicted), one.invert(predicted) * unit)
 
 
 def test_a_dimension_that_varies_in_few_frames_is_predicted() -> None:

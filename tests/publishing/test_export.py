@@ -171,7 +171,8 @@ def test_a_hugging_face_model_keeps_its_files_and_its_answers(
 ) -> None:
     backbone = backbones.load(str(hf_folder(family)))
     policy = policy_over(backbone).eval()
-    lerobot_folder.write(tmp_path, policy, {**META, "cameras": ["left", "right"]})
+    seen = {**META, "cameras": ["left", "right"], "pictures": [[30, 40], [20, 20]]}
+    lerobot_folder.write(tmp_path, policy, seen)
     again, meta = lerobot_folder.load(tmp_path)
     assert torch.equal(acts(policy), acts(again)) and meta["cameras"] == ["left", "right"]
     features = json_of(tmp_path / "config.json")["input_features"]
@@ -179,6 +180,11 @@ def test_a_hugging_face_model_keeps_its_files_and_its_answers(
         "observation.images.left",
         "observation.images.right",
     ]
+    assert [features[name]["shape"] for name in features if "images" in name] == [
+        [3, 30, 40],
+        [3, 20, 20],
+    ]
+    assert checkpoint.sizes_of(meta) == ((30, 40), (20, 20))
     alone = backbones.load(str(tmp_path))
     assert alone.answer(images(2), TEXTS) == backbone.answer(images(2), TEXTS)
     assert alone.fingerprint() == backbone.fingerprint()

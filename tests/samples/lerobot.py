@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from aegis_cli.data.lerobot import dataset, rows, write
+from aegis_cli.data.lerobot import dataset, rows, source, write
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.write import Limits, NewEpisode, Spec
 
@@ -85,12 +85,13 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
     """All frames of a camera, as training gets them."""
     found = dataset.load(folder)
     (key,) = found.cameras(camera)
+    read = source.find(found)
     return camera_frames.load(
-        found,
-        rows.read_index(found),
+        read,
+        rows.read_index(read),
         key,
         side,
-        dataset.digests(found, [key])[0],
+        source.digests(read, [key])[0],
         1,
         lambda _: None,
     )

@@ -34,6 +34,15 @@ def test_several_cameras_have_keys_of_their_own() -> None:
     assert found.state.dtype == np.float32 and found.state.tolist() == [1, 2, 3]
 
 
+@pytest.mark.parametrize("key", ["observation/image", "observation/wrist"])
+def test_the_picture_of_a_single_camera_has_two_names(key: str) -> None:
+    """That of every policy with one camera, which clients know, and its own."""
+    seen = observation()
+    picture = seen.pop("observation/image")
+    found = Reader(deployed(cameras=("observation.images.wrist",))).read(seen | {key: picture})
+    np.testing.assert_array_equal(found.pictures, picture)
+
+
 @pytest.mark.parametrize("missing", ["observation/wrist", "observation/state", "prompt"])
 def test_a_missing_key_is_named_with_those_that_are_there(missing: str) -> None:
     seen = several()

@@ -21,6 +21,7 @@ if MISSING:
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import demonstrations, record
+from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import export
@@ -73,7 +74,7 @@ def test_every_camera_is_one_of_the_benchmarks() -> None:
 
 
 def test_a_dataset_has_each_cameras_frames(dataset: Path, tmp_path: Path) -> None:
-    found = demonstrations.load(dataset, 0.5, 0, BOTH)
+    found = demonstrations.load(dataset, 0.5, 0, Selection(BOTH))
     assert found.task == TASK and found.cameras == FULL
     record.run(TASK, 2, 0, tmp_path / "usual", form="lerobot", workers=1)
     usual = demonstrations.load(tmp_path / "usual", 0.5, 0)
@@ -114,7 +115,7 @@ def test_another_single_camera_than_the_usual_is_remembered(
     usual = trained(known, dataset, tmp_path / "usual", "corner2")
     assert rollout.load_run(one, None).cameras == ("gripperPOV",)
     assert rollout.load_run(usual, None).cameras == ()
-    assert "cameras" not in checkpoint.load_policy(usual)[1]
+    assert checkpoint.load_policy(usual)[1]["cameras"] == ["observation.images.corner2"]
 
 
 def wide(folder: Path) -> Path:

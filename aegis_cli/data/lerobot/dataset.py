@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.layout import Info
@@ -31,7 +29,7 @@ class EpisodeIndex:
 
     Attributes:
         length: number of its frames.
-        data: the parquet file with its rows.
+        data: the parquet file with its rows, as far as the meta folder knows (see `source`).
         clips: its clip for each video feature.
     """
 
@@ -101,8 +99,8 @@ class Dataset:
             features = ", ".join(self.info.features)
             raise AegisError(
                 f"no feature '{feature}' in '{self.folder}'; it has {features}",
-                f"a dataset with {layout.STATE} and {layout.ACTION}",
-                "rename the feature, or give another dataset",
+                "the features with the robot's positions and with its actions",
+                "name them: --set demos.state=NAME, --set demos.action=NAME",
             )
         if len(found.shape) != 1 or not found.dtype.startswith(("float", "int", "uint")):
             shape = " x ".join(map(str, found.shape))
@@ -141,32 +139,6 @@ def load(folder: Path) -> Dataset:
     return Dataset(folder, info, tasks, episodes, layout.read_stats(folder))
 
 
-def digests(dataset: Dataset, cameras: Sequence[str]) -> list[str]:
-    """A digest per camera: sha256 over its name and every file that training on it reads."""
-    shared = {layout.INFO, layout.TASKS}
-    shared |= {path.relative_to(dataset.folder) for path in _episode_files(dataset.folder)}
-    shared |= {episode.data for episode in dataset.episodes}
-    hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
-    found = []
-    for camera in cameras:
-        clips = {
-            episode.clips[camera].file for episode in dataset.episodes if camera in episode.clips
-        }
-        hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
-        own = {str(path): hashes[path] for path in shared | clips}
-        text = files.canonical({"camera": camera, "files": own})
-        found.append(hashlib.sha256(text.encode()).hexdigest())
-    return found
-
-
-def joined_digest(digests: Sequence[str]) -> str:
-    """sha256 of what is learned from several cameras together; a single camera's own digest."""
-    if len(digests) == 1:
-        return digests[0]
-    text = files.canonical({"cameras": list(digests)})
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def _read_tasks(folder: Path) -> tuple[str, ...]:
     """The texts of the tasks, by their numbers.
 
@@ -184,12 +156,13 @@ def _read_tasks(folder: Path) -> tuple[str, ...]:
         return tuple(by_number[i] for i in range(len(texts)))
 
 
-def _episode_files(folder: Path) -> list[Path]:
+def episode_files(folder: Path) -> list[Path]:
+    """The files that have a row per episode."""
     return sorted((folder / _EPISODES).glob("*/*.parquet"))
 
 
 def _read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
-    where, paths = folder / _EPISODES, _episode_files(folder)
+    where, paths = folder / _EPISODES, episode_files(folder)
     if not paths:
         raise AegisError(f"no parquet file in '{where}'", "a row per episode there", layout.AGAIN)
     rows: list[dict[str, Any]] = []

@@ -13,7 +13,7 @@ import contextlib
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,9 +26,9 @@ from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped, worker_count
-from aegis_cli.data.lerobot import layout, pictures, rows, video
-from aegis_cli.data.lerobot.dataset import Dataset
+from aegis_cli.data.lerobot import layout, pictures, video
 from aegis_cli.data.lerobot.rows import Index
+from aegis_cli.data.lerobot.source import DataFile, Source
 
 _PART = 256  # frames that one call decodes, or a little more
 _PER_WORKER = 8  # parts that repay a worker's start
@@ -37,11 +37,15 @@ _SAME = 2.0  # of 255: by how much decoders of several machines may differ in th
 
 @dataclass(frozen=True)
 class ImagePart:
-    """Whole row groups of a data file."""
+    """Rows of a data file that follow each other, in `groups` of its row groups.
+
+    `skip` rows of these groups come before them.
+    """
 
     path: Path
     camera: str
     groups: tuple[int, ...]
+    skip: int
     first_frame: int
     count: int
 
@@ -60,6 +64,7 @@ class ImagePart:
                 layout.open_parquet(self.path)
                 .read_row_groups(list(self.groups), columns=[self.camera])
                 .column(self.camera)
+                .slice(self.skip, self.count)
             )
 
     def _picture(self, cells: Any, i: int) -> np.ndarray:
@@ -96,7 +101,7 @@ Part = ImagePart | VideoPart
 
 
 def load(
-    dataset: Dataset,
+    source: Source,
     index: Index,
     camera: str,
     side: int | None,
@@ -105,6 +110,8 @@ def load(
     on_event: OnEvent,
 ) -> np.ndarray:
     """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first if no file has them.
+
+    Frames of episodes that are not read have their places, which take no room on the disk.
 
     Args:
         side: pixels of the square that each frame is fitted into; None: as is, or fitted to the
@@ -117,36 +124,46 @@ def load(
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be
             written.
     """
-    path = _file(camera, side, digest)
+    path, count = _file(source, camera, side, digest), source.dataset.info.frames
     kept = path.exists()
     if not kept:
         files.make_folder(path.parent)
-        parts = list(split(dataset, index, camera))
+        parts = list(split(source, index, camera))
         height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
-        _write(path, parts, (dataset.info.frames, height, width, 3), workers, on_event)
-    frames = _open(path, dataset.info.frames)
+        _write(path, parts, (count, height, width, 3), workers, on_event)
+    frames = _open(path, count)
     if kept:
-        _check_some(path, frames, dataset, index, camera)
+        _check_some(path, frames, source, index, camera)
     return frames
 
 
-def are_kept(camera: str, side: int | None, digest: str) -> bool:
+def are_kept(source: Source, camera: str, side: int | None, digest: str) -> bool:
     """Whether `load` would find the frames, and decode none."""
-    return _file(camera, side, digest).exists()
+    return _file(source, camera, side, digest).exists()
 
 
-def _file(camera: str, side: int | None, digest: str) -> Path:
-    """Where the frames that are decoded from what has this digest are kept."""
+def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:
+    """Where the frames that are decoded from what has this digest are kept.
+
+    Those of some episodes are a file of their own, unless all episodes of the same files are there.
+    """
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
-    key = files.canonical({"dataset": digest, "camera": camera, "side": side, **made})
-    return cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+    key = {"dataset": digest, "camera": camera, "side": side, **made}
+    whole = cache_folder() / _name(key)
+    if len(source.episodes) == len(source.dataset.episodes) or whole.exists():
+        return whole
+    return cache_folder() / _name({**key, "episodes": source.episodes})
 
 
-def pick(dataset: Dataset, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
+def _name(key: Mapping[str, Any]) -> str:
+    return f"{hashlib.sha256(files.canonical(key).encode()).hexdigest()[:32]}.npy"
+
+
+def pick(source: Source, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
     """Some of a camera's frames as they are, by their rising numbers."""
     return [
         part.at(number - part.first_frame)
-        for part in split(dataset, index, camera)
+        for part in split(source, index, camera)
         for number in numbers
         if part.first_frame <= number < part.first_frame + part.count
     ]
@@ -159,16 +176,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aegis" / "frames"
 
 
-def split(dataset: Dataset, index: Index, camera: str) -> Iterator[Part]:
+def split(source: Source, index: Index, camera: str) -> Iterator[Part]:
     """A camera's frames in parts that can be decoded one by one, in order."""
-    if dataset.info.features[camera].dtype == "image":
-        for file in rows.data_files(dataset):
+    if source.dataset.info.features[camera].dtype == "image":
+        for file in source.data:
             yield from _image_parts(file, camera)
     else:
-        yield from _video_parts(dataset, index, camera)
+        yield from _video_parts(source, index, camera)
 
 
-def _image_parts(file: rows.DataFile, camera: str) -> Iterator[ImagePart]:
+def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
+    """The file's rows that are read, cut between row groups where there are enough."""
     with layout.reading_parquet(file.path):
         found = layout.open_parquet(file.path)
         if camera not in found.schema_arrow.names:
@@ -178,31 +196,40 @@ def _image_parts(file: rows.DataFile, camera: str) -> Iterator[ImagePart]:
                 layout.AGAIN,
             )
         sizes = [found.metadata.row_group(i).num_rows for i in range(found.metadata.num_row_groups)]
-    groups: list[int] = []
-    first = count = 0
-    for group, size in enumerate(sizes):
-        groups, count = [*groups, group], count + size
-        if count >= _PART or group == len(sizes) - 1:
-            yield ImagePart(file.path, camera, tuple(groups), file.first_frame + first, count)
-            groups, first, count = [], first + count, 0
+    ends = np.cumsum(sizes)
+    for rows in file.rows:
+        first, last = rows.first, rows.first + rows.count
+        for end in ends[np.searchsorted(ends, first, side="right") :].tolist():
+            stop = min(end, last)
+            if stop - first >= _PART or stop == last:
+                groups = np.searchsorted(ends, [first, stop - 1], side="right")
+                chosen = tuple(range(groups[0], groups[1] + 1))
+                skip = first - int(ends[groups[0]] - sizes[groups[0]])
+                frame = rows.first_frame + first - rows.first
+                yield ImagePart(file.path, camera, chosen, skip, frame, stop - first)
+                first = stop
+            if stop == last:
+                break
 
 
-def _video_parts(dataset: Dataset, index: Index, camera: str) -> Iterator[VideoPart]:
-    """Episodes that follow each other in one file are read in one go."""
+def _video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart]:
+    """Episodes that follow each other, also in one file, are read in one go."""
+    dataset = source.dataset
     tolerance = 0.5 / dataset.info.fps
-    frame = first = 0
-    path: Path | None = None
+    starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)]).tolist()
+    first, path = 0, Path()
     times: list[float] = []
-    for episode in dataset.episodes:
-        clip = episode.clips[camera]
-        own = clip.start_s + index.timestamp[frame : frame + episode.length]
-        if times and (clip.file != path or own[0] <= times[-1] or len(times) >= _PART):
-            yield VideoPart(dataset.folder / str(path), tuple(times), tolerance, first)
-            times, first = [], frame
-        path = clip.file
+    for number in source.episodes:
+        frame, clip = starts[number], dataset.episodes[number].clips[camera]
+        own = clip.start_s + index.timestamp[frame : starts[number + 1]]
+        goes_on = clip.file == path and frame == first + len(times)
+        if times and (not goes_on or own[0] <= times[-1] or len(times) >= _PART):
+            yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
+            times = []
+        if not times:
+            first, path = frame, clip.file
         times += own.tolist()
-        frame += episode.length
-    yield VideoPart(dataset.folder / str(path), tuple(times), tolerance, first)
+    yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
 
 
 def _write(
@@ -213,7 +240,8 @@ def _write(
     on_event: OnEvent,
 ) -> None:
     """Decode into a file beside `path`, then rename it."""
-    needed, free = int(np.prod(shape)), shutil.disk_usage(path.parent).free
+    count = sum(part.count for part in parts)
+    needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
         raise AegisError(
             f"{free / 1e9:.1f} GB free in '{path.parent}'",
@@ -230,9 +258,9 @@ def _write(
         with mapped(
             decode, parts, workers, "a decoding process", "free some memory, then run it again"
         ) as counts:
-            for count in counts:
-                done += count
-                on_event(Progress("decode", done, shape[0], "frames"))
+            for decoded in counts:
+                done += decoded
+                on_event(Progress("decode", done, count, "frames"))
         with open(aside, "rb") as file:
             os.fsync(file.fileno())
         os.replace(aside, path)
@@ -259,9 +287,7 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
     return count
 
 
-def _check_some(
-    path: Path, frames: np.ndarray, dataset: Dataset, index: Index, camera: str
-) -> None:
+def _check_some(path: Path, frames: np.ndarray, source: Source, index: Index, camera: str) -> None:
     """Compare the first, a middle and the last cached frame with the dataset's.
 
     To read all of them would take as long as the cache saves.
@@ -269,13 +295,19 @@ def _check_some(
     Raises:
         AegisError: the file holds other frames.
     """
-    numbers = sorted({0, len(frames) // 2, len(frames) - 1})
-    for number, picture in zip(numbers, pick(dataset, index, camera, numbers), strict=True):
-        wanted = fitting.fit(picture, *frames.shape[1:3]).astype(float)
+    parts = list(split(source, index, camera))
+    middle = parts[len(parts) // 2]
+    chosen = {
+        parts[0].first_frame: (parts[0], 0),
+        middle.first_frame + middle.count // 2: (middle, middle.count // 2),
+        parts[-1].first_frame + parts[-1].count - 1: (parts[-1], parts[-1].count - 1),
+    }
+    for number, (part, place) in chosen.items():
+        wanted = fitting.fit(part.at(place), *frames.shape[1:3]).astype(float)
         if np.abs(frames[number] - wanted).mean() > _SAME:
             raise AegisError(
                 f"frame {number} of the cached frames in '{path}', which are not those of "
-                f"'{dataset.folder}'",
+                f"'{source.dataset.folder}'",
                 "the frames that were decoded from it",
                 f"rm '{path}'",
             )

@@ -9,6 +9,7 @@ videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import math
 import re
@@ -200,6 +201,17 @@ def data_file(info: Info, chunk: int, file: int) -> Path:
         ValueError: the dataset's template is none, or leads out of the folder.
     """
     return _filled(info.data_path, {"chunk_index": chunk, "file_index": file})
+
+
+def data_files(info: Info, folder: Path) -> list[Path]:
+    """The parquet files below `folder` whose names the dataset's template can give."""
+    pattern, name = [], []
+    for text, field_name, _, _ in string.Formatter().parse(info.data_path):
+        pattern.append(glob.escape(text) + ("" if field_name is None else "*"))
+        name.append(re.escape(text) + ("" if field_name is None else r"\d+"))
+    fits = re.compile("".join(name))
+    found = sorted(folder.glob("".join(pattern)))
+    return [path for path in found if fits.fullmatch(path.relative_to(folder).as_posix())]
 
 
 def video_file(info: Info, camera: str, chunk: int, file: int) -> Path:

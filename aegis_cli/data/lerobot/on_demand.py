@@ -24,13 +24,18 @@ class FramesOnDemand:
         shape: (N, H, W, 3).
     """
 
-    def __init__(self, parts: Sequence[VideoPart], side: int | None) -> None:
-        """Decode the first frame, which tells their size unless `side` does, in pixels."""
+    def __init__(self, parts: Sequence[VideoPart], count: int, side: int | None) -> None:
+        """Decode the first frame, which tells their size unless `side` does, in pixels.
+
+        Args:
+            parts: the frames that may be asked for, rising.
+            count: N, how many there are with those that are in no part.
+        """
         self._parts = parts
         self._begin_at = [part.first_frame for part in parts]
         self._readers = _Readers()
-        count = parts[-1].first_frame + parts[-1].count
-        height, width = (side, side) if side is not None else self._decoded(0).shape[:2]
+        first = parts[0].first_frame
+        height, width = (side, side) if side is not None else self._decoded(first).shape[:2]
         self.shape = (count, height, width, 3)
 
     def __len__(self) -> int:

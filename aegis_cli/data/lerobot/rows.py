@@ -1,10 +1,8 @@
-"""The numbers of a dataset's frames: which episode a row belongs to, and its vectors."""
+"""The numbers of a dataset's frames: their times, their instructions, and their vectors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +10,12 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
-from aegis_cli.data.lerobot.dataset import Dataset
-
-_INDEX = ("episode_index", "frame_index", "timestamp", "task_index")
-
-
-@dataclass(frozen=True)
-class DataFile:
-    """A file of `data/`, and which of the dataset's frames and episodes are in it."""
-
-    path: Path
-    first_frame: int
-    frames: int
-    first_episode: int
-    lengths: tuple[int, ...]
+from aegis_cli.data.lerobot.source import WITHOUT, DataFile, Source, column, numbers
 
 
 @dataclass(frozen=True)
 class Index:
-    """What the rows say about all N frames.
+    """What the rows say about all N frames of a dataset; 0 for a frame that is not read.
 
     Attributes:
         timestamp: [N] float64, seconds from the episode's start.
@@ -41,106 +26,105 @@ class Index:
     task: np.ndarray
 
 
-def data_files(dataset: Dataset) -> Iterator[DataFile]:
-    """The files in the order of their frames."""
-    frame = number = 0
-    for path, group in groupby(dataset.episodes, lambda episode: episode.data):
-        lengths = tuple(episode.length for episode in group)
-        yield DataFile(dataset.folder / path, frame, sum(lengths), number, lengths)
-        frame, number = frame + sum(lengths), number + len(lengths)
-
-
-def read_index(dataset: Dataset) -> Index:
-    """Times and tasks of all frames, after a check that every row is where the meta folder says.
+def read_index(source: Source) -> Index:
+    """Times and tasks of the frames, after a check that the frames of an episode are in order.
 
     Raises:
-        AegisError: a file that is missing or damaged, rows that are missing or out of place, a task
-            without a text.
+        AegisError: a file that is missing or damaged, rows that are out of place, a task without a
+            text.
     """
-    times, tasks = [], []
-    for file in data_files(dataset):
-        columns = zip(_INDEX, _read(file, _INDEX), strict=True)
-        episode, frame, time, task = (_numbers(column, name, file.path) for name, column in columns)
-        _check_rows(file, episode.astype(np.int64), frame.astype(np.int64))
-        if ((task < 0) | (task >= len(dataset.tasks))).any():
+    frames, texts = source.dataset.info.frames, len(source.dataset.tasks)
+    index = Index(np.zeros(frames), np.zeros(frames, np.int64))
+    for file in source.data:
+        time, frame, task = (
+            _numbers(file, name) for name in ("timestamp", "frame_index", "task_index")
+        )
+        _check_order(source, file, frame)
+        if ((task < 0) | (task >= texts)).any():
             found = f"'{file.path}' has a task_index outside {layout.TASKS}"
-            raise AegisError(found, f"0 to {len(dataset.tasks) - 1}", layout.AGAIN)
-        times.append(time)
-        tasks.append(task.astype(np.int64))
-    return Index(np.concatenate(times), np.concatenate(tasks))
+            raise AegisError(found, f"0 to {texts - 1}", layout.AGAIN)
+        _put(index.timestamp, file, time)
+        _put(index.task, file, task.astype(np.int64))
+    return index
 
 
-def read_vectors(dataset: Dataset, feature: str) -> np.ndarray:
-    """One vector feature of all frames, [N, D] float32.
+def read_vectors(source: Source, feature: str) -> np.ndarray:
+    """One vector feature of all frames, [N, D] float32; 0 for a frame that is not read.
 
     Raises:
         AegisError: a file that is missing or damaged, vectors of another size, or numbers that are
             not finite.
     """
-    size = dataset.size(feature)
-    parts = []
-    for file in data_files(dataset):
-        (column,) = _read(file, (feature,))
-        parts.append(_matrix(column, size, feature, file.path))
-    return np.concatenate(parts)
-
-
-def _read(file: DataFile, names: Sequence[str]) -> list[Any]:
-    with layout.reading_parquet(file.path):
-        found = layout.open_parquet(file.path)
-        if missing := [name for name in names if name not in found.schema_arrow.names]:
-            what = f"no column '{missing[0]}' in '{file.path}'"
-            raise AegisError(what, f"every feature that {layout.INFO} lists", layout.AGAIN)
-        if found.metadata.num_rows != file.frames:
-            episodes = f"{len(file.lengths)} episodes from number {file.first_episode}"
+    size = source.dataset.size(feature)
+    vectors = np.zeros((source.dataset.info.frames, size), np.float32)
+    for file in source.data:
+        rows = _matrix(_read(file, feature), size, feature, file.path)
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if len(bad):
+            row = int(_rows_of(file)[bad[0]])
             raise AegisError(
-                f"{found.metadata.num_rows} rows in '{file.path}'",
-                f"the {file.frames} rows of its {episodes}",
-                layout.AGAIN,
+                f"'{feature}' in '{file.path}' has NaN or infinite values in {len(bad)} rows, the "
+                f"first in row {row}, of episode {_episode_at(source, file, int(bad[0]))}",
+                "finite numbers",
+                "leave those episodes out with demos.only, or record them again",
             )
-        table = found.read(columns=list(names))
-    return [table.column(name) for name in names]
+        _put(vectors, file, rows)
+    return vectors
 
 
-def _numbers(column: Any, name: str, path: Path) -> np.ndarray:
-    """A column's numbers [n] float64, which is exact for any index."""
-    with layout.damaged(path):
-        if column.null_count:
-            raise ValueError(f"'{name}' has {column.null_count} empty cells")
-        numbers = column.to_numpy().astype(np.float64)
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"NaN or infinite values in '{name}'")
-        return numbers
+def _put(target: np.ndarray, file: DataFile, values: np.ndarray) -> None:
+    """Write what was read of a file's rows to the places of their frames."""
+    done = 0
+    for rows in file.rows:
+        target[rows.first_frame : rows.first_frame + rows.count] = values[done : done + rows.count]
+        done += rows.count
 
 
-def _check_rows(file: DataFile, episode: np.ndarray, frame: np.ndarray) -> None:
-    numbers = file.first_episode + np.repeat(np.arange(len(file.lengths)), file.lengths)
-    frames = np.concatenate([np.arange(length) for length in file.lengths])
-    wrong = np.flatnonzero((episode != numbers) | (frame != frames))
+def _rows_of(file: DataFile) -> np.ndarray:
+    """The numbers of the rows that are read [n] int64."""
+    return np.concatenate([np.arange(rows.first, rows.first + rows.count) for rows in file.rows])
+
+
+def _episode_at(source: Source, file: DataFile, place: int) -> int:
+    """The episode of a file's row, by its place among those that are read."""
+    ends = np.cumsum([source.dataset.episodes[number].length for number in file.episodes])
+    return file.episodes[int(np.searchsorted(ends, place, side="right"))]
+
+
+def _read(file: DataFile, name: str) -> Any:
+    """The rows of a column that are read."""
+    with layout.reading_parquet(file.path):
+        cells = column(layout.open_parquet(file.path), file.path, name)
+    if len(file.rows) == 1:
+        return cells.slice(file.rows[0].first, file.rows[0].count)
+    return cells.take(_rows_of(file))
+
+
+def _numbers(file: DataFile, name: str) -> np.ndarray:
+    return numbers(_read(file, name), name, file.path)
+
+
+def _check_order(source: Source, file: DataFile, frame: np.ndarray) -> None:
+    """Raise AegisError unless the rows of each episode are its frames 0, 1, 2 and so on."""
+    lengths = [source.dataset.episodes[number].length for number in file.episodes]
+    wanted = np.concatenate([np.arange(length) for length in lengths])
+    wrong = np.flatnonzero(frame != wanted)
     if len(wrong):
-        row = int(wrong[0])
+        place = int(wrong[0])
+        row, episode = int(_rows_of(file)[place]), _episode_at(source, file, place)
         raise AegisError(
-            f"row {row} of '{file.path}' is frame {frame[row]} of episode {episode[row]}",
-            f"frame {frames[row]} of episode {numbers[row]}, as the meta folder says",
-            layout.AGAIN,
+            f"row {row} of '{file.path}' is frame {int(frame[place])} of episode {episode}",
+            f"frame {wanted[place]} of episode {episode}",
+            WITHOUT,
         )
 
 
-def _matrix(column: Any, size: int, feature: str, path: Path) -> np.ndarray:
+def _matrix(cells: Any, size: int, feature: str, path: Path) -> np.ndarray:
     with layout.damaged(path):
-        if column.null_count:
-            raise ValueError(f"'{feature}' has {column.null_count} empty cells")
-        values = _flat(column.combine_chunks(), size, feature, path)
-        rows = np.asarray(values, np.float32).reshape(-1, size)
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(bad):
-        raise AegisError(
-            f"'{feature}' in '{path}' has NaN or infinite values in {len(bad)} rows, the first "
-            f"in row {bad[0]}",
-            "finite numbers",
-            "leave those episodes out of the dataset, or record them again",
-        )
-    return rows
+        if cells.null_count:
+            raise ValueError(f"'{feature}' has {cells.null_count} empty cells")
+        values = _flat(cells.combine_chunks(), size, feature, path)
+        return np.asarray(values, np.float32).reshape(-1, size)
 
 
 def _flat(array: Any, size: int, feature: str, path: Path) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from aegis_cli.common import files, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import dataset, frames, layout, rows
+from aegis_cli.data.lerobot import dataset, frames, layout, rows, source
 from aegis_cli.data.lerobot.dataset import Dataset
 
 
@@ -87,14 +87,15 @@ def save_sheet(folder: Path, out: Path) -> None:
     found = dataset.load(folder)
     if not found.info.cameras:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
-    index = rows.read_index(found)
+    read = source.find(found)
+    index = rows.read_index(read)
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
     shown = np.unique(
         np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES).round().astype(int)
     )
     ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
     pictures = {
-        camera: dict(zip(ends, frames.pick(found, index, camera, ends), strict=True))
+        camera: dict(zip(ends, frames.pick(read, index, camera, ends), strict=True))
         for camera in found.info.cameras
     }
     entries = []

@@ -244,6 +244,22 @@ class Backbone(nn.Module, ABC):
     def check_text(self, question: str, answer: str) -> None:
         """Raise AegisError if the model cannot read a question with its answer; most read any."""
 
+    def check_prompt(self, text: str) -> None:
+        """Raise AegisError if the model cannot read this text as a prompt; most read any.
+
+        Whether it is too long beside an image, only `process` tells.
+        """
+
+    def check_prompts(self, images: Images, texts: Sequence[str]) -> None:
+        """Raise AegisError unless the model can read each text as a prompt beside one row's images.
+
+        The images are prepared once, with the longest text: a processor takes a good part of a
+        second for them, and demonstrations have thousands of texts.
+        """
+        for text in texts:
+            self.check_prompt(text)
+        self.process(images, [max(texts, key=len)])
+
     def sites(self) -> dict[str, str]:
         """The kind (maps, norms, embeddings, stem) of every module that owns parameters, by name.
 

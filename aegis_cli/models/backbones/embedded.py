@@ -285,6 +285,9 @@ class EmbeddedVLM(Backbone):
             return list(X_WORDS[:count])
         return [f"{x} {y}" for x in X_WORDS for y in Y_WORDS][:count]
 
+    def check_prompt(self, text: str) -> None:
+        _check_length(len(self.tokenizer.prompt(text)))
+
     def check_text(self, question: str, answer: str) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
         # The model's own answer has to fit too.

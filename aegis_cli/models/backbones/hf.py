@@ -273,6 +273,9 @@ class HFBackbone(Backbone):
             for prompts, answered in prepared:
                 yield self._generated(prompts), self._log_likelihood(answered)
 
+    def check_prompt(self, text: str) -> None:
+        self._prompter.check_text(text)
+
     def check_text(self, question: str, answer: str) -> None:
         for text in (question, answer):
             self._prompter.check_text(text)

@@ -228,7 +228,7 @@ def test_missing_episode_rows(bad: Bad, folder: Path) -> None:
 
 def test_missing_frames(bad: Bad, folder: Path) -> None:
     edit_table(folder / IMAGE, lambda table: table.slice(1))
-    bad(*FROM_FOLDER, says=(IMAGE, "rows of its 5 episodes"))
+    bad(*FROM_FOLDER, says=("4 rows of episode 0", IMAGE, "5 rows one after the other"))
 
 
 def test_frames_out_of_place(bad: Bad, folder: Path) -> None:

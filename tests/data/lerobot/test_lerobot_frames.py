@@ -15,7 +15,7 @@ from samples.lerobot import episodes, frames, read, save
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import GREY
-from aegis_cli.data.lerobot import dataset, rows, video
+from aegis_cli.data.lerobot import dataset, rows, source, video
 from aegis_cli.data.lerobot import frames as camera_frames
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -31,7 +31,7 @@ def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.Monk
     whole = frames(made)
     reencode(path, gop=1000)
     monkeypatch.setattr(camera_frames, "_PART", 8)
-    found = dataset.load(folder)
+    found = source.find(dataset.load(folder))
     index = rows.read_index(found)
     parts = list(camera_frames.split(found, index, "observation.images.top"))
     assert len(parts) > 1 and sum(part.count for part in parts) == len(whole)

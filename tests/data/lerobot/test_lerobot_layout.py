@@ -24,7 +24,7 @@ from samples.lerobot import (
 )
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import dataset, layout, rows, write
+from aegis_cli.data.lerobot import dataset, layout, rows, source, write
 from aegis_cli.data.lerobot.write import Limits
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -243,11 +243,12 @@ def test_several_files_and_chunks_of_videos(tmp_path: Path, tinier_files: int) -
 
 def assert_same(folder: Path, made: list[write.NewEpisode], camera: str | None = None) -> None:
     found = dataset.load(folder)
-    index, (state, actions, texts) = rows.read_index(found), joined(made)
+    chosen, (state, actions, texts) = source.find(found), joined(made)
+    index = rows.read_index(chosen)
     assert [episode.length for episode in found.episodes] == [len(e.actions) for e in made]
     assert [found.tasks[i] for i in index.task] == texts
-    np.testing.assert_array_equal(rows.read_vectors(found, layout.STATE), state)
-    np.testing.assert_array_equal(rows.read_vectors(found, layout.ACTION), actions)
+    np.testing.assert_array_equal(rows.read_vectors(chosen, layout.STATE), state)
+    np.testing.assert_array_equal(rows.read_vectors(chosen, layout.ACTION), actions)
     np.testing.assert_array_equal(read(folder, camera), frames(made, camera or "top"))
 
 

@@ -64,6 +64,11 @@ class AegisPolicy(PreTrainedPolicy):
         self.model = model or _new(config, dataset_stats)
         self._meta = dict(meta or {"task": None, "normalization": config.normalization})
         self._cameras = self._in_order()
+        if model is None and self.model.backbone.image_size is None:
+            features = config.image_features
+            self._meta["pictures"] = [list(features[name].shape[1:]) for name in self._cameras]
+        sizes = checkpoint.sizes_of(self._meta)
+        self._sizes = dict(zip(self._cameras, sizes, strict=True)) if sizes else {}
         _check_sizes(config, self.model)
         _check_cameras(self._cameras, self.model)
         chosen = methods.get(config.method)
@@ -174,9 +179,11 @@ class AegisPolicy(PreTrainedPolicy):
                 "train without FSDP",
             )
         self.config._save_pretrained(save_directory)
-        meta = {"method": self.config.method, "replan": self.config.n_action_steps}
-        if len(self._cameras) > 1:
-            meta["cameras"] = [_short(name) for name in self._cameras]
+        meta = {
+            "method": self.config.method,
+            "replan": self.config.n_action_steps,
+            "cameras": [_short(name) for name in self._cameras],
+        }
         lerobot_folder.write_model(Path(save_directory), self.model, {**self._meta, **meta})
 
     @classmethod
@@ -258,15 +265,16 @@ class AegisPolicy(PreTrainedPolicy):
         return list(zip(*pictures, strict=True))
 
     def _pictures(self, batch: Mapping[str, Any], name: str) -> list[Tensor]:
-        """B pictures [H, W, 3] uint8 of one camera, fitted to the backbone as in training."""
+        """B pictures [H, W, 3] uint8 of one camera, in the size that training showed."""
         found = batch[name]
         if found.is_floating_point():
             found = (found * 255).round().clamp(0, 255).to(torch.uint8)
         rows = found.permute(0, 2, 3, 1).cpu().contiguous()
-        size = self.model.backbone.image_size
-        if size is None or rows.shape[1:3] == (size, size):
+        side = self.model.backbone.image_size
+        size = self._sizes.get(name) if side is None else (side, side)
+        if size is None or rows.shape[1:3] == size:
             return list(rows)
-        fitted = [fit(row.numpy(), size, size) for row in rows]
+        fitted = [fit(row.numpy(), *size) for row in rows]
         return [torch.from_numpy(np.ascontiguousarray(row)) for row in fitted]
 
 

@@ -1,0 +1,230 @@
+"""What is read of a dataset: which of its episodes, the files that hold them, and their digest.
+
+The meta folder names the file of each episode's rows, too. It is not asked: LeRobot's converter
+from v2.1 named the file before it for the first episode of every file, as long as it was older than
+0.5.0, and many datasets on the hub were converted by it. A file's own rows say which episodes it
+holds, and LeRobot itself reads all the files there are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import dataset as datasets
+from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot.dataset import Dataset
+
+WITHOUT = "get the dataset again, or leave those episodes out with demos.only"
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a data file, one after the other, and the dataset's frames that they are.
+
+    Attributes:
+        first: number of the first row in its file.
+        first_frame: number of its frame in the dataset.
+        count: how many rows there are.
+    """
+
+    first: int
+    first_frame: int
+    count: int
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """A file of `data/` that holds episodes to be read.
+
+    Attributes:
+        episodes: their numbers, in the order of its rows.
+        rows: their rows; those of episodes that follow each other are together.
+    """
+
+    path: Path
+    episodes: tuple[int, ...]
+    rows: tuple[Rows, ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Some of a dataset's episodes, or all of them, and the data files that they are in.
+
+    Frames and episodes keep the numbers that they have in the whole dataset.
+
+    Attributes:
+        episodes: numbers of the episodes that are read, rising.
+        data: the files, in the order of their first episodes.
+    """
+
+    dataset: Dataset
+    episodes: tuple[int, ...]
+    data: tuple[DataFile, ...]
+
+    @cached_property
+    def frames(self) -> int:
+        """How many frames are read."""
+        return sum(self.dataset.episodes[number].length for number in self.episodes)
+
+
+def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
+    """Find the rows of these episodes, or of all of them for None.
+
+    Files that hold none of them need not be there.
+
+    Raises:
+        AegisError: a file that is missing or damaged, or rows that are not those of which the meta
+            folder speaks.
+    """
+    wanted = range(len(dataset.episodes)) if episodes is None else sorted(episodes)
+    starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)])
+    asked, seen = set(wanted), dict[int, Path]()
+    found = []
+    for path in layout.data_files(dataset.info, dataset.folder):
+        file = _file(dataset, path, asked, starts)
+        for number in file.episodes:
+            if number in seen:
+                raise AegisError(
+                    f"episode {number} in '{path}' and in '{seen[number]}'",
+                    "the rows of an episode in one file",
+                    layout.AGAIN,
+                )
+            seen[number] = path
+        if file.episodes:
+            found.append(file)
+    for number in wanted:
+        if number not in seen:
+            raise _missing(dataset, number)
+    found.sort(key=lambda file: file.rows[0].first_frame)
+    return Source(dataset, tuple(wanted), tuple(found))
+
+
+def _file(dataset: Dataset, path: Path, asked: set[int], starts: np.ndarray) -> DataFile:
+    """The episodes that a file holds, as far as they are asked for."""
+    episode_of = _episode_of_rows(path)
+    changes = np.flatnonzero(np.diff(episode_of)) + 1
+    ends = [*changes.tolist(), len(episode_of)]
+    numbers, rows, first = list[int](), list[Rows](), 0
+    for end in ends if len(episode_of) else []:
+        number = int(episode_of[first])
+        if number in asked:
+            _check_length(dataset, path, number, end - first)
+            numbers.append(number)
+            rows.append(Rows(first, int(starts[number]), end - first))
+        elif not 0 <= number < len(dataset.episodes):
+            raise AegisError(
+                f"row {first} of '{path}' is of episode {number}",
+                f"0 to {len(dataset.episodes) - 1}, as the meta folder says",
+                layout.AGAIN,
+            )
+        first = end
+    return DataFile(path, tuple(numbers), _together(rows))
+
+
+def _episode_of_rows(path: Path) -> np.ndarray:
+    """The episode of each row [n] int64."""
+    name = "episode_index"
+    with layout.reading_parquet(path):
+        cells = column(layout.open_parquet(path), path, name)
+    return numbers(cells, name, path).astype(np.int64)
+
+
+def column(file: Any, path: Path, name: str) -> Any:
+    """A column of an open parquet file.
+
+    Raises:
+        AegisError: the file has none of that name.
+    """
+    if name not in file.schema_arrow.names:
+        raise AegisError(
+            f"no column '{name}' in '{path}'",
+            f"every feature that {layout.INFO} lists",
+            layout.AGAIN,
+        )
+    return file.read(columns=[name]).column(name)
+
+
+def numbers(column: Any, name: str, path: Path) -> np.ndarray:
+    """A column's numbers [n] float64, which is exact for any index.
+
+    Raises:
+        AegisError: a cell is empty, or no finite number.
+    """
+    with layout.damaged(path):
+        if column.null_count:
+            raise ValueError(f"'{name}' has {column.null_count} empty cells")
+        values = column.to_numpy().astype(np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError(f"NaN or infinite values in '{name}'")
+        return values
+
+
+def _check_length(dataset: Dataset, path: Path, number: int, rows: int) -> None:
+    length = dataset.episodes[number].length
+    if rows != length:
+        raise AegisError(
+            f"{rows} rows of episode {number} in '{path}'",
+            f"{length} rows one after the other, as the meta folder says",
+            WITHOUT,
+        )
+
+
+def _together(rows: Sequence[Rows]) -> tuple[Rows, ...]:
+    """The same rows; those that go on where the ones before end, in the file and in the dataset."""
+    joined = list[Rows]()
+    for own in rows:
+        if joined:
+            last = joined[-1]
+            goes_on = (last.first + last.count, last.first_frame + last.count)
+            if goes_on == (own.first, own.first_frame):
+                joined[-1] = Rows(last.first, last.first_frame, last.count + own.count)
+                continue
+        joined.append(own)
+    return tuple(joined)
+
+
+def _missing(dataset: Dataset, number: int) -> AegisError:
+    path = dataset.folder / dataset.episodes[number].data
+    if path.exists():
+        found = f"no rows of episode {number} in '{dataset.folder}'"
+    else:
+        found = f"no file '{path}'"
+    return AegisError(found, f"episode {number}, which the meta folder says is there", WITHOUT)
+
+
+# --- digests --------------------------------------------------------------------------------------
+
+
+def digests(source: Source, cameras: Sequence[str]) -> list[str]:
+    """A digest per camera: sha256 over its name and every file that training on it reads."""
+    dataset = source.dataset
+    read = [dataset.episodes[number] for number in source.episodes]
+    shared = {layout.INFO, layout.TASKS}
+    for path in [*datasets.episode_files(dataset.folder), *(file.path for file in source.data)]:
+        shared.add(path.relative_to(dataset.folder))
+    hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
+    found = []
+    for camera in cameras:
+        clips = {episode.clips[camera].file for episode in read if camera in episode.clips}
+        hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
+        own = {str(path): hashes[path] for path in shared | clips}
+        text = files.canonical({"camera": camera, "files": own})
+        found.append(hashlib.sha256(text.encode()).hexdigest())
+    return found
+
+
+def joined_digest(digests: Sequence[str]) -> str:
+    """sha256 of what is learned from several cameras together; a single camera's own digest."""
+    if len(digests) == 1:
+        return digests[0]
+    text = files.canonical({"cameras": list(digests)})
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,42 @@
+"""Which of the demonstrations are learned from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot.layout import ACTION, STATE
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which episodes of demonstrations are read, and which features of a LeRobot folder.
+
+    Attributes:
+        camera: one or several of the folder's cameras; None: the only one there is.
+        only: the episodes, as `demos.only` names them; None: all.
+        state, action: the features that are proprioception and actions; several are joined, and ()
+            reads none.
+    """
+
+    camera: str | tuple[str, ...] | None = None
+    only: str | None = None
+    state: str | tuple[str, ...] = STATE
+    action: str | tuple[str, ...] = ACTION
+
+    def check_file(self, path: Path) -> None:
+        """Raise AegisError where something is chosen that a file of `aegis demos` does not have."""
+        for name, what in (("camera", "a camera"), ("state", "features"), ("action", "features")):
+            chosen = getattr(self, name)
+            if chosen in (getattr(ALL, name), ()):
+                continue
+            named = chosen if isinstance(chosen, str) else ", ".join(chosen)
+            raise AegisError(
+                f"demos.{name}: {named} with the file '{path}'",
+                f"a LeRobot folder, to choose {what} of",
+                f"leave demos.{name} out",
+            )
+
+
+ALL = Selection()
