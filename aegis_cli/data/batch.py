@@ -18,8 +18,8 @@ Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
 Asked = tuple[Images, Sequence[str], Sequence[str]]
 
 # A dimension that varies less than this share of its own magnitude is left unscaled: dividing by a
-# deviation of almost nothing would turn sensor noise into the largest input. Around zero there is no
-# magnitude, and units may be large: of slow motions in metres a frame, a deviation is 1e-5.
+# deviation of almost nothing would turn sensor noise into the largest input. Around zero there is
+# no magnitude, and units may be large: slow motions in metres a frame deviate by 1e-5.
 _NEAR_CONSTANT, _LEAST = 1e-4, 1e-6
 
 

@@ -47,7 +47,7 @@ _SAID = (
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 
-is_policy = model_folder.is_policy
+is_policy, is_own_config = model_folder.is_policy, model_folder.is_own_config
 
 
 def write(

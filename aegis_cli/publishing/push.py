@@ -8,12 +8,13 @@ import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.version import __version__
+from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint
 
@@ -35,7 +36,8 @@ class PushReport:
         dtype: name of the type that the backbone's weights are in.
         url: of the commit; None where nothing was sent.
         files: their paths in the repository.
-        megabytes: their sizes together.
+        removed: paths of a policy in the other layout that was there; not known of a dry run.
+        megabytes: the sizes of `files` together.
     """
 
     repo: str
@@ -44,6 +46,7 @@ class PushReport:
     dtype: str
     private: bool
     files: tuple[str, ...]
+    removed: tuple[str, ...]
     megabytes: float
 
     def to_json(self) -> dict[str, Any]:
@@ -61,7 +64,8 @@ def run(
 ) -> PushReport:
     """Send a run's policy, or that of a checkpoint in a run, to the hub in one commit.
 
-    A repository that is not there is created. Files that it has and the policy has not, stay.
+    A repository that is not there is created. Of its other files those go that a push in the other
+    layout has left, which would be loaded instead of the new policy; all others stay.
 
     Args:
         repo: ORG/NAME.
@@ -91,10 +95,10 @@ def run(
         contents = _files(folder)
         if form == card.AEGIS:
             contents[RECIPE] = home / "recipe.yaml"
-        url = None if api is None else _send(api, repo, contents, private)
+        url, removed = (None, ()) if api is None else _send(api, repo, contents, private)
         size = sum(path.stat().st_size for path in contents.values())
         dtype, files = exported.dtype, tuple(sorted(contents))
-        return PushReport(repo, url, form, dtype, private, files, size / 1e6)
+        return PushReport(repo, url, form, dtype, private, files, removed, size / 1e6)
 
 
 def _check_name(repo: str) -> None:
@@ -133,13 +137,15 @@ def _api() -> HfApi:
     return huggingface_hub.HfApi(library_name="aegis-vla", library_version=__version__)
 
 
-def _send(api: HfApi, repo: str, contents: Mapping[str, Path], private: bool) -> str:
+def _send(
+    api: HfApi, repo: str, contents: Mapping[str, Path], private: bool
+) -> tuple[str, tuple[str, ...]]:
     """Create the repository where it is missing, and commit the files.
 
     Returns:
-        Where the commit can be seen.
+        Where the commit can be seen, and which files it removes.
     """
-    from huggingface_hub import CommitOperationAdd
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
     added = [CommitOperationAdd(path, content) for path, content in sorted(contents.items())]
     with _reaching(repo):
@@ -151,8 +157,30 @@ def _send(api: HfApi, repo: str, contents: Mapping[str, Path], private: bool) ->
                 "a private repository, or a new one",
                 "choose another name, or make it private in its settings",
             )
+        removed = _of_the_other_layout(api, repo, contents)
+        changes = [*added, *(CommitOperationDelete(path) for path in removed)]
         message = f"A policy of Aegis {__version__}"
-        return str(api.create_commit(repo, added, commit_message=message).commit_url)
+        commit = api.create_commit(repo, changes, commit_message=message)
+    return str(commit.commit_url), removed
+
+
+def _of_the_other_layout(api: HfApi, repo: str, contents: Mapping[str, Path]) -> tuple[str, ...]:
+    """The files that an earlier push in the other layout has left in a repository."""
+    siblings = api.repo_info(repo).siblings or []
+    there = {file.rfilename for file in siblings} - set(contents)
+    left = set[str]()
+    if {lerobot_folder.CONFIG, lerobot_folder.MODEL} <= there:
+        # Other policies and models have files of these names.
+        config = Path(api.hf_hub_download(repo, lerobot_folder.CONFIG))
+        if lerobot_folder.is_own_config(config.read_bytes()):
+            left |= {lerobot_folder.CONFIG, lerobot_folder.MODEL}
+            left |= {lerobot_folder.PREPROCESSOR, lerobot_folder.POSTPROCESSOR}
+    if checkpoint.EXPERT in there:
+        weights = [
+            n for n in there if PurePosixPath(n).match(f"{checkpoint.BACKBONE}/*.safetensors")
+        ]
+        left |= {checkpoint.EXPERT, RECIPE, *weights}
+    return tuple(sorted(left & there))
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from samples.hub import Hub
 from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
+from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, push
 from aegis_cli.training import checkpoint
 
@@ -54,6 +55,39 @@ def test_what_is_downloaded_is_the_runs_policy(
     tensors = found[0].state_dict()
     for name, tensor in own[0].state_dict().items():
         assert torch.equal(tensor, tensors[name]), name
+
+
+FORMS = (card.AEGIS, card.LEROBOT)
+
+
+@pytest.mark.parametrize(("first", "second"), [FORMS, FORMS[::-1], (card.AEGIS,) * 2])
+def test_a_push_in_another_layout_takes_the_place_of_the_one_before(
+    first: str, second: str, run_folder: Path, hub: Hub, tmp_path: Path, own_cache: None
+) -> None:
+    push.run(run_folder, REPO, first)
+    hub.committed["notes.txt"] = hub.committed["backbone/notes.txt"] = b"mine"
+    before = set(hub.committed)
+    report = push.run(run_folder, REPO, second)
+    assert set(hub.committed) == {*report.files, "notes.txt", "backbone/notes.txt"}
+    assert set(report.removed) == before - set(hub.committed)
+    assert lerobot_folder.is_policy(download(hub, tmp_path / "x")) == (second == card.LEROBOT)
+    checkpoint.load_policy(tmp_path / "x")
+
+
+@pytest.mark.parametrize("config", [b'{"type": "smolvla"}', b'{"model_type": "smolvlm"}', b"no"])
+def test_the_files_of_another_program_stay(
+    config: bytes, run_folder: Path, hub: Hub, own_cache: None
+) -> None:
+    hub.committed |= {"config.json": config, "model.safetensors": b"theirs"}
+    assert push.run(run_folder, REPO).removed == ()
+    assert hub.committed["config.json"] == config and "model.safetensors" in hub.committed
+
+
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub-cache"))
 
 
 def test_a_checkpoints_files_are_those_of_its_user_and_the_recipe(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import threading
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ class Hub:
     """What the stand-in has been sent, and how it answers.
 
     Attributes:
-        committed: the files by their paths, of all commits.
+        committed: the files by their paths, after all commits.
         created: what a repository was asked for with; None before that.
         public: whether the repository is there already, and public.
     """
@@ -43,7 +44,14 @@ class Hub:
         if "/commit/" in path:
             repo = path.removeprefix("/api/models/").split("/commit/")[0]
             return 200, self._commit(body, repo)
-        return 200, {"id": path.removeprefix("/api/models/"), "private": not self.public}
+        found: dict[str, Any] = {"id": path.removeprefix("/api/models/")}
+        files = [{"rfilename": name} for name in sorted(self.committed)]
+        return 200, found | {"private": not self.public, "siblings": files}
+
+    def file(self, path: str) -> bytes | None:
+        """What is downloaded under a path; None: no file's."""
+        _, resolve, name = path.partition("/resolve/main/")
+        return self.committed.get(name) if resolve else None
 
     def _commit(self, body: bytes, repo: str) -> dict[str, Any]:
         for line in body.splitlines():
@@ -51,6 +59,8 @@ class Hub:
             if entry["key"] == "file":
                 value = entry["value"]
                 self.committed[value["path"]] = base64.b64decode(value["content"])
+            if entry["key"] == "deletedFile":
+                del self.committed[entry["value"]["path"]]
         oid = "0" * 40
         return {"success": True, "commitOid": oid, "commitUrl": f"{self.url}/{repo}/commit/{oid}"}
 
@@ -61,7 +71,21 @@ def _handler(hub: Hub) -> type[BaseHTTPRequestHandler]:
             self._reply(self._body())
 
         def do_GET(self) -> None:
-            self._reply(b"")
+            if (content := hub.file(self.path)) is None:
+                self._reply(b"")
+            else:
+                self._file(content)
+
+        do_HEAD = do_GET
+
+        def _file(self, content: bytes) -> None:
+            self.send_response(200)
+            self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+            self.send_header("X-Repo-Commit", "0" * 40)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(content)
 
         def _body(self) -> bytes:
             if self.headers.get("Transfer-Encoding") != "chunked":
@@ -115,4 +139,6 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     with serving() as found:
         monkeypatch.setattr(constants, "ENDPOINT", found.url)
+        files = found.url + "/{repo_id}/resolve/{revision}/{filename}"
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", files)
         yield found

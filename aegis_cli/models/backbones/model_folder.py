@@ -75,8 +75,13 @@ def is_policy(folder: Path) -> bool:
     path = folder / "config.json"
     if not path.is_file() or not (folder / "model.safetensors").is_file():
         return False
+    return is_own_config(path.read_bytes())
+
+
+def is_own_config(content: bytes) -> bool:
+    """Whether this is LeRobot's configuration of a policy of ours."""
     try:
-        config = files.parse_json(path.read_bytes())
+        config = files.parse_json(content)
     except ValueError:
         return False  # whoever loads it as a model of the hub says what is wrong
     return isinstance(config, dict) and config.get("type") == "aegis"
