@@ -152,7 +152,8 @@ def demos(
     \b
     Example: aegis demos reach --episodes 300 --out reach.safetensors
     Example: aegis demos reach --episodes 300 --format lerobot --out reach-dataset
-    Example: aegis demos suite/cartpole-swingup --out cartpole.safetensors
+    Example: aegis demos suite/cartpole-swingup --episodes 4 --drop-below 0.2 \\
+                 --out cartpole.safetensors
     Example: aegis demos metaworld/mt4 --episodes 400 --out mt4.safetensors
     Example: aegis demos metaworld/door-open --format lerobot --out door-dataset \\
                  --camera corner2 --camera gripperPOV
