@@ -17,6 +17,8 @@ import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from dm_control import suite  # noqa: E402
 from dm_control.suite.utils import randomizers  # noqa: E402
 
+from aegis_cli.sim.scene import SLOW_FLAGS  # noqa: E402
+
 _TASK = {
     "acrobot": ("acrobot", "swingup"),
     "cartpole": ("cartpole", "balance"),
@@ -29,7 +31,6 @@ _TASK = {
     "pendulum": ("pendulum", "swingup"),
     "swimmer": ("swimmer", "swimmer6"),
 }
-_SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 _PLAIN = Photo(noise=(0.0, 0.04), cast=0.2)
 _THERMAL = Photo(blur_px=(0.0, 0.8), noise=(0.02, 0.06), contrast=(0.6, 1.0))
 
@@ -44,7 +45,7 @@ class Robot:
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
         with interrupts.deferred():  # half of a context cannot be closed
             self._renderer = mujoco.Renderer(model, SIZE, SIZE)
-        for flag in _SLOW_FLAGS:
+        for flag in SLOW_FLAGS:
             self._renderer.scene.flags[flag] = False
         atexit.register(self._renderer.close)  # while EGL is still there
 
