@@ -203,8 +203,9 @@ def test_an_offline_hub_is_one_error(
 
 
 @pytest.mark.parametrize("name", ["alone", "a/b/c", "-a/b", "a/b.git", "a/b--c", "a b/c", "/b"])
-def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, run_folder: Path) -> None:
-    assert "ORG/NAME" in refused(aegis("push", "--dry-run", "--", run_folder, name))
+def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, tmp_path: Path) -> None:
+    """Before the run is looked at."""
+    assert "ORG/NAME" in refused(aegis("push", "--dry-run", "--", tmp_path, name))
 
 
 def test_what_is_no_run_is_refused(aegis: Aegis, run_folder: Path, tmp_path: Path) -> None:

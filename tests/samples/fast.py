@@ -46,6 +46,7 @@ TESTS = (
     "pretraining/test_pretrain.py::test_the_recipe_that_ships_loads",
     "pretraining/test_pretrain_dual.py::"
     "test_the_loss_is_least_where_positives_win_and_no_others_count_against_them",
+    "publishing/test_push.py::test_what_is_no_repository_is_refused",
 )
 
 
