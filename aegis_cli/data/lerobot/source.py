@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -211,15 +211,33 @@ def digests(source: Source, cameras: Sequence[str]) -> list[str]:
     shared = {layout.INFO, layout.TASKS}
     for path in [*datasets.episode_files(dataset.folder), *(file.path for file in source.data)]:
         shared.add(path.relative_to(dataset.folder))
-    hashes = {path: files.sha256_file(dataset.folder / path) for path in shared}
+    hashes = {path: _sha256(dataset.folder / path) for path in shared}
     found = []
     for camera in cameras:
         clips = {episode.clips[camera].file for episode in read if camera in episode.clips}
-        hashes |= {path: files.sha256_file(dataset.folder / path) for path in clips}
+        hashes |= {path: _sha256(dataset.folder / path) for path in clips if path not in hashes}
         own = {str(path): hashes[path] for path in shared | clips}
         text = files.canonical({"camera": camera, "files": own})
         found.append(hashlib.sha256(text.encode()).hexdigest())
     return found
+
+
+def _sha256(path: Path) -> str:
+    """The file's digest, which is taken once as long as nobody writes to it.
+
+    A job with several methods asks anew for each, and videos are many gigabytes.
+    """
+    if not path.is_file():
+        return files.sha256_file(path)  # which says what is wrong
+    state = path.stat()
+    changes = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+    return _hashed(path.resolve(), changes)
+
+
+@cache
+def _hashed(path: Path, changes: tuple[int, ...]) -> str:
+    """`changes` is what would differ if somebody had written to the file."""
+    return files.sha256_file(path)
 
 
 def joined_digest(digests: Sequence[str]) -> str:

@@ -121,6 +121,18 @@ def test_a_sound_datasets_digest_is_of_the_files_that_its_meta_folder_names(fold
     assert loaded(folder).sha256 == one
 
 
+def test_a_file_is_read_once_for_its_digest_until_it_changes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = demonstrations.digest(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(source.files, "sha256_file", lambda path: pytest.fail(f"reads {path}"))
+        assert demonstrations.digest(folder) == first
+    path = data_files(folder)[0]
+    edit_table(path, lambda table: replaced(table, "timestamp", table["timestamp"]))
+    assert demonstrations.digest(folder) != first
+
+
 def test_an_episode_in_two_files(folder: Path) -> None:
     lay_out(folder, [6])
     second = data_files(folder)[1]
