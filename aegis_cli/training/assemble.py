@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import devices, launch
+from aegis_cli.common import artifacts, devices, launch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
@@ -197,6 +197,8 @@ def build(
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
     _check_parts(method, measured, recipe.backbone)
+    if anchor is not None and method.needs:
+        _warn_of_another_prompt(anchor, recipe, on_event)
     # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
@@ -381,6 +383,23 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
     """What the method reads of the anchor."""
     found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
     return anchor_file.to_device(found, device)
+
+
+def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> None:
+    """Warn of an anchor whose questions were asked in another way than the recipe asks.
+
+    A chat model answers `{}` in sentences, and `{} Give a very brief answer.` in a word: what keeps
+    the one need not keep the other.
+    """
+    meta = artifacts.read_header(path).meta
+    asked = meta.get("ask", sets.PLAIN)
+    if "vqa" in meta and asked != recipe.anchor.ask:
+        text = (
+            f"the questions of '{path}' were asked as '{asked}', and the recipe asks them as "
+            f"'{recipe.anchor.ask}' (anchor.ask): measure the anchor with --ask "
+            f"'{recipe.anchor.ask}', or --set 'anchor.ask={asked}'; and probe with the same --ask"
+        )
+        on_event(Warned("train", text))
 
 
 def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:

@@ -29,7 +29,7 @@ from torch import nn
 
 from aegis_cli.anchors import anchor_file as anchor_files
 from aegis_cli.common import artifacts
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
@@ -356,3 +356,35 @@ def batches(
             demos.batch(rows, SETTINGS.chunk),
             torch.Generator().manual_seed((seed * 1_000_003 + i) * 4 + 1),
         )
+
+
+@pytest.mark.parametrize(
+    ("asked", "wanted", "method", "warned"),
+    [
+        ("{} shortly", "{}", "aegis", True),
+        ("{}", "{} shortly", "aegis", True),
+        ("{} shortly", "{} shortly", "aegis", False),
+        ("{} shortly", "{}", "naive", False),
+    ],
+)
+def test_an_anchor_whose_questions_were_asked_in_another_way_is_told(
+    asked: str,
+    wanted: str,
+    method: str,
+    warned: bool,
+    start: Start,
+    recipe: Recipe,
+    anchor_file: Path,
+    tmp_path: Path,
+) -> None:
+    saved = artifacts.load(anchor_file, "anchor")
+    meta = {**saved.header.meta, "vqa": "questions.jsonl", "ask": asked}
+    other = tmp_path / "anchor.safetensors"
+    artifacts.save(other, "anchor", saved.tensors, fingerprint=saved.header.fingerprint, meta=meta)
+    told = replace(recipe, anchor=replace(recipe.anchor, ask=wanted))
+    said: list[Event] = []
+    start(method, tmp_path / "run", recipe=told, anchor=other, on_event=said.append)
+    texts = [event.text for event in said if isinstance(event, Warned)]
+    assert [f"asked as '{asked}'" in text and f"--ask '{wanted}'" in text for text in texts] == (
+        [True] if warned else []
+    )
