@@ -84,7 +84,7 @@ def measure_passes(
     on_event: OnEvent = ignore,
     ranks: Ranks = ALONE,
 ) -> tuple[list[Moments], list[Moments]]:
-    """The same of any images, each with a text that it is read with.
+    """The moments of each layer over image and over text tokens, of images that are read with texts.
 
     Args:
         batches: in which they are passed; `read` finds one's images and texts, for a GPU in several

@@ -106,7 +106,7 @@ def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 def shared_moments(
     hidden: Sequence[Tensor], mask: Tensor, total: Callable[[Tensor], Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
-    """The same of each layer, where several processes have a share of the batch each.
+    """Each layer's mean [D] and variance [D] of a batch that several processes share.
 
     Mean and variance are those of all shares. Their gradients reach this process's tokens alone, so
     that the processes' gradients add up to that of the batch.

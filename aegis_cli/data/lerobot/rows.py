@@ -10,7 +10,7 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
-from aegis_cli.data.lerobot.source import WITHOUT, DataFile, Source, column, numbers
+from aegis_cli.data.lerobot.source import LEFT_OUT, WITHOUT, DataFile, Source, column, numbers
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def read_vectors(source: Source, feature: str) -> np.ndarray:
                 f"'{feature}' in '{file.path}' has NaN or infinite values in {len(bad)} rows, the "
                 f"first in row {row}, of episode {_episode_at(source, file, int(bad[0]))}",
                 "finite numbers",
-                "leave those episodes out with demos.only, or record them again",
+                f"{LEFT_OUT}, or record them again",
             )
         _put(vectors, file, rows)
     return vectors

@@ -23,7 +23,8 @@ from aegis_cli.data.lerobot import dataset as datasets
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.dataset import Dataset
 
-WITHOUT = "get the dataset again, or leave those episodes out with demos.only"
+LEFT_OUT = "leave those episodes out (demos.only, or --episodes of aegis evaluate)"
+WITHOUT = f"get the dataset again, or {LEFT_OUT}"
 
 
 @dataclass(frozen=True)
