@@ -84,7 +84,7 @@ def measure_passes(
     on_event: OnEvent = ignore,
     ranks: Ranks = ALONE,
 ) -> tuple[list[Moments], list[Moments]]:
-    """The moments of each layer over image and over text tokens, of images that are read with texts.
+    """The moments of each layer over image and text tokens, of images that are read with texts.
 
     Args:
         batches: in which they are passed; `read` finds one's images and texts, for a GPU in several

@@ -78,7 +78,7 @@ def relative_distance(
 
 
 def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor] | None) -> Tensor:
-    """Squared distance of a student's tokens [n, D] from a teacher's, over the teacher's variance."""
+    """Squared distance of a student's tokens [n, D] from a teacher's, over their variance."""
     off = (student - teacher).square().sum()
     if total is None:
         return off / (teacher - teacher.mean(0)).square().sum()
@@ -89,7 +89,7 @@ def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor
 def _relative_padded(
     student: Tensor, teacher: Tensor, valid: Tensor, total: Callable[[Tensor], Tensor] | None
 ) -> Tensor:
-    """What `_relative` returns, of tokens [B, T, D] of which those that are `valid` [B, T, 1] count."""
+    """What `_relative` returns, of tokens [B, T, D], of which `valid` [B, T, 1] ones count."""
     add_up = total or (lambda x: x)
     off = (student - teacher).masked_fill(~valid, 0).square().sum()
     shown = teacher.masked_fill(~valid, 0)
