@@ -151,15 +151,39 @@ def poison(groups: Groups) -> None:
 # --- several processes ---------------------------------------------------------------------------
 
 
-def check_group(group: dist.ProcessGroup | None) -> None:
-    """Raise AegisError where several processes run and no group names those that share a model."""
-    if group is not None or not dist.is_available() or not dist.is_initialized():
-        return
-    if dist.get_world_size() > 1:
+WORLD = "world"  # all processes, also where they are connected only after the guard was made
+Group = dist.ProcessGroup | str | None
+
+
+def processes() -> int:
+    """How many processes torch.distributed has connected by now; 1 where it has none."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def resolved(group: Group) -> dist.ProcessGroup | None:
+    """The group that is meant, as far as it is there by now.
+
+    Raises:
+        AegisError: another text than "world".
+    """
+    if not isinstance(group, str):
+        return group
+    if group != WORLD:
         raise AegisError(
-            f"a guard in one of {dist.get_world_size()} processes without process_group=",
-            "the group of those that train one model together",
-            "process_group=torch.distributed.group.WORLD, under DistributedDataParallel or FSDP2",
+            f"process_group={group!r}",
+            f"a group of torch.distributed, or {WORLD!r}",
+            f"process_group={WORLD!r}",
+        )
+    return dist.group.WORLD if processes() > 1 else None
+
+
+def check_group(group: Group) -> None:
+    """Raise AegisError where several processes run and no group names those that share a model."""
+    if resolved(group) is None and processes() > 1:
+        raise AegisError(
+            f"a guard in one of {processes()} processes without process_group=",
+            "those that train one model together",
+            f"process_group={WORLD!r}, under DistributedDataParallel or FSDP2",
         )
 
 

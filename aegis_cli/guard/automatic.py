@@ -75,6 +75,7 @@ class AutomaticLoop:
                 "batch that is skipped; where a step needs several passes at once, call the guard "
                 "in the loop: guard.watch around all of them, and guard.backward",
             )
+        self._dual.check_group()
         self._dual.forget_cleared()
         self._watched = contextlib.ExitStack()
         self._watched.enter_context(self._hooks.watch(mask, image, self._note))
@@ -95,7 +96,11 @@ class AutomaticLoop:
         device = seen.hidden[0].device.type
         # The loop may call the model inside an autocast of its own.
         with torch.autocast(device, enabled=False):
-            self._ahead = self._dual.ahead(seen)
+            self._ahead = self._dual.ahead(seen, self._scale())
+
+    def _scale(self) -> float:
+        """What the loop's scaler multiplies its next loss by."""
+        return 1.0 if self._scaler is None else self._scaler.get_scale()
 
     def discard(self) -> None:
         """Forget the pass of a batch that is skipped."""
@@ -128,8 +133,7 @@ class AutomaticLoop:
                 "call the model itself and not its parts, or name the module whose call is a pass: "
                 "guard.automatic(around=policy)",
             )
-        scale = 1.0 if self._scaler is None else self._scaler.get_scale()
-        self._dual.arrived(ahead, scale, skips)
+        self._dual.arrived(ahead, self._scale(), skips)
 
 
 class LoopHooks:
@@ -188,7 +192,9 @@ class LoopHooks:
         # A pass without gradients is an evaluation. A copy of the module has the hooks too.
         if module is not self._around or not torch.is_grad_enabled() or self._in_pass:
             return
-        self._in_backward = False  # whatever became of the last one
+        if self._in_backward:  # the last one raised an exception, such as for want of memory
+            self._loop.discard()
+        self._in_backward = False
         mask = image = None
         if self._reads:
             given = self._given(args, named)

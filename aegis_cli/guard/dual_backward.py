@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.distributed import ProcessGroup
 
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.guard import accumulation
-from aegis_cli.guard.accumulation import Accumulation
+from aegis_cli.guard.accumulation import Accumulation, Group
 from aegis_cli.guard.stepper import GuardedStepper
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Parts, Pass
@@ -47,7 +46,7 @@ class DualBackward:
         stepper: GuardedStepper,
         ledger: LedgerOutsideRuns,
         owners: Ranks,
-        processes: ProcessGroup | None,
+        processes: Group,
     ) -> None:
         """Begin without a pass.
 
@@ -74,6 +73,13 @@ class DualBackward:
     def forget(self) -> None:
         """Forget the sum."""
         self._sum = None
+
+    def check_group(self) -> None:
+        """Raise AegisError where processes have been connected of which the guard does not know.
+
+        Trainers connect them long after the guard was made.
+        """
+        accumulation.check_group(self._processes)
 
     def forget_cleared(self) -> None:
         """Forget the sum if its gradients are gone, before a forward pass needs the memory."""
@@ -113,12 +119,17 @@ class DualBackward:
             taken = backward.second_backward(groups, penalty * scale)
         self._add(total, AnchorGradient(taken, w2), loss.detach(), scale, skips)
 
-    def ahead(self, seen: Pass) -> AnchorGradient:
-        """The anchor gradient of a pass that a loss is still to be made of; the graph stays."""
+    def ahead(self, seen: Pass, scale: float) -> AnchorGradient:
+        """The anchor gradient of a pass that a loss is still to be made of; the graph stays.
+
+        Args:
+            scale: what the loss is going to be scaled by. The penalty is scaled before it goes
+                back, as the loss is: in half precision its gradients would vanish otherwise.
+        """
         assert self._parts.penalty is not None
         penalty, w2 = self._parts.penalty(seen)
         self._refuse_reentrant(penalty)
-        taken = backward.second_backward(self._learning(), penalty, retain_graph=True)
+        taken = backward.second_backward(self._learning(), penalty * scale, retain_graph=True)
         return AnchorGradient(taken, w2.detach())
 
     def reopen(self) -> None:
@@ -144,12 +155,11 @@ class DualBackward:
         """Project `.grad`, to which a backward pass of the loop's own has added its gradient.
 
         Args:
-            anchor: what `ahead` gave of the same forward pass.
+            anchor: what `ahead` gave of the same forward pass, with the same `scale`.
         """
         total, self._reopened = self._reopened, None
         self._stepper.passed()
-        taken = {i: None if g is None else g * scale for i, g in anchor.taken.items()}
-        self._add(total, AnchorGradient(taken, anchor.w2), None, scale, skips)
+        self._add(total, anchor, None, scale, skips)
 
     def _add(
         self,
@@ -165,12 +175,13 @@ class DualBackward:
         """
         assert self._parts.combine is not None
         groups, taken, w2 = self._learning(), anchor.taken, anchor.w2
-        if self._processes is not None:
+        processes = accumulation.resolved(self._processes)
+        if processes is not None:
             if not self._owners.several:  # else they arrive as means
                 learning = {id(p): p for group in groups for p in group}
-                taken = accumulation.mean_gradients(taken, learning, self._processes)
+                taken = accumulation.mean_gradients(taken, learning, processes)
             numbers = [w2] if loss is None else [w2, loss]
-            w2, *rest = accumulation.mean_over(numbers, self._processes)
+            w2, *rest = accumulation.mean_over(numbers, processes)
             loss = next(iter(rest), None)
         if total is None:
             self._step += 1

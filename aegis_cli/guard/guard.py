@@ -18,6 +18,7 @@ from aegis_cli.anchors.hooks import LayerHooks, Removable
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard import accumulation
+from aegis_cli.guard.accumulation import Group
 from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
 from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
 from aegis_cli.guard.options import SECTIONS, start
@@ -30,7 +31,6 @@ from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import structure
 
 if TYPE_CHECKING:
-    from torch.distributed import ProcessGroup
     from transformers import TrainerCallback
 
 METHODS = tuple(SECTIONS)
@@ -58,7 +58,9 @@ class Guard(Removable):
 
     Attributes:
         ledger: inner products of each group and W2^2 of each layer, one row per optimizer step.
-        unprotected: names of learning modules that `protect` leaves free (`nullspace` and `kfac`).
+        unprotected: names of learning modules that nothing holds (`nullspace` and `kfac`): those
+            that `protect` leaves free, and those on which no answer depended when the anchor was
+            measured.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class Guard(Removable):
         method: str = "aegis",
         part: str | None = None,
         vision: str | Sequence[str] = (),
-        process_group: ProcessGroup | None = None,
+        process_group: Group = None,
         **options: Any,
     ) -> None:
         """Check model and anchor against each other, and start the method.
@@ -88,7 +90,8 @@ class Guard(Removable):
             method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
             vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
             process_group: the processes that train copies of the model together
-                (DistributedDataParallel), or a model that is sharded already (FSDP2).
+                (DistributedDataParallel), or a model that is sharded already (FSDP2). "world" is
+                all of them, also where a trainer connects them later.
             options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns,
                 or refuse; with `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their
                 `every` is 1 unless given: see `settle`.
@@ -103,7 +106,7 @@ class Guard(Removable):
             )
         model = structure.part_of(model, part)
         dual = methods.get(method).dual
-        self._owners = _owners(model, process_group)
+        self._owners = _owners(model, accumulation.resolved(process_group))
         if dual:
             accumulation.check_group(process_group)
         if not structure.learning(model):
@@ -181,6 +184,7 @@ class Guard(Removable):
                 "evaluate outside guard.watch",
             )
         self._check_image(image)
+        self._dual.check_group()
         self._dual.forget_cleared()
         backward.keep_compiled()
         with self._hooks.watch(mask, image, self._note):
@@ -414,7 +418,7 @@ class Guard(Removable):
             )
 
 
-def _owners(model: nn.Module, group: ProcessGroup | None) -> Ranks:
+def _owners(model: nn.Module, group: dist.ProcessGroup | None) -> Ranks:
     """The processes that have some rows of every weight; one where each has all.
 
     Raises:
@@ -425,5 +429,11 @@ def _owners(model: nn.Module, group: ProcessGroup | None) -> Ranks:
     if group is None:
         refuse_sharded(model)
     found = Ranks(dist.get_rank(group), dist.get_world_size(group), group)
+    if not found.several:
+        raise AegisError(
+            "weights that are sharded over one process",
+            "several processes, or whole weights",
+            "leave fully_shard out where there is one process",
+        )
     refuse_partly_sharded(model, found.count)
     return found

@@ -91,6 +91,7 @@ def start(
         _check_adapters(model, sites, header, path)
         if dense:
             anchor = _renamed_curvature(anchor, sites, unmeasured, plain)
+            unprotected = tuple(sorted({*unprotected, *_without_curvature(anchor, sites)}))
         else:
             anchor = _renamed(anchor, sites, maps.heads, unmeasured, plain)
     device = next(p for p in model.parameters() if p.requires_grad).device
@@ -322,6 +323,15 @@ def _renamed_curvature(
     measured = {name.rpartition(".")[0] for name in anchor.curvature}
     _check_measured("curvature", dict.fromkeys(map(plain, sites)), measured, unmeasured)
     return Anchor(curvature={name: anchor.curvature[known] for name, known in wanted.items()})
+
+
+def _without_curvature(anchor: Anchor, sites: Collection[str]) -> list[str]:
+    """The sites on which no answer depended when the anchor was measured: nothing holds them.
+
+    Such is the first map of a fresh LoRA, whose second one is zero.
+    """
+    side = SIDES[1]
+    return [site for site in sites if not torch.any(anchor.curvature[f"{site}.{side}"].values)]
 
 
 def _check_measured(

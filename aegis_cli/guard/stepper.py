@@ -37,8 +37,10 @@ class GuardedStepper:
     def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
         self._model, self._parts = model, parts
         self._learning = structure.learning(model)
+        self._device = next(iter(self._learning.values())).device
         self._stepper = Stepper(model, parts, may_shard)
         self._stepping, self._count = False, 0
+        self._counted: int | None = None  # the optimizer whose step was counted since the last pass
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
         self._slowed: SlowedStep | None = None  # of a step of the loop's own
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
@@ -59,8 +61,15 @@ class GuardedStepper:
         self._automatic = anchor
 
     def check(self) -> None:
-        """Refuse a model whose parameters are not those that the guard was made with."""
+        """Refuse a model whose parameters are not those that the guard was made with.
+
+        Raises:
+            AegisError: they were replaced or moved, or further ones learn.
+        """
         self._stepper.known.check()
+        if structure.learning(self._model).keys() - self._learning.keys():
+            self._refuse_other_parameters()
+        self._refuse_another_device()
 
     def passed(self) -> None:
         """Note a guarded backward pass, which every optimizer may follow with one step.
@@ -69,7 +78,7 @@ class GuardedStepper:
             AegisError: it left no gradient in the model.
         """
         check_reached(self._learning.values())
-        self._stepped = set()
+        self._stepped, self._counted = set(), None
 
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
         """Whether every gradient of what learns is finite, in all processes."""
@@ -97,11 +106,13 @@ class GuardedStepper:
             AegisError: other parameters learn than when the guard was made, or their gradients are
                 those of a plain backward pass.
         """
-        if not self._parts.constrains:
+        if not self._parts.constrains or not self._guards(optimizer):
             _take(optimizer, scaler)
             return
         self._refuse_other_parameters()
+        self._refuse_another_device()
         self._refuse_unguarded(optimizer)
+        self._refuse_second(optimizer)
         self._stepping = True
         try:
             self._stepper.step(
@@ -110,6 +121,27 @@ class GuardedStepper:
         finally:
             self._stepping = False
         self._count += 1
+
+    def _refuse_another_device(self) -> None:
+        """Refuse a model that has moved away from what its updates are constrained by."""
+        device = next(iter(self._learning.values())).device
+        if self._parts.constrains and device != self._device:
+            raise AegisError(
+                f"a model that was on {self._device} when the guard was made, and is on {device}",
+                "one and the same",
+                f"model.to('{device}') before Guard(...), also where a trainer would do it",
+            )
+
+    def _refuse_second(self, optimizer: Optimizer) -> None:
+        """Refuse a second optimizer's step after one pass, which would constrain twice."""
+        if self._counted not in (None, id(optimizer)):
+            raise AegisError(
+                "two optimizers on guarded parameters, whose updates would be constrained twice",
+                "one, which may have groups with settings of their own",
+                "torch.optim.AdamW([{'params': ..., 'lr': ...}, ...]); an optimizer of parameters "
+                "that the guard does not know may be there besides",
+            )
+        self._counted = id(optimizer)
 
     def _refuse_other_parameters(self) -> None:
         if structure.learning(self._model).keys() != self._learning.keys():
@@ -174,6 +206,7 @@ class GuardedStepper:
         if by_itself and self._parts.constrains and self._slowed is None:
             assert self._automatic is not None
             self._refuse_other_parameters()
+            self._refuse_second(optimizer)
             self._stepper.begin(self._by_name(self._automatic()))
             self._slowed = SlowedStep(self._parts)
 

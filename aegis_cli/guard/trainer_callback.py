@@ -43,6 +43,9 @@ def trainer_callback(
                 # Accelerate's optimizer knows the scaler that its loop uses.
                 scaler = getattr(given.get("optimizer"), "scaler", None)
                 guard.automatic(mask=mask, image=image, scaler=scaler)
+            else:
+                # A Trainer begins again with smaller batches where the memory did not suffice.
+                guard.discard()
 
         def on_step_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:
             if control.should_save or control.should_evaluate:

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from aegis_cli.common.errors import AegisError
+from aegis_cli.guard.accumulation import processes
 from aegis_cli.models import structure
 
 MASTER = "aegis_master"  # in a parameter's state: its value in float32
@@ -41,7 +43,18 @@ class WideStep:
         """Let the parameters be their masters inside the block, and then those rounded.
 
         A parameter that somebody has changed since has its master anew, from what it is now.
+
+        Raises:
+            AegisError: several processes, whose DistributedDataParallel would no longer see the
+                gradients of parameters that have been of another type.
         """
+        if self._half and processes() > 1:
+            raise AegisError(
+                f"weights in {str(self._half[0].dtype).removeprefix('torch.')} in one of "
+                f"{processes()} processes",
+                "float32 weights, or one process",
+                "load the model in float32",
+            )
         narrow = [p.data for p in self._half]
         given = [p.grad for p in self._half]
         for parameter, master in zip(self._half, self._masters(), strict=True):

@@ -84,7 +84,11 @@ def _penalty(
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
         costs, distances = [], []
-        for name, moments in wanted.items():
+        device = seen.hidden[0].device
+        for name, moments in list(wanted.items()):
+            if moments[0].mean.device != device:  # somebody has moved the model meanwhile
+                moments = [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in moments]
+                wanted[name], weights[name] = moments, weights[name].to(device)
             cost, w2 = _cost(seen, name, moments, weights[name])
             costs.append(cost)
             distances.append(w2)

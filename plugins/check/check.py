@@ -302,12 +302,17 @@ def smolvla_moves_orthogonally(folder: Path) -> str:
     worst = 0.0
     for site, protection in nullspace.protections(measured, likes, Strength(ENERGY)).items():
         update = (moved[f"{site}.weight"], moved.get(f"{site}.bias"))
-        along = nullspace.squared(protection.removed(*update)).sqrt()
-        worst = max(worst, float(along / nullspace.squared(update).sqrt()))
+        along = norm_of(protection.removed(*update))
+        worst = max(worst, along / norm_of(update))
     expert = [n for n, by in moved.items() if n.startswith("lm_expert.") and by.any()]
     assert sites and expert
     assert worst <= LIMITS["orthogonal"], f"{worst:.2g} of an update is along the span"
     return f"{len(sites)} sites, largest share of an update along the span {worst:.2g}"
+
+
+def norm_of(pair: nullspace.Pair) -> float:
+    """The Euclidean norm of a map's weight and bias together."""
+    return float(sum(part.square().sum() for part in pair if part is not None).sqrt())
 
 
 def smolvla_at_strength_0_is_adamw(folder: Path) -> str:

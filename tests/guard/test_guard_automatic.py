@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import gc
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from samples.guard import (
     compiling,
     guarded_steps,
     make,
+    measured,
     task_loss,
     vector,
 )
@@ -148,6 +150,66 @@ def test_several_guards_each_see_their_own_model(anchors: dict[str, Path]) -> No
         plain_steps(model)
     for model, other in both:
         assert torch.equal(vector(model), vector(alone)) and same_ledger(guard, other)
+
+
+def test_small_anchor_gradients_are_those_of_a_loop_that_calls_the_guard(tmp_path: Path) -> None:
+    """The penalty is scaled before it goes back: in half precision its gradients vanish otherwise.
+
+    The variances are those of a deep model's residual stream, which the penalty divides by.
+    """
+    model = deep()
+    path = measured(model, tmp_path / "anchor.safetensors", parts=("moments",))
+    rows = []
+    for is_automatic, half in ((False, False), (False, True), (True, True)):
+        model = deep()
+        guard = Guard(model, path, layers=LAYERS, weighting="variance")
+        scaler = torch.amp.GradScaler("cpu", init_scale=2.0**14)
+        if is_automatic:
+            guard.automatic(mask="mask", scaler=scaler)
+        pixels, ids, mask = batch(0, 2048, torch.float32)
+        pass_of = contextlib.nullcontext() if is_automatic else guard.watch(mask)
+        with pass_of, torch.autocast("cpu", torch.float16, enabled=half):
+            out = model(pixels, ids, mask)
+        loss = (out.float() / 40 - 1).square().mean(-1)[mask].mean()
+        if is_automatic:
+            scaler.scale(loss).backward()
+        else:
+            guard.backward(loss, scaler)
+        rows.append(guard.ledger.tensors()["aa"][0])
+        guard.remove()
+    exact, manual, automatically = rows
+    torch.testing.assert_close(automatically, manual, rtol=1e-3, atol=0)
+    torch.testing.assert_close(automatically, exact, rtol=0.1, atol=0)
+
+
+def deep() -> Vlm:
+    model = make(dtype=torch.float32)
+    with torch.no_grad():
+        model.text.words.weight.mul_(40)
+        model.vision[0].weight.mul_(150)
+    return model
+
+
+def test_an_exception_in_a_backward_pass_ends_no_training(anchors: dict[str, Path]) -> None:
+    """Such as for want of memory, after which a loop goes on with less."""
+    model, _guard = automatic("aegis", anchors)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    one, _ = automatic("aegis", anchors)
+    own = torch.optim.SGD(one.parameters(), lr=0.1)
+
+    def fail(gradient: Tensor) -> None:
+        raise MemoryError
+
+    loss = task_loss(model, 0)
+    handle = model.vision[0].weight.register_hook(fail)
+    with pytest.raises(MemoryError):
+        loss.backward()
+    handle.remove()
+    for each, stepping in ((model, optimizer), (one, own)):
+        stepping.zero_grad()
+        task_loss(each, 1).backward()
+        stepping.step()
+    assert torch.equal(vector(model), vector(one))
 
 
 def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None:

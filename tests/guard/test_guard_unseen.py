@@ -23,7 +23,13 @@ from samples.ranks import WORLD, shard_under_a_guard
 from torch import Tensor, multiprocessing, nn
 
 from aegis_cli import Guard
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.moments import Moments
+from aegis_cli.guard import accumulation
+from aegis_cli.methods.aegis import _penalty
+from aegis_cli.methods.base import Pass
 
 MASK = batch(0)[2]
 METHODS: dict[str, dict[str, Any]] = {
@@ -103,6 +109,83 @@ def test_freezing_a_part_later_is_no_other_parameter(method: str, anchors: dict[
     guard.backward(watched(guard, model))
 
 
+@every_method
+def test_what_learns_only_later_is_refused(method: str, anchors: dict[str, Path]) -> None:
+    """Its first steps would be taken with nothing held."""
+    model = make()
+    model.vision.requires_grad_(False)
+    own = {"kfac": {"protect": ("maps",)}, "nullspace": {"vision": "vision"}}
+    path = anchors[method]
+    guard = Guard(model, path, method=method, **{**METHODS[method], **own.get(method, {})})
+    model.vision.requires_grad_(True)
+    refused(lambda: watched(guard, model), "other trainable parameters")
+    guard.remove()
+    automatic = Guard(make(), path, method=method, **METHODS[method]).automatic(mask="mask")
+    other = automatic._model
+    other.text.layers[0].requires_grad_(False)
+    task_loss(other, 0).backward()  # a part that is frozen later is none
+
+
+@pytest.mark.parametrize("method", ["nullspace", "kfac"])
+def test_a_model_that_has_moved_since_the_guard_was_made(
+    method: str, anchors: dict[str, Path]
+) -> None:
+    """The directions that its updates are kept from lie on the other device."""
+    model, guard = guarded(method, anchors)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    guard.backward(watched(guard, model))
+    guard._stepper._device = torch.device("cuda", 0)  # as if it had been there
+    before = vector(model)
+    refused(lambda: guard.step(optimizer), "cuda:0", "before Guard(...)")
+    refused(lambda: watched(guard, model), "cuda:0", "before Guard(...)")
+    assert torch.equal(vector(model), before)
+
+
+def test_an_anchor_follows_a_model_to_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The meta device computes nothing, and refuses tensors of any other."""
+    monkeypatch.setattr(devices, "reading_waits", lambda _: True)  # no rows are selected there
+    layers = [Moments(4, torch.zeros(3), torch.ones(3)) for _ in range(2)]
+    penalty = _penalty(Anchor(layers, layers), "all", "variance", torch.empty(0))
+    hidden = tuple(torch.zeros(2, 5, 3, device="meta") for _ in layers)
+    tokens = torch.ones(2, 5, dtype=torch.bool, device="meta")
+    seen = Pass(0, None, hidden, tokens, tokens)
+    cost, distances = penalty(seen)
+    assert cost.device.type == distances.device.type == "meta"
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_processes_that_are_connected_after_the_guard_was_made(
+    is_automatic: bool, anchors: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As trainers connect them; without a group each process would project by its own gradient."""
+    model, guard = guarded("aegis", anchors)
+    named = Guard(make(), anchors["aegis"], layers=LAYERS, process_group="world")
+    if is_automatic:
+        guard.automatic(mask="mask")
+    monkeypatch.setattr(accumulation, "processes", lambda: 2)
+    begin = (lambda: task_loss(model, 0)) if is_automatic else (lambda: watched(guard, model))
+    refused(begin, "one of 2 processes", "process_group='world'")
+    known = {"world": "all of them", None: None}
+    monkeypatch.setattr(accumulation, "resolved", lambda group: known[group])
+    asked: list[object] = []
+    monkeypatch.setattr(
+        accumulation, "mean_gradients", lambda taken, _, group: (asked.append(group), taken)[1]
+    )
+    monkeypatch.setattr(accumulation, "mean_over", lambda numbers, group: list(numbers))
+    with named.watch(MASK):
+        loss = task_loss(named._model, 0)
+    named.backward(loss)
+    assert asked == ["all of them"]
+
+
+def test_another_word_than_world(anchors: dict[str, Path]) -> None:
+    refused(
+        lambda: Guard(make(), anchors["aegis"], layers=LAYERS, process_group="gloo"),
+        "process_group='gloo'",
+        "'world'",
+    )
+
+
 # --- passes ---------------------------------------------------------------------------------------
 
 
@@ -170,6 +253,42 @@ def test_two_optimizers_may_follow_one_guarded_pass(anchors: dict[str, Path]) ->
     for optimizer in optimizers:
         optimizer.step()
         refused(optimizer.step, "without a guard.backward since the last one")
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_two_optimizers_do_not_constrain_twice(
+    is_automatic: bool, anchors: dict[str, Path]
+) -> None:
+    """A proximal step that is taken twice draws back twice as much."""
+    model, guard = guarded("kfac", anchors)
+    if is_automatic:
+        guard.automatic(mask="mask")
+    parts = [*model.vision.parameters()], [*model.text.parameters()]
+    one, other = (torch.optim.SGD(part, lr=0.1) for part in parts)
+    for seed in range(2):  # each step may have one of them
+        if is_automatic:
+            task_loss(model, seed).backward()
+        else:
+            guard.backward(task_loss(model, seed))
+        take = (lambda o: o.step()) if is_automatic else guard.step
+        take(one)
+        before = vector(model)
+        refused(lambda: take(other), "two optimizers")
+        assert torch.equal(vector(model), before)
+        one.zero_grad()
+        other.zero_grad()
+
+
+def test_an_optimizer_of_other_parameters_constrains_nothing(anchors: dict[str, Path]) -> None:
+    model, guard = guarded("kfac", anchors)
+    expert = nn.Linear(2, 1)
+    optimizer = torch.optim.SGD(expert.parameters(), lr=0.1)
+    guard.backward(task_loss(model, 0))
+    guard.step(torch.optim.SGD(model.parameters(), lr=0.1))
+    held, before = vector(model), vector(expert)
+    expert(torch.ones(1, 2)).sum().backward()
+    guard.step(optimizer)
+    assert torch.equal(vector(model), held) and not torch.equal(vector(expert), before)
 
 
 def test_a_step_on_zeros_is_no_training(anchors: dict[str, Path]) -> None:

@@ -96,7 +96,7 @@ def _trained_in_parts(rank: int, path: Path) -> tuple[Tensor, dict[str, Tensor]]
     The first one sends nothing, as accelerate and Trainers have it.
     """
     model, called = _copied(make())
-    guard = Guard(model, path, LAYERS, process_group=dist.group.WORLD)
+    guard = Guard(model, path, LAYERS, process_group="world")
     guard.automatic(mask="mask", image=lambda _: IMAGE)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for index in range(STEPS):
