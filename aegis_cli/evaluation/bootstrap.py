@@ -59,7 +59,7 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     sqrt((S - 1) / S) (Hesterberg 2015, The American Statistician 69(4), section 3.1), so that
     deviations from the mean are divided by it.
 
-    Where all questions or episodes of all seeds came out alike, no draw differs, and that says
+    Where all images or episodes of all seeds came out alike, no draw differs, and that says
     nothing. Then the share of those that would have come out otherwise is at most Wilson's bound
     for a share that was never seen.
 
@@ -91,10 +91,13 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
 
 
 def _unseen(seeds: Sequence[Units]) -> float:
-    """The largest share of questions or episodes that may be unlike all that were seen."""
+    """The largest share of images or episodes that may be unlike all that were seen.
+
+    An image's questions share its difficulty, so that they are one look and not several.
+    """
     from aegis_cli.data.vqa.metrics import wilson_interval  # loads torch
 
-    asked = {one.draw: float(one.counts.sum()) for one in seeds}
+    asked = {one.draw: float(len(one.values)) for one in seeds}
     return wilson_interval(0, sum(asked.values()))[1]
 
 

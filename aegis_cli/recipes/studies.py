@@ -70,9 +70,13 @@ class PolicyVariant(Variant):
     against: str | None = key(
         NOT_EMPTY,
         None,
-        doc="Variant that its success, return and drop are compared with, such as a naive of the "
-        "same learning rate and optimizer. Null: the variant named naive.",
+        doc="Variant that its success, return, drop and costs are compared with, e.g. a naive of "
+        "the same learning rate and optimizer. Null: the variant named naive.",
     )
+
+    def is_plain(self, method: str) -> bool:
+        """Whether it is this method with nothing done to what it has trained, as a merge would."""
+        return self.method == method and "merge.method" not in self.set
 
 
 @section

@@ -224,6 +224,22 @@ def _readable(tasks: Any) -> list[str]:
     ]
 
 
+def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """Demonstrations that are given are the same with every seed."""
+    shared, names = raw.get("shared"), raw.get("per_seed")
+    settings = shared.get("demos") if isinstance(shared, dict) else None
+    path = settings.get("path") if isinstance(settings, dict) else None
+    if path is None or not isinstance(names, list) or "demos" not in names:
+        return []
+    return [
+        Problem(
+            f"per_seed: demos with shared: demos.path: {path}",
+            "demonstrations that are recorded, to have others with every seed",
+            "take demos out of per_seed: the seeds still hold out other episodes",
+        )
+    ]
+
+
 def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """A gate of one run; a study says of every variant whether it passes its bar."""
     shared = raw.get("shared")
@@ -309,7 +325,11 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         tuning_seed=Tuning().seed,
         tuning_keys="task, seed, questions, episodes, within, runs",
         together=_together,
-        problems=lambda raw: [*_gate_problems(raw), *_reference_problems(raw)],
+        problems=lambda raw: [
+            *_gate_problems(raw),
+            *_drawn_problems(raw),
+            *_reference_problems(raw),
+        ],
     ),
     StreamStudyRecipe: _CellRules(
         recipe=StreamRecipe,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from aegis_cli.common.files import canonical
-from aegis_cli.recipes import FOLDER_NAME, Variant
+from aegis_cli.recipes import FOLDER_NAME, LEARNERS, METHODS, Variant
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.strict_yaml import Problem, line_of, put
 
@@ -88,6 +88,10 @@ def read(
     return found
 
 
+# The sections that one method or learner alone reads.
+SECTIONS = frozenset(name.replace("-", "_") for name in (*METHODS, *LEARNERS))
+
+
 def _problems(
     where: str, variant: Variant, places: Places, lines: Mapping[str, int | None]
 ) -> Iterator[Problem]:
@@ -97,6 +101,11 @@ def _problems(
             if not all(dotted.split(".")) or isinstance(value, dict):
                 expected, fix = "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4"
                 found.insert(0, Problem(f"{where}.{part}: {dotted}", expected, fix))
+            section = dotted.partition(".")[0]
+            if section in SECTIONS and section != variant.method.replace("-", "_"):
+                expected = f"keys that method '{variant.method}' reads"
+                fix = f"delete it, or set method: {section.replace('_', '-')}"
+                found.append(Problem(f"{where}.{part}: {dotted}", expected, fix))
             for problem in found:
                 yield problem._replace(line=lines.get(dotted))
     for knob, values in variant.tune.items():

@@ -9,7 +9,8 @@ what they were measured on.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping
+import statistics
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter, sub
 from typing import Annotated, Any
@@ -108,9 +109,12 @@ def _lost_by_image(figures: PolicyFigures) -> Units | None:
 
     lost = np.array(figures.lost_per_image, np.float64)
     questions = np.array(figures.questions_per_image, np.float64)
-    # A backbone that has moved gives no answer as surely as before, to the last digit.
-    still = figures.cross_entropy == figures.baseline_cross_entropy
-    return Units(100 * lost, questions, figures.probe_seed, sure=still)
+    return Units(100 * lost, questions, figures.probe_seed, sure=_stands_still(figures))
+
+
+def _stands_still(figures: PolicyFigures) -> bool:
+    """Whether the backbone has not moved: else no answer is as sure as before to the last digit."""
+    return figures.cross_entropy == figures.baseline_cross_entropy
 
 
 def _seen_episodes(figures: PolicyFigures) -> Units | None:
@@ -153,7 +157,7 @@ class PolicyResult:
 
     Attributes:
         diverged: the seeds whose training did, which no mean counts and which cost the bar.
-        step_time: ratio to naive's training step; so is `peak_memory`.
+        step_time: ratio to naive's training step, or to that of `against`; so is `peak_memory`.
         bar: None for naive and for methods that train on VQA data.
         against: the variant that gains and the difference of the drops are to; None for naive.
     """
@@ -172,6 +176,7 @@ class PolicyResult:
             axis="VQA accuracy lost (points)",
             units=_lost_by_image,
             more_is_better=False,
+            sure=_stands_still,
         ),
     ]
     cross_entropy: Annotated[Mean, Metric("Cross-entropy (nats)", 3, more_is_better=False)]
@@ -225,6 +230,7 @@ class PolicyResult:
             against=NAIVE,
             compare=sub,
             units=_lost_by_image,
+            sure=_stands_still,
         ),
     ] = None
 
@@ -251,7 +257,8 @@ POLICY_BAR = (
 class TaskResults:
     """One task's table.
 
-    The baseline is the backbone before training; it is unknown as long as every training diverged.
+    The baseline is the backbone before training, a mean over the sets of questions that the seeds
+    were asked; it is unknown as long as every training diverged.
 
     Attributes:
         vqa: the set of questions, where a study asks several; each has a table and a bar.
@@ -290,6 +297,21 @@ class StudyReport:
         return dataclasses.asdict(self)
 
 
+def _cost(name: str, against: str | None, costs: Mapping[str, Cost]) -> Cost | None:
+    """What a variant costs over the one that it is held against."""
+    own = costs.get(name)
+    if own is None or against is None:
+        return own
+    reference = costs.get(against)
+    if reference is None:
+        return None
+    return dataclasses.replace(
+        own,
+        step_time=own.step_time / reference.step_time,
+        peak_memory=own.peak_memory / reference.peak_memory,
+    )
+
+
 def task_results(
     task: str,
     found: Mapping[str, Mapping[int, Outcome]],
@@ -312,7 +334,7 @@ def task_results(
     results = []
     for name, own in found.items():
         variant = variants[name]
-        cost = costs.get(name)
+        cost = _cost(name, variant.against, costs)
         # Contrasts are declared against naive, whose place a variant may give to another.
         reference = variant.against or (None if name == NAIVE else NAIVE)
         references = {NAIVE: samples[reference]} if reference in samples else {}
@@ -328,17 +350,23 @@ def task_results(
             bar=None,
             against=variant.against,
         )
-        if variant.method != NAIVE and name not in ceilings:
+        if not variant.is_plain(NAIVE) and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
-    rows = [row for sample in samples.values() for row in sample.figures.values()]
-    return TaskResults(
-        task=task,
-        baseline_accuracy=rows[0].baseline_accuracy if rows else None,
-        baseline_cross_entropy=rows[0].baseline_cross_entropy if rows else None,
-        majority_accuracy=rows[0].majority_accuracy if rows else None,
-        results=results,
-    )
+    # One cell of each set of questions, since seeds may have sets of their own.
+    asked: dict[int, PolicyFigures] = {}
+    for sample in samples.values():
+        for row in sample.figures.values():
+            asked.setdefault(row.probe_seed, row)
+    before = {name: _mean([getattr(row, name) for row in asked.values()]) for name in _BEFORE}
+    return TaskResults(task=task, results=results, **before)
+
+
+_BEFORE = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return statistics.fmean(values) if values else None
 
 
 # --- streams --------------------------------------------------------------------------------------

@@ -100,12 +100,14 @@ class Metric(Column):
         of: what it is of one cell; by default the cell's figure of the field's own name.
         summary: what becomes of the cells' values.
         units: what one cell was measured on, if it kept that, for the crossed bootstrap.
+        sure: whether a cell's figure could not have been another; None: it always could.
     """
 
     _: KW_ONLY
     of: Callable[[Any], float | None] | None = None
     summary: Callable[[Values], Any] = over_seeds
     units: Callable[[Any], Units | None] | None = None
+    sure: Callable[[Any], bool] | None = None
 
 
 @dataclass(frozen=True)
@@ -158,9 +160,20 @@ def measure(
         known = {setting: value for setting, value in values.items() if value is not None}
         made = column.summary(known if seeded else _once(known))
         if isinstance(made, Estimate) and column.units is not None:
-            made = dataclasses.replace(made, crossed=_crossed(column.units, known, sample, other))
+            crossed = _crossed(column.units, known, sample, other)
+            # Seeds that came out alike by chance do not tell how seeds vary.
+            alike = made.interval is not None and made.interval[1] - made.interval[0] <= ROUNDING
+            blind = alike and crossed is None and not _surely(column, known, sample, other)
+            interval = None if blind else made.interval
+            made = dataclasses.replace(made, interval=interval, crossed=crossed)
         measured[name] = made
     return measured
+
+
+def _surely(column: Metric, known: Values, sample: Sample, other: Sample | None) -> bool:
+    """Whether none of these cells, nor of those that they are compared with, could differ."""
+    figures = [each.figures[s] for each in (sample, other) if each is not None for s in known]
+    return column.sure is not None and all(column.sure(found) for found in figures)
 
 
 def _crossed(
@@ -314,11 +327,13 @@ def above(limit: float, unit: str) -> Limit:
 def _reaches(found: Estimate | float, side: int, limit: float) -> bool | None:
     """Whether the upper end (`side` 1) is at most `limit`, or the lower one (-1) at least.
 
-    A plain number is both of its ends.
+    A plain number is both of its ends. Several runs that came out alike, and tell nothing of how
+    runs vary, fail where that is on the bad side.
     """
     if not isinstance(found, Estimate):
         return side * found <= side * limit
     if found.ends is None:
-        return None
+        is_bad = found.runs > 1 and side * found.mean > side * limit
+        return False if is_bad else None
     low, high = found.ends
     return high <= limit if side == 1 else low >= limit

@@ -114,7 +114,9 @@ class PolicyStudy:
 
     def point(self, variant: str, value: Any, found: PolicyFigures | Divergence) -> PolicyPoint:
         """What a knob's value led to."""
-        method = self.recipe.variants[variant].method
+        own = self.recipe.variants[variant]
+        # The margin is of naive as it is, and not of the best of its many merges.
+        method = own.method if own.is_plain(own.method) else f"{own.method}, merged"
         if isinstance(found, Divergence):
             return PolicyPoint(variant, method, value, None, None, None)
         success = found.success_seen if found.return_share is None else found.return_share

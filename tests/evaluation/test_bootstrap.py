@@ -26,9 +26,12 @@ def drawn(
 
 
 def test_units_that_are_all_alike_are_no_certainty_unless_nothing_else_could_come_out() -> None:
-    """Wilson's bound for what was never seen, of the questions that differ between the seeds."""
+    """Wilson's bound for what was never seen, of the images that differ between the seeds.
+
+    Four questions about an image are one look at it.
+    """
     alike = [Units(np.full(7, 2.0), np.full(7, 4.0), draw, reach=1.0) for draw in (0, 0, 1)]
-    bound = wilson_interval(0, 2 * 7 * 4)[1]
+    bound = wilson_interval(0, 2 * 7)[1]
     assert crossed_interval(alike) == pytest.approx((0.5 - bound, 0.5 + bound))
     still = [replace(one, sure=True) for one in alike]
     assert crossed_interval(still) == pytest.approx((0.5, 0.5))

@@ -57,6 +57,16 @@ def with_variant(**keys: Any) -> dict[str, Any]:
             "did you mean 'lora'?",
         ),
         (
+            with_variant(method="naive", set={"kfac.weight": 1.0}),
+            "variants.x.set: kfac.weight",
+            "set method: kfac",
+        ),
+        (
+            with_variant(method="kfac", tune={"lora.rank": [4, 16]}),
+            "variants.x.tune: lora.rank",
+            "set method: lora",
+        ),
+        (
             with_variant(method="lora", tune={"lora.rank": [4, 0]}),
             "variants.x: lora.rank: 0",
             "its default is 16",
@@ -493,6 +503,13 @@ def test_a_seed_that_the_study_draws_cannot_be_set(where: str, tmp_path: Path) -
         keys["variants"]["aegis-update"]["set"]["demos.seed"] = 7
     error = refusal(tmp_path, keys)
     assert "demos.seed" in error.found and "per_seed" in error.fix
+
+
+def test_demonstrations_that_are_given_cannot_be_drawn(tmp_path: Path) -> None:
+    keys = without_seeds(per_seed=["demos", "questions"])
+    keys["shared"]["demos"]["path"] = "reach.safetensors"
+    error = refusal(tmp_path, keys)
+    assert "demos.path: reach.safetensors" in error.found and "out of per_seed" in error.fix
 
 
 def test_several_knobs_are_tried_in_all_combinations(tmp_path: Path) -> None:

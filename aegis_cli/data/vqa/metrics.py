@@ -142,8 +142,8 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
 
     The drop is the share of questions that were lost less the share that was won. Each has Wilson's
     interval, and the ends of both are put together by squares (MOVER: Zou & Donner 2008, Statistics
-    in Medicine 27(10), 1693-1702). So an answer that is lost never makes the upper end lower, and
-    no change at all is no certainty. Questions about one image share its difficulty, so they count
+    in Medicine 27(10), 1693-1702), with the correlation of two shares of the same questions. So no
+    change at all is no certainty. Questions about one image share its difficulty, so they count
     as fewer: as many as would tell as much if they were independent.
     """
     # Differences of pairs: how hard a question is cancels, which two accuracies apart would not.
@@ -153,8 +153,16 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
     lost, won = float((change > 0).mean()), float((change < 0).mean())
     least_lost, most_lost = wilson_interval(lost * count, count)
     least_won, most_won = wilson_interval(won * count, count)
-    low = lost - won - math.hypot(lost - least_lost, most_won - won)
-    return low, lost - won + math.hypot(most_lost - lost, won - least_won)
+    # A question that was lost cannot have been won: of two shares, one is small where the other is
+    # large.
+    alike = math.sqrt(lost * won / ((1 - lost) * (1 - won))) if lost < 1 and won < 1 else 0.0
+    below = _together(lost - least_lost, most_won - won, alike)
+    return lost - won - below, lost - won + _together(most_lost - lost, won - least_won, alike)
+
+
+def _together(a: float, b: float, alike: float) -> float:
+    """How far the difference of two shares reaches that reach a and b, correlated by -`alike`."""
+    return math.sqrt(a * a + b * b + 2 * alike * a * b)
 
 
 def _design_effect(values: np.ndarray, cluster_of: Sequence[int]) -> float:
