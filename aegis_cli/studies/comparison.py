@@ -262,6 +262,8 @@ class TaskResults:
 
     Attributes:
         vqa: the set of questions, where a study asks several; each has a table and a bar.
+        compared: how many cells are compared with another variant's of the same seed.
+        across_versions: how many of these another version of the code has measured.
     """
 
     task: str
@@ -270,6 +272,8 @@ class TaskResults:
     majority_accuracy: float | None
     results: list[PolicyResult]
     vqa: str | None = None
+    compared: int = 0
+    across_versions: int = 0
 
 
 @dataclass(frozen=True)
@@ -331,13 +335,16 @@ def task_results(
     samples: dict[str, Sample] = {}
     for name, own in found.items():
         samples[name] = Sample({(task, seed): row for seed, row in own.items() if measured(row)})
-    results = []
+    results, pairs = [], list[tuple[PolicyFigures, PolicyFigures]]()
     for name, own in found.items():
         variant = variants[name]
         cost = _cost(name, variant.against, costs)
         # Contrasts are declared against naive, whose place a variant may give to another.
         reference = variant.against or (None if name == NAIVE else NAIVE)
         references = {NAIVE: samples[reference]} if reference in samples else {}
+        for other in references.values():
+            for setting in samples[name].figures.keys() & other.figures.keys():
+                pairs.append((samples[name].figures[setting], other.figures[setting]))
         made = PolicyResult(
             variant=name,
             method=variant.method,
@@ -359,7 +366,13 @@ def task_results(
         for row in sample.figures.values():
             asked.setdefault(row.probe_seed, row)
     before = {name: _mean([getattr(row, name) for row in asked.values()]) for name in _BEFORE}
-    return TaskResults(task=task, results=results, **before)
+    return TaskResults(
+        task=task,
+        results=results,
+        compared=len(pairs),
+        across_versions=sum(one.code != other.code for one, other in pairs),
+        **before,
+    )
 
 
 _BEFORE = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")

@@ -320,6 +320,15 @@ def test_the_baseline_is_a_mean_over_the_questions_that_seeds_were_asked() -> No
     assert table.baseline_accuracy == pytest.approx(0.92)
 
 
+def test_differences_across_versions_of_the_code_are_counted() -> None:
+    base = dataclasses.replace(row(Recipe(name="x")), code="0.1.0 a")
+    later = dataclasses.replace(base, code="0.1.0 b")
+    variants = {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")}
+    rows = {"naive": {0: base, 1: base, 2: base}, "other": {0: base, 1: later}}
+    table = task_results("reach", rows, variants, {}, {}, frozenset())
+    assert (table.compared, table.across_versions) == (2, 1)
+
+
 def test_costs_are_over_the_variant_that_one_is_held_against() -> None:
     variants = {
         "naive": PolicyVariant("naive"),

@@ -256,6 +256,15 @@ def _notes(report: Any) -> list[str]:
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
+    mixed, pairs = (
+        sum(getattr(task, name) for task in report.tasks)
+        for name in ("across_versions", "compared")
+    )
+    if mixed:
+        notes.append(
+            f"{mixed} of {pairs} paired differences are of cells that two versions of the code "
+            "measured"
+        )
     if report.costs_on:
         notes.append(f"step times and memory were measured on: {'; '.join(report.costs_on)}")
     if report.tuning:
