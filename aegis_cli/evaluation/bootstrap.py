@@ -8,7 +8,7 @@ seed's figure, and an interval over seeds alone does not see it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,8 @@ class Units:
         draw: seeds of the same draw were measured on the same units, in the same order.
         reach: how far two questions or episodes can be apart.
         sure: whether nothing else could have come out, as of a model that has not moved.
+        names: N names by which units are known in other draws too; None where no other draw has
+            them.
     """
 
     values: np.ndarray
@@ -38,13 +40,14 @@ class Units:
     draw: int = 0
     reach: float = 100.0
     sure: bool = False
+    names: tuple[str, ...] | None = None
 
     def minus(self, other: Units) -> Units | None:
         """The paired difference; None if the other was measured on other units."""
         import numpy as np
 
-        same = self.draw == other.draw and np.array_equal(self.counts, other.counts)
-        if not same:
+        same = self.draw == other.draw and self.names == other.names
+        if not same or not np.array_equal(self.counts, other.counts):
             return None
         sure = self.sure and other.sure
         return replace(self, values=self.values - other.values, sure=sure)
@@ -53,8 +56,8 @@ class Units:
 def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, float] | None:
     """95 % interval of the mean over seeds of each seed's mean over units.
 
-    Seeds and units are drawn with replacement, independently of each other, and units once for all
-    seeds that share them: the pigeonhole bootstrap (Owen 2007, The Annals of Applied Statistics
+    Seeds and units are drawn with replacement, independently of each other, and a unit once for all
+    seeds that share it: the pigeonhole bootstrap (Owen 2007, The Annals of Applied Statistics
     1(2), 386-411), which is conservative. Few seeds make a bootstrap too narrow by the factor
     sqrt((S - 1) / S) (Hesterberg 2015, The American Statistician 69(4), section 3.1), so that
     deviations from the mean are divided by it.
@@ -97,8 +100,15 @@ def _unseen(seeds: Sequence[Units]) -> float:
     """
     from aegis_cli.data.vqa.metrics import wilson_interval  # loads torch
 
-    asked = {one.draw: float(len(one.values)) for one in seeds}
-    return wilson_interval(0, sum(asked.values()))[1]
+    asked = {unit for one in seeds for unit in _units(one)}
+    return wilson_interval(0, len(asked))[1]
+
+
+def _units(one: Units) -> list[Hashable]:
+    """What a seed's units are known by: their names, or their places in its draw."""
+    if one.names is not None:
+        return list(one.names)
+    return [(one.draw, place) for place in range(len(one.values))]
 
 
 def _resampled_means(
@@ -107,12 +117,19 @@ def _resampled_means(
     """Each seed's mean in each resample of its units, [R, S]."""
     import numpy as np
 
-    weights: dict[int, np.ndarray] = {}
+    named = dict.fromkeys(name for one in seeds for name in one.names or ())
+    column = {name: place for place, name in enumerate(named)}
+    weights: dict[int | None, np.ndarray] = {}  # of each draw, and under None of all that are named
     means = []
     for one in seeds:
-        if one.draw not in weights:
-            size = len(one.values)
-            weights[one.draw] = rng.multinomial(size, np.full(size, 1 / size), size=resamples)
-        weight = weights[one.draw]  # [R, N], how often each unit was drawn
+        known = one.draw if one.names is None else None
+        if known not in weights:
+            size = len(one.values) if one.names is None else len(column)
+            weights[known] = rng.multinomial(size, np.full(size, 1 / size), size=resamples)
+        weight = weights[known]  # [R, N], how often each unit was drawn
+        if one.names is not None:
+            weight = weight[:, [column[name] for name in one.names]]
+            # Of a seed's few units a resample may have none; then all of them count.
+            weight = np.where(weight.any(axis=1, keepdims=True), weight, 1)
         means.append((weight @ one.values) / (weight @ one.counts))
     return np.stack(means, 1)

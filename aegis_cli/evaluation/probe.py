@@ -390,11 +390,17 @@ def compare(
     )
 
 
-def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, list[int]]:
+def by_image(
+    after: Sequence[Graded], before: Sequence[Graded], names: Sequence[str] | None
+) -> dict[str, Any]:
     """What was lost on each image, which is what intervals over images are made of.
 
     `lost_per_image` is the number of correct answers before minus that after, of as many questions
     as `questions_per_image` says; images are in the order of their numbers in the set.
+
+    Args:
+        names: of the set's images, which tell where another set has the same: `images`; None: no
+            other has.
     """
     lost: dict[int, int] = {}
     questions: dict[int, int] = {}
@@ -405,6 +411,7 @@ def by_image(after: Sequence[Graded], before: Sequence[Graded]) -> dict[str, lis
     return {
         "lost_per_image": [lost[number] for number in numbers],
         "questions_per_image": [questions[number] for number in numbers],
+        "images": None if names is None else [names[number] for number in numbers],
     }
 
 

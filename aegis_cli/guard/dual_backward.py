@@ -60,6 +60,7 @@ class DualBackward:
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._looked = 0, False
+        self._overflowed = False  # whether `.grad` holds a step that a scaler is going to skip
 
     @property
     def anchor(self) -> dict[int, Tensor | None]:
@@ -109,6 +110,7 @@ class DualBackward:
         total, self._sum = self._sum if continued else None, None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
+        self._see_whether_cleared(groups)
         # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
         # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
@@ -144,6 +146,12 @@ class DualBackward:
         self._reopened, self._sum = self._sum if self.continues() else None, None
         if self._reopened is not None:
             accumulation.take_back(self._reopened, self._learning())
+        self._see_whether_cleared(self._learning())
+
+    def _see_whether_cleared(self, groups: accumulation.Groups) -> None:
+        """Before a backward pass: whether a step that overflowed is over."""
+        if self._overflowed and accumulation.cleared(groups):
+            self._overflowed = False
 
     def leave(self) -> None:
         """Project `.grad` as it was before `reopen`, for that pass has added nothing to it."""
@@ -184,7 +192,8 @@ class DualBackward:
             w2, *rest = accumulation.mean_over(numbers, processes)
             loss = next(iter(rest), None)
         if total is None:
-            self._step += 1
+            if not self._overflowed:  # else it is a further micro-batch of that step
+                self._step += 1
             total = accumulation.started(taken, w2)
         else:
             accumulation.grow(total, taken, w2)
@@ -197,6 +206,7 @@ class DualBackward:
             if not skips:
                 raise diverged(len(self._ledger))
             accumulation.poison(groups)
+            self._overflowed = True
             return
         check_row(gram, self._ledger.groups)
         self._ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)

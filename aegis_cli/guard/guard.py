@@ -109,6 +109,7 @@ class Guard(Removable):
         self._owners = _owners(model, accumulation.resolved(process_group))
         if dual:
             accumulation.check_group(process_group)
+        _refuse_sparse(model)
         if not structure.learning(model):
             raise AegisError(
                 f"a {type(model).__name__} without trainable parameters",
@@ -415,6 +416,18 @@ class Guard(Removable):
                 f"{found} of an automatic guard",
                 f"{instead}, which it sees by itself",
                 f"call {instead}, or leave guard.automatic() out",
+            )
+
+
+def _refuse_sparse(model: nn.Module) -> None:
+    """Raise AegisError for tables whose gradients are sparse, which no projection reads."""
+    for name, module in model.named_modules():
+        table = isinstance(module, nn.Embedding | nn.EmbeddingBag)
+        if table and module.sparse and module.weight.requires_grad:
+            raise AegisError(
+                f"'{name}', a table with sparse gradients",
+                "dense gradients",
+                "make it with sparse=False, or freeze it",
             )
 
 

@@ -109,7 +109,8 @@ def _lost_by_image(figures: PolicyFigures) -> Units | None:
 
     lost = np.array(figures.lost_per_image, np.float64)
     questions = np.array(figures.questions_per_image, np.float64)
-    return Units(100 * lost, questions, figures.probe_seed, sure=_stands_still(figures))
+    sure = _stands_still(figures)
+    return Units(100 * lost, questions, figures.probe_seed, sure=sure, names=figures.images)
 
 
 def _stands_still(figures: PolicyFigures) -> bool:

@@ -22,6 +22,7 @@ class VqaFigures:
     majority_accuracy: float
     lost_per_image: tuple[int, ...] | None = None
     questions_per_image: tuple[int, ...] | None = None
+    images: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class PolicyFigures:
     Attributes:
         lost_per_image: for each image, correct answers before training minus those after it.
         questions_per_image: for each image, the number of its questions.
+        images: a digest of each image's name, where other seeds may have been asked about the same
+            ones; None of scenes.
         outcomes_seen, outcomes_held_out: one character per episode, 1 for a success, else 0.
         code: version and digest of the package that measured the cell.
     """
@@ -64,6 +67,7 @@ class PolicyFigures:
     return_share: float | None = None
     lost_per_image: tuple[int, ...] | None = None
     questions_per_image: tuple[int, ...] | None = None
+    images: tuple[str, ...] | None = None
     probe_seed: int = 0
     outcomes_seen: str | None = None
     outcomes_held_out: str | None = None

@@ -588,7 +588,8 @@ class PolicyRunner:
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
             wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
-            files.save_json(path, report.to_json() | probe.by_image(after, before) | wrong)
+            own = probe.by_image(after, before, asked.names)
+            files.save_json(path, report.to_json() | own | wrong)
             track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
@@ -641,10 +642,11 @@ def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
         majority_accuracy=probed["majority"],
         lost_per_image=_tuple(probed.get("lost_per_image")),
         questions_per_image=_tuple(probed.get("questions_per_image")),
+        images=_tuple(probed.get("images")),
     )
 
 
-def _tuple(values: list[int] | None) -> tuple[int, ...] | None:
+def _tuple(values: list[Any] | None) -> tuple[Any, ...] | None:
     """A list of a JSON file; None from a file that an older version wrote."""
     return None if values is None else tuple(values)
 

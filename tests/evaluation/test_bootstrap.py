@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +40,58 @@ def test_units_that_are_all_alike_are_no_certainty_unless_nothing_else_could_com
     assert pair is not None and pair.sure
     mixed = still[0].minus(alike[1])
     assert mixed is not None and not mixed.sure
+
+
+def named(rng: np.random.Generator, seeds: int, asked: int, pool: int) -> list[Units]:
+    """Seeds that are each asked about some images of a file; the images differ in difficulty."""
+    hard = rng.normal(size=pool)
+    found = []
+    for seed in range(seeds):
+        chosen = rng.permutation(pool)[:asked]
+        values = 4 * (hard[chosen] + 0.1 * rng.normal(size=asked))
+        names = tuple(f"image {i}" for i in chosen)
+        found.append(Units(values, np.full(asked, 4.0), seed, names=names))
+    return found
+
+
+def test_images_that_seeds_share_are_drawn_once() -> None:
+    """Whatever their order: five looks at the same images are hardly more than one."""
+    shared = named(np.random.default_rng(0), seeds=5, asked=40, pool=40)
+    apart = [replace(one, names=None) for one in shared]
+    one_draw = []
+    for one in shared:
+        order = np.argsort(one.names)
+        one_draw.append(replace(one, values=one.values[order], draw=0, names=None))
+    widths = [np.ptp(crossed_interval(seeds)) for seeds in (shared, apart, one_draw)]
+    assert widths[0] > 1.5 * widths[1] and widths[0] == pytest.approx(widths[2], rel=0.1)
+
+
+def test_names_that_no_seeds_share_are_those_of_draws_of_their_own() -> None:
+    rng = np.random.default_rng(1)
+    apart = [
+        Units(rng.normal(size=50), np.ones(50), seed, names=tuple(f"{seed} {i}" for i in range(50)))
+        for seed in range(4)
+    ]
+    plain = [replace(one, names=None) for one in apart]
+    widths = [np.ptp(crossed_interval(seeds)) for seeds in (apart, plain)]
+    assert widths[0] == pytest.approx(widths[1], rel=0.15)
+
+
+def test_other_images_are_no_pair() -> None:
+    one, other = (Units(np.ones(3), np.ones(3), 0, names=names) for names in ("abc", "abd"))
+    assert one.minus(other) is None and one.minus(one) is not None
+
+
+def test_few_images_that_a_resample_may_miss_still_have_an_interval() -> None:
+    seeds = named(np.random.default_rng(2), seeds=3, asked=2, pool=6)
+    assert all(math.isfinite(end) for end in crossed_interval(seeds))
+
+
+def test_images_that_several_seeds_were_asked_about_are_one_look() -> None:
+    names = tuple("abcdefg")
+    alike = [Units(np.full(7, 2.0), np.full(7, 4.0), draw, 1.0, names=names) for draw in range(3)]
+    bound = wilson_interval(0, 7)[1]
+    assert crossed_interval(alike) == pytest.approx((0.5 - bound, 0.5 + bound))
 
 
 def test_one_seed_has_no_interval() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import gc
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -188,6 +189,32 @@ def deep() -> Vlm:
         model.text.words.weight.mul_(40)
         model.vision[0].weight.mul_(150)
     return model
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_a_step_that_overflows_counts_once(is_automatic: bool, anchors: dict[str, Path]) -> None:
+    """However many micro-batches follow in it; it has no row, since no weight moves."""
+    model, guard = guarded("aegis", anchors)
+    scaler = torch.amp.GradScaler("cpu", init_scale=256.0)
+    if is_automatic:
+        guard.automatic(mask="mask", scaler=scaler)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    for step in range(4):
+        for micro in range(3):
+            factor = math.inf if step in (1, 2) and micro == 1 else 1.0
+            if is_automatic:
+                scaler.scale(task_loss(model, step) * factor).backward()
+                continue
+            with guard.watch(batch(step)[2]):
+                loss = task_loss(model, step) * factor
+            guard.backward(loss, scaler)
+        if is_automatic:
+            scaler.step(optimizer)
+        else:
+            guard.step(optimizer, scaler)
+        scaler.update()
+        optimizer.zero_grad()
+    assert guard.ledger.tensors()["step"].tolist() == [1, 4]
 
 
 def test_an_exception_in_a_backward_pass_ends_no_training(anchors: dict[str, Path]) -> None:

@@ -178,6 +178,13 @@ def test_processes_that_are_connected_after_the_guard_was_made(
     assert asked == ["all of them"]
 
 
+@every_method
+def test_a_table_with_sparse_gradients(method: str, anchors: dict[str, Path]) -> None:
+    model = make()
+    model.text.words.sparse = True
+    refused(lambda: guarded(method, anchors, model), "text.words", "sparse=False")
+
+
 def test_another_word_than_world(anchors: dict[str, Path]) -> None:
     refused(
         lambda: Guard(make(), anchors["aegis"], layers=LAYERS, process_group="gloo"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,11 @@ TRAINING_MIX: dict[str, int] = {
 _CHUNK = 250  # scenes a worker renders at a time
 
 
+def _name(key: str) -> str:
+    """A short digest of an image's name, which need not be UTF-8."""
+    return hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
+
+
 @dataclass(frozen=True)
 class VQASet:
     """Questions about images; `image_of[i]` is the image that `questions[i]` asks about.
@@ -46,6 +52,13 @@ class VQASet:
     image_of: np.ndarray
     questions: tuple[Question, ...]
     skipped: int = 0
+
+    @property
+    def names(self) -> list[str] | None:
+        """A digest of each image's name; None of scenes, which every seed has drawn for itself."""
+        if isinstance(self.images, np.ndarray):
+            return None
+        return [_name(picture.key) for picture in self.images.pictures]
 
     def sized(self, size: int | None) -> VQASet:
         """The same set for a backbone that needs images of `size` pixels per side.
