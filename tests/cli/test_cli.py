@@ -29,6 +29,7 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.common.version import __version__
+from aegis_cli.data.selection import Selection
 from aegis_cli.deploy import load_acting
 from aegis_cli.recipes import Anchor
 
@@ -215,7 +216,7 @@ def test_anchor_arguments(aegis, stage):
         )[0]
         == 0
     )
-    no_frames = {"demos": None, "camera": None, "only": None}
+    no_frames = {"demos": None, "selection": Selection()}
     assert calls == [(("b", Anchor(samples=9, batch_size=2), Path("a")), no_frames)]
     assert (
         aegis(
@@ -235,6 +236,10 @@ def test_anchor_arguments(aegis, stage):
     )
     settings = Anchor(parts=("fisher", "inputs"), energy=0.5, fisher_samples=3, seed=4)
     assert calls[1] == (("embedded", settings, Path("a")), no_frames)
+    frames = ("--demos", "d", "--camera", "top", "--camera", "wrist", "--only", "0-3")
+    assert aegis("anchor", "--out", "a", *frames)[0] == 0
+    chosen = {"demos": Path("d"), "selection": Selection(("top", "wrist"), "0-3")}
+    assert calls[2][1] == chosen
 
 
 def test_train_takes_method_and_overrides_into_the_recipe(aegis, stage, recipe):
