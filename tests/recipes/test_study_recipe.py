@@ -413,6 +413,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("anchor-temperature", 15, 15),
         ("regime", 24, 24),
         ("aegis-trial", 150, 150),
+        ("merges", 34, 34),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
@@ -450,6 +451,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "anchor-temperature",
         "regime",
         "aegis-trial",
+        "merges",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(
