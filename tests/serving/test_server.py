@@ -61,6 +61,11 @@ def test_the_stock_client_of_openpi_gets_the_actions_of_load_policy(naive_run: P
         with pytest.raises(RuntimeError, match="no 'prompt' in an observation"):
             client.infer({key: value for key, value in seen.items() if key != "prompt"})
         np.testing.assert_array_equal(client.infer(seen)["actions"], chunk(own, seen))
+        broker = pytest.importorskip("openpi_client.action_chunk_broker")
+        one_by_one = broker.ActionChunkBroker(client, action_horizon=2)
+        whole = chunk(own, seen)
+        for action in whole[:2]:
+            np.testing.assert_array_equal(one_by_one.infer(seen)["actions"], action)
         client._ws.close()
 
 
