@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
+from aegis_cli.data import relative
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.lerobot import dataset, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
@@ -25,6 +26,9 @@ from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.lerobot.source import Source
 from aegis_cli.data.selection import ALL, Selection
+
+# The statistics of relative actions are of this many at most; each takes a step of a chunk.
+_MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
@@ -112,10 +116,37 @@ class Demonstrations:
         _, is_pad = self.chunks(frame, chunk)
         return len(frame), int((~is_pad).sum())
 
-    def scales(self, normalization: str = "mean_std") -> tuple[Normalizer, Normalizer]:
-        """Normalizers of proprioception and actions, from the training episodes alone."""
+    def relative_places(self, absolute: Sequence[str]) -> tuple[int | None, ...]:
+        """The position that each action is relative to; see `relative.places`."""
+        sizes = self.tensors["actions"].shape[1], self.tensors["proprio"].shape[1]
+        return relative.places(self.action_names, self.proprio_names, sizes, absolute)
+
+    def scales(
+        self, normalization: str = "mean_std", chunk: int = 1, places: relative.Places = ()
+    ) -> tuple[Normalizer, Normalizer]:
+        """Normalizers of proprioception and actions, from the training episodes alone.
+
+        Args:
+            chunk: how many actions are predicted at once.
+            places: what each action is relative to; then its statistics are over all steps of the
+                chunks, since it grows along them.
+        """
         fit = {"mean_std": Normalizer.fit, "quantiles": Normalizer.fit_quantiles}[normalization]
-        return fit(self.tensors["proprio"][self.train]), fit(self.tensors["actions"][self.train])
+        actions = self.tensors["actions"][self.train]
+        if places:
+            actions = self._relative_actions(chunk, places)
+        return fit(self.tensors["proprio"][self.train]), fit(actions)
+
+    def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
+        """Actions [N, A] of the training frames' chunks, less their origins.
+
+        Of more than `_MOST_ROWS`, evenly spaced frames have theirs.
+        """
+        every = -(-len(self.train) * chunk // _MOST_ROWS)
+        frames = self.train[:: max(1, every)]
+        actions, is_pad = self.chunks(frames, chunk)
+        origins = relative.Origins(places)(self.tensors["proprio"][frames])
+        return (actions - origins)[~is_pad]
 
 
 def load(

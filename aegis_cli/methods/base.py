@@ -13,7 +13,7 @@ from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Pair
 from aegis_cli.core.projection import Combine
-from aegis_cli.data.batch import Normalizer, RobotBatch, Share
+from aegis_cli.data.batch import RobotBatch, Share
 
 Options = Mapping[str, Any]
 
@@ -37,7 +37,9 @@ class Setting:
             its graph; only for a method that trains on questions.
         instructions: every text that the frames come with, so that a method which makes more text
             of them can refuse it before any work; none in a loop of somebody else's.
-        action_scale: of the robot's actions; None in a loop of somebody else's.
+        targets: robot frames -> what the expert has to predict of their actions, [B, H, A]; None in
+            a loop of somebody else's.
+        actions: A, how many numbers an action has.
         owners: the processes each of which has some rows of every weight; one where each has all.
     """
 
@@ -48,7 +50,8 @@ class Setting:
     anchor: Anchor | None = None
     vqa_loss: Callable[[Pass], Tensor] | None = None
     instructions: Sequence[str] = ()
-    action_scale: Normalizer | None = None
+    targets: Callable[[RobotBatch], Tensor] | None = None
+    actions: int = 0
     owners: Ranks = ALONE
 
     def learning(self) -> dict[str, nn.Parameter]:

@@ -49,18 +49,17 @@ def start(setting: Setting) -> Parts:
 
 def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
     """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
-    backbone, scale = setting.backbone, setting.action_scale
+    backbone, targets = setting.backbone, setting.targets
     limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
-    assert scale is not None
+    assert targets is not None
     numbers = _numbers(setting)
-    _check_room(setting, " ".join(numbers[-1:] * (horizon * len(scale.mean))))
+    _check_room(setting, " ".join(numbers[-1:] * (horizon * setting.actions)))
 
     def loss(seen: Pass) -> Tensor:
         frames = seen.frames
         assert frames is not None
-        device = scale.mean.device
         chosen = spread(frames.actions.shape[1], horizon)
-        bins = binned(scale(frames.actions[:, chosen].to(device)), limit, len(numbers))
+        bins = binned(targets(frames)[:, chosen], limit, len(numbers))
         # The actions past an episode's end were never shown.
         shown = ~frames.is_pad[:, chosen]
         texts = as_texts(bins, shown, numbers)

@@ -21,6 +21,7 @@ from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.state_dicts import check_state, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
+from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.models import structure
 from aegis_cli.models.backbones import model_folder, outline
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES
@@ -40,6 +41,7 @@ _SAID = (
     "task",
     "replan",
     "normalization",
+    "relative",
     "cameras",
     "pictures",
     "state",
@@ -57,7 +59,7 @@ def write(
 
     Args:
         meta: what a policy's user has to know: method, task, replan, normalization and, where they
-            are known, the cameras and the sizes of their pictures.
+            are known, what actions are relative to, the cameras and the sizes of their pictures.
         cameras: other names of the pictures, in the order in which the backbone takes them.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)
@@ -109,8 +111,9 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     with reading_meta(path):
         check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         scales = [_unit(int(sizes[name])) for name in ("positions", "actions")]
+        relative = relative_of(meta, int(sizes["actions"]), int(sizes["positions"]))
         stored = STORED_TYPES[meta.get("stored", FLOAT32)]
-    policy = Policy(backbone, ActionExpert(shape), *scales)
+    policy = Policy(backbone, ActionExpert(shape), *scales, relative)
     backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)

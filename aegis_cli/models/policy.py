@@ -1,4 +1,4 @@
-"""A robot policy: a backbone, an action expert that reads it, and two normalizers."""
+"""A robot policy: a backbone, an action expert that reads it, and a robot's scales."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from aegis_cli.common.devices import send
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
+from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
@@ -23,15 +24,35 @@ class Policy(nn.Module):
     """
 
     def __init__(
-        self, backbone: Backbone, expert: ActionExpert, proprio: Normalizer, action: Normalizer
+        self,
+        backbone: Backbone,
+        expert: ActionExpert,
+        proprio: Normalizer,
+        action: Normalizer,
+        relative: Places = (),
     ) -> None:
+        """Put the parts together.
+
+        Args:
+            proprio: of the robot's positions.
+            action: of its actions, less what they are relative to.
+            relative: the place of the position that each action is predicted relative to, None for
+                an absolute one; empty where all are absolute.
+        """
         super().__init__()
         self.backbone, self.expert = backbone, expert
         self.proprio_scale, self.action_scale = proprio, action
+        self.origins = Origins(relative)
 
     def encode(self, images: Images, instructions: Sequence[str]) -> Encoding:
         """The backbone's pass over B images (or B tuples of several cameras') and instructions."""
         return self.backbone.encode(self.backbone.prepare(images, instructions))
+
+    def targets(self, batch: RobotBatch) -> Tensor:
+        """What the expert has to predict of a batch's actions: [B, H, A], in normalised units."""
+        device = self.backbone.device
+        origins = self.origins(send(batch.proprio, device))
+        return self.action_scale(send(batch.actions, device) - origins)
 
     def flow_loss(
         self,
@@ -56,7 +77,7 @@ class Policy(nn.Module):
             A scalar, in normalised units; of a share, what it contributes to the whole batch's.
         """
         device = self.backbone.device
-        actions = self.action_scale(send(batch.actions, device))[:, None]  # [B, 1, H, A]
+        actions = self.targets(batch)[:, None]  # [B, 1, H, A]
         of = of or Whole(len(actions), int((~batch.is_pad).sum()))
         shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
         # Both are drawn on the CPU, so that they are the same whatever the device, and for the
@@ -104,7 +125,8 @@ class Policy(nn.Module):
     ) -> Tensor:
         """What `act` returns for that noise [B, H, A]."""
         encoding = self.encode(images, instructions)
-        state = self.proprio_scale(proprio.to(self.backbone.device))
+        proprio = proprio.to(self.backbone.device)
+        state = self.proprio_scale(proprio)
         suffix = self.backbone.suffix(encoding, noise.shape[1])
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
@@ -112,7 +134,8 @@ class Policy(nn.Module):
             found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
             return found[:, 0]
 
-        return self.action_scale.invert(flow.integrate(velocity, noise.to(state.device)))
+        predicted = flow.integrate(velocity, noise.to(state.device))
+        return self.action_scale.invert(predicted) + self.origins(proprio)
 
     def _velocity(
         self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix

@@ -46,6 +46,10 @@ def cross_checks(
     if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
         found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    if recipe.train.relative_exclude is not None and not recipe.train.relative_actions:
+        found = f"train.relative_exclude: {', '.join(recipe.train.relative_exclude)}"
+        fix = "set it, or delete train.relative_exclude"
+        yield Problem(found, "it with train.relative_actions: true", fix)
     if recipe.train.augment is None and "augment_count" in changed(recipe.train):
         found = f"train.augment_count: {recipe.train.augment_count} without train.augment"
         fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"

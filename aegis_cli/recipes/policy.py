@@ -274,6 +274,20 @@ class Train:
         doc="How proprioception and actions are scaled: to mean 0 and standard deviation 1, or "
         "by their 1 % and 99 % quantiles.",
     )
+    relative_actions: bool = key(
+        default=False,
+        later=True,
+        doc="Predict actions relative to the robot's position when their chunk begins, each to the "
+        "position of its own name, as LeRobot's use_relative_actions does. The policy adds the "
+        "position again, so that what it answers is absolute.",
+    )
+    relative_exclude: tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        None,
+        later=True,
+        doc="Words in the names of actions that stay absolute under `relative_actions`, such as "
+        "gripper.",
+    )
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
     )

@@ -22,6 +22,7 @@ from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations
+from aegis_cli.data.relative import Places
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -91,7 +92,8 @@ class TrainingRun:
 
         `task` is None for one that is not simulated; `cameras`, in their order, are there if they
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
-        if it is not float32.
+        if it is not float32; `relative`, for each action the place of the position that it is
+        predicted relative to, or None, if any is.
         """
         found = {
             "method": self.method.name,
@@ -100,6 +102,8 @@ class TrainingRun:
             "normalization": self.recipe.train.normalization,
         }
         found |= recipes.selected(self.recipe)
+        if self.policy.origins.places:
+            found["relative"] = list(self.policy.origins.places)
         if self.demos.cameras:
             found["cameras"] = list(self.demos.cameras)
         if self.policy.backbone.image_size is None:
@@ -438,7 +442,8 @@ def _start(
         anchor,
         vqa_loss,
         demos.texts,
-        policy.action_scale,
+        policy.targets,
+        len(policy.action_scale.mean),
         owners,
     )
     return method.start(setting)
@@ -468,17 +473,27 @@ def _vqa_loss(
 
 
 def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrations) -> Policy:
-    proprio, action = demos.scales(recipe.train.normalization)
+    train = recipe.train
+    relative = demos.relative_places(train.relative_exclude or ()) if train.relative_actions else ()
+    proprio, action = demos.scales(train.normalization, train.chunk, relative)
     shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
     expert = ActionExpert(shape)
     if recipe.expert.start is not None:
-        expert.load_state_dict(_begun_expert(recipe.expert.start, shape).state_dict())
-    return Policy(backbone, expert, proprio, action).to(backbone.device)
+        expert.load_state_dict(_begun_expert(recipe.expert.start, shape, relative).state_dict())
+    return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
 
 
-def _begun_expert(start: str, shape: ExpertShape) -> ActionExpert:
+def _begun_expert(start: str, shape: ExpertShape, relative: Places) -> ActionExpert:
     """The expert of another run, which has to be of the shape that this one needs."""
-    found = checkpoint.load_expert(start)
+    found, meta = checkpoint.load_expert(start)
+    if tuple(meta.get("relative", ())) != tuple(relative):
+        raise AegisError(
+            f"the expert of '{start}' predicts {_told(meta.get('relative', ()))}, this training "
+            f"{_told(relative)}",
+            "an expert that predicts the same",
+            "set train.relative_actions and train.relative_exclude to those of that run, or delete "
+            "expert.start",
+        )
     here, there = shape.to_json(), found.shape.to_json()
     other = [
         f"{name} {there[name]} instead of {here[name]}"
@@ -493,6 +508,13 @@ def _begun_expert(start: str, shape: ExpertShape) -> ActionExpert:
             "--set backbone=… too, or delete expert.start",
         )
     return found
+
+
+def _told(relative: Places) -> str:
+    if not relative:
+        return "absolute actions"
+    own = ", ".join("absolute" if place is None else f"to {place}" for place in relative)
+    return f"actions relative to positions ({own})"
 
 
 def expert_shape(

@@ -30,6 +30,7 @@ from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.backbones import model_folder
@@ -296,14 +297,16 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
     expert, meta, scales = _load_expert(path / EXPERT, backbone)
-    return Policy(backbone, expert, *scales).eval(), meta
+    relative = relative_of(meta, expert.shape.actions, expert.shape.proprio)
+    return Policy(backbone, expert, *scales, relative).eval(), meta
 
 
-def load_expert(folder: str | Path) -> ActionExpert:
-    """The expert alone of what `load_policy` takes."""
+def load_expert(folder: str | Path) -> tuple[ActionExpert, dict[str, Any]]:
+    """The expert alone of what `load_policy` takes, and the meta."""
     if lerobot_folder.is_policy(Path(folder)):
-        return lerobot_folder.load(Path(folder))[0].expert
-    return _load_expert(_expert_file(folder))[0]
+        policy, meta = lerobot_folder.load(Path(folder))
+        return policy.expert, meta
+    return _load_expert(_expert_file(folder))[:2]
 
 
 def expert_sha256(folder: str | Path) -> str:
@@ -333,6 +336,7 @@ def _load_expert(
         if backbone is not None:
             check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         _check_user_meta(meta)
+        relative_of(meta, shape.actions, shape.proprio)
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
         wanted |= {f"proprio.{name}": torch.empty(shape.proprio) for name in ("mean", "std")}

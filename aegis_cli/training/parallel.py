@@ -108,8 +108,8 @@ def shard(policy: Policy, precision: str, device: torch.device) -> None:
     policies |= {policy.backbone: as_kept, policy.expert: as_kept}
     for module, of_messages in policies.items():
         fully_shard(module, mesh=mesh, reshard_after_forward=True, mp_policy=of_messages)
-    for scale in (policy.proprio_scale, policy.action_scale):  # they lie outside of what is cut
-        scale.to(device)
+    for part in (policy.proprio_scale, policy.action_scale, policy.origins):  # nothing cuts them
+        part.to(device)
     for name in ("encode", "answer_log_likelihood"):
         register_fsdp_forward_method(policy.backbone, name)
     for module in policy.modules():

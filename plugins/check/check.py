@@ -27,8 +27,11 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
+from lerobot.lerobot_types import TransitionKey
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.processor import RelativeActionsProcessorStep
 from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.constants import OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file, save_file
 from smolvla_in_miniature import save_smolvla, save_vlm
@@ -39,6 +42,7 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.nullspace import Strength
+from aegis_cli.data import relative
 from aegis_cli.models import backbones
 
 ENERGY = 0.9  # share of the VLM's inputs that is protected
@@ -74,6 +78,7 @@ def main() -> None:
         smolvla_moves_orthogonally,
         smolvla_at_strength_0_is_adamw,
         frames_are_augmented_as_by_torchvision,
+        actions_are_relative_as_in_lerobot,
     )
     failed = 0
     for check in checks:
@@ -380,6 +385,20 @@ def frames_are_augmented_as_by_torchvision(_: Path) -> str:
     changed = {name: worst for name, worst in found.items() if worst > augmentation.CLOSE}
     assert not changed, f"largest differences: {changed}"
     return f"{len(found)} transformations, largest difference {max(found.values()):.2g}"
+
+
+def actions_are_relative_as_in_lerobot(_: Path) -> str:
+    names = ["shoulder.pos", "elbow.pos", "gripper.pos"]
+    places = relative.places(names, names, (3, 3), ["gripper"])
+    theirs = RelativeActionsProcessorStep(True, ["gripper"], names)
+    generator = torch.Generator().manual_seed(0)
+    state = torch.randn(4, 3, generator=generator)
+    actions = torch.randn(4, 6, 3, generator=generator)
+    seen = {TransitionKey.ACTION: actions, TransitionKey.OBSERVATION: {OBS_STATE: state}}
+    difference = theirs(seen)[TransitionKey.ACTION] - (actions - relative.Origins(places)(state))
+    worst = float(difference.abs().max())
+    assert worst == 0, f"largest difference {worst:.2g}"
+    return "train.relative_actions and use_relative_actions agree to the bit"
 
 
 # --- commands and files ---------------------------------------------------------------------------

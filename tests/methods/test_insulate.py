@@ -163,7 +163,7 @@ def test_the_loss_is_in_nats_per_number_that_is_written() -> None:
     assert batch.is_pad[:, -1].any() and not batch.is_pad[:, 0].any()
     auxiliary = start(INSULATE, policy, horizon=2, bins=8, weight=3.0).auxiliary
     assert auxiliary is not None
-    actions = policy.action_scale(batch.actions)[:, [0, CHUNK - 1]]
+    actions = policy.targets(batch)[:, [0, CHUNK - 1]]
     total, numbers = torch.zeros((), dtype=torch.float64), 0
     for i, instruction in enumerate(batch.instructions):
         rows = actions[i][~batch.is_pad[i, [0, CHUNK - 1]]]

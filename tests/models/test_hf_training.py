@@ -75,7 +75,8 @@ def gradients(
         options,
         measured,
         instructions=INSTRUCTIONS,
-        action_scale=policy.action_scale,
+        targets=policy.targets,
+        actions=len(policy.action_scale.mean),
     )
     parts = chosen.start(setting)
     policy.train()

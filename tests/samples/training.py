@@ -170,7 +170,8 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
             anchor or make_anchor(),
             vqa_loss,
             INSTRUCTIONS,
-            policy.action_scale,
+            policy.targets,
+            len(policy.action_scale.mean),
         )
     )
 

@@ -1,0 +1,106 @@
+"""Actions that are predicted relative to where the robot is when their chunk begins.
+
+`action - position` of the same joint, as LeRobot's `use_relative_actions` and openpi's
+`DeltaActions` have it. Grippers are often left as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.common.errors import AegisError
+
+# For each action, the place of its own joint among the positions; None where it stays absolute.
+Places = Sequence[int | None]
+
+
+class Origins(nn.Module):
+    """What is subtracted of each action before the expert learns it, and added to what it predicts.
+
+    Attributes:
+        places: of each of A actions; empty where all are absolute.
+    """
+
+    def __init__(self, places: Places = ()) -> None:
+        super().__init__()
+        self.places = tuple(places)
+        self._columns: Tensor
+        # The last of P + 1 columns is 0. The header of a policy's file names the places.
+        columns = torch.tensor([-1 if place is None else place for place in places]).long()
+        self.register_buffer("_columns", columns, persistent=False)
+
+    def forward(self, proprio: Tensor) -> Tensor | float:
+        """The origins [B, 1, A] of chunks that begin at positions [B, P]; 0 if all are absolute."""
+        if not self.places:
+            return 0.0
+        return nn.functional.pad(proprio, (0, 1))[:, None, self._columns]
+
+
+def places(
+    actions: Sequence[str],
+    positions: Sequence[str],
+    sizes: tuple[int, int],
+    absolute: Sequence[str],
+) -> tuple[int | None, ...]:
+    """The position that each action is relative to: that of its name.
+
+    Where the data names neither, actions belong to positions by their order.
+
+    Args:
+        actions: names of the A actions; empty where there are none.
+        positions: names of the P positions.
+        sizes: (A, P).
+        absolute: words in the names of actions that stay absolute, such as gripper.
+
+    Raises:
+        AegisError: an action without a position of its name, other numbers of nameless ones, or a
+            word that no action's name has.
+    """
+    if not actions and not positions and not absolute and sizes[0] == sizes[1]:
+        return tuple(range(sizes[0]))
+    if len(actions) != sizes[0] or len(positions) != sizes[1]:
+        raise AegisError(
+            f"train.relative_actions: true with {sizes[0]} actions and {sizes[1]} positions, not "
+            "all of which have names",
+            "names of both in the demonstrations; without any, as many positions as actions and no "
+            "train.relative_exclude",
+            "delete train.relative_actions, or name the features' components in info.json",
+        )
+    for word in absolute:
+        if not any(word.lower() in name.lower() for name in actions):
+            raise AegisError(
+                f"train.relative_exclude: '{word}', which no action's name has",
+                f"a word of {', '.join(actions)}",
+                "correct it, or delete it",
+            )
+    words = [word.lower() for word in absolute]
+    stays = [any(word in name.lower() for word in words) for name in actions]
+    moved = [name for name, stay in zip(actions, stays, strict=True) if not stay]
+    lacking = [name for name in moved if name not in positions]
+    if lacking:
+        raise AegisError(
+            f"train.relative_actions: true, and no position is named {' or '.join(lacking)}",
+            f"actions that say which positions to take: {', '.join(positions)}",
+            "name what stays absolute in train.relative_exclude, or delete train.relative_actions",
+        )
+    return tuple(
+        None if stay else positions.index(name) for name, stay in zip(actions, stays, strict=True)
+    )
+
+
+def of_meta(meta: Mapping[str, Any], actions: int, positions: int) -> tuple[int | None, ...]:
+    """The places that the meta of a policy's file tells; empty where all actions are absolute.
+
+    Raises:
+        ValueError: they are not those of so many actions and positions.
+    """
+    told = meta.get("relative", [])
+    known = [None, *range(positions)]
+    fits = isinstance(told, list) and len(told) in (0, actions)
+    if not fits or not all(place in known and type(place) is not bool for place in told):
+        raise ValueError(f"'relative' is {told!r}")
+    return tuple(told)
