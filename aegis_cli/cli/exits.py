@@ -120,8 +120,8 @@ def _is_out_of_memory(error: Exception) -> bool:
 def _too_large(error: Exception) -> AegisError:
     said = (str(error).splitlines() or [""])[0]
     fix = (
-        "a smaller --batch-size or --set train.batch_size=..., fewer --workers, or "
-        "train.gradient_checkpointing; see --dry-run"
+        "a smaller --batch-size or --set train.batch_size=..., fewer train.flow_samples or "
+        "--workers, or train.gradient_checkpointing; see --dry-run"
     )
     return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits", fix)
 

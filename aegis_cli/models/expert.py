@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, Rotation, additive, block_attention, rotate
@@ -114,11 +115,15 @@ class ActionExpert(nn.Module):
     """Velocity field over action chunks.
 
     It is given proprioception, the flow time and a backbone's keys and values.
+
+    Attributes:
+        recomputes: whether a layer's activations are not kept for the backward pass but made anew
+            in it. They grow with flow samples x chunk x (chunk + the backbone's tokens).
     """
 
     def __init__(self, shape: ExpertShape) -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.recomputes = shape, False
         width = shape.width
         self.action_in = nn.Linear(shape.actions, width)
         self.position = nn.Parameter(torch.randn(shape.chunk, width) * 0.02)
@@ -164,7 +169,10 @@ class ActionExpert(nn.Module):
         for layer, keys_values, mask, own in zip(
             self.layers, prefix, masks, rotations, strict=True
         ):
-            tokens = layer(tokens, keys_values, mask, own)
+            if self.recomputes and torch.is_grad_enabled():
+                tokens = checkpoint(layer, tokens, keys_values, mask, own, use_reentrant=False)
+            else:
+                tokens = layer(tokens, keys_values, mask, own)
         # Loss and integration take the velocity in float32, also under autocast.
         return self.action_out(self.final_norm(tokens)).float()
 

@@ -335,7 +335,8 @@ class Train:
     )
     gradient_checkpointing: bool = key(
         default=False,
-        doc="Hugging Face backbones only: less memory, at the price of a second forward pass.",
+        doc="Hugging Face backbones only: less memory, at the price of a second forward pass, of "
+        "the action expert too.",
     )
     compile: bool = key(
         default=False,

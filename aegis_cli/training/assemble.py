@@ -478,6 +478,7 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrat
     proprio, action = demos.scales(train.normalization, train.chunk, relative)
     shape = expert_shape(backbone, recipe, len(proprio.mean), len(action.mean))
     expert = ActionExpert(shape)
+    expert.recomputes = train.gradient_checkpointing
     if recipe.expert.start is not None:
         expert.load_state_dict(_begun_expert(recipe.expert.start, shape, relative).state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)

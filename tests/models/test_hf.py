@@ -134,6 +134,43 @@ def test_any_of_several_ends_ends_an_answer(backbone: HFBackbone) -> None:
     close(alone[2], torch.logaddexp(alone[0], alone[1]))
 
 
+def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -> None:
+    """Each is as long as the vocabulary, and a batch of images of several sizes has many rows."""
+    said = backbone._prompter.answer_ids(SAID)
+    head, seen = backbone.get_submodule(backbone._head), list[torch.Size]()
+    handle = head.register_forward_hook(lambda _, __, out: seen.append(out.shape[:-1]))
+    backbone.answer_log_likelihood(images(4), TEXTS, SAID)
+    handle.remove()
+    assert seen == [(1, sum(len(words) + 1 for words in said))]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"repetition_penalty": 50.0},
+        {"no_repeat_ngram_size": 1},
+        {"do_sample": True, "temperature": 9.0, "top_k": 3},
+        {"num_beams": 3},
+        {"min_new_tokens": 9},
+    ],
+)
+def test_a_models_own_ways_to_generate_change_no_answer(
+    own: dict[str, float], backbone: HFBackbone
+) -> None:
+    """An answer is the likeliest, or what is scored would be another than what is said."""
+    plain = backbone.answer(images(4), TEXTS)
+    config = backbone.vlm.generation_config
+    before = {name: getattr(config, name) for name in own}
+    config.update(**own)
+    try:
+        assert backbone.answer(images(4), TEXTS) == plain
+        assert backbone.vlm.generation_config is config
+        assert {name: getattr(config, name) for name in own} == own
+    finally:
+        config.update(**before)
+
+
 def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackbone) -> None:
     """The same scores as a batch with padding has, whatever the order."""
     frames, image_of = images(2), torch.tensor([0, 1, 1, 0])

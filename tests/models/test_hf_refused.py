@@ -214,6 +214,8 @@ def test_keys_that_are_rotated_otherwise_than_the_experts(
         ("mllama", "cross-attention layers"),
         ("phi4_multimodal", "a causal language model with inputs of its own"),
         ("phi4mm", "repository's own code"),
+        ("internvl_chat", "ends in -hf"),
+        ("llava_qwen", "ends in -hf"),
     ],
 )
 def test_a_family_that_cannot_be_used_is_refused_with_the_reason(
@@ -225,6 +227,19 @@ def test_a_family_that_cannot_be_used_is_refused_with_the_reason(
     for name in ("other", "other#model.language_model.layers"):
         said = bad(*MEASURE, name, says=(f"'{kind}' model", why, "paligemma, "))
         assert "after a #" not in said and "processor's files" not in said
+
+
+def test_a_model_without_an_end_of_answers_is_refused(
+    place: Path, bad: Bad, hf_folder: Callable[[str], Path]
+) -> None:
+    folder = place / "endless"
+    shutil.copytree(hf_folder("paligemma"), folder)
+    for name in ("config.json", "generation_config.json"):
+        content = json.loads((folder / name).read_text())
+        content["eos_token_id"] = None
+        content.get("text_config", {})["eos_token_id"] = None
+        (folder / name).write_text(json.dumps(content))
+    bad(*MEASURE, "endless", says=("without eos_token_id", "end an answer"))
 
 
 class SelfAttention(torch.nn.Module):

@@ -28,6 +28,7 @@ from samples.training import (
     snapshot_gradients,
 )
 from samples.training_runs import TIMES, assert_same_run, metrics, protected_shares
+from torch import Tensor
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -128,6 +129,32 @@ def test_checkpointing_gives_the_same_gradients_of_both_backwards(
             torch.testing.assert_close(checkpointed[name], wanted, rtol=1e-5, atol=1e-7, msg=name)
     for name in row:
         torch.testing.assert_close(same_row[name], row[name])
+
+
+@pytest.mark.parametrize("family", ["paligemma", "smolvlm"])
+def test_an_expert_that_recomputes_keeps_less_and_gives_the_same_gradients(
+    family: str, hf_backbone: Loaded
+) -> None:
+    found, kept = [], []
+    for again in (False, True):
+        policy = policy_over(hf_backbone(family))
+        policy.expert.recomputes = again
+        own = [0]
+
+        def keep(tensor: Tensor, own: list[int] = own) -> Tensor:
+            own[0] += tensor.numel()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            gradients(policy)
+        found.append(snapshot_gradients(policy))
+        kept.append(own[0])
+    plain, recomputed = found
+    assert kept[1] < kept[0] and plain.keys() == recomputed.keys()
+    for name, wanted in plain.items():
+        assert (wanted is None) == (recomputed[name] is None), name
+        if wanted is not None:
+            torch.testing.assert_close(recomputed[name], wanted, rtol=0, atol=0, msg=name)
 
 
 @tracing

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from transformers.utils import is_torchvision_available
 
 from aegis_cli.common import prefetch
+from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Asked, Images
@@ -89,6 +91,12 @@ class HFBackbone(Backbone):
         names = {id(module): name for name, module in self.named_modules()}
         self._table, self._head = names[id(table)], names[id(head)]
         self.tied_heads = {self._table: self._head} if head.weight is table.weight else {}
+        if model.generation_config.eos_token_id is None:
+            raise AegisError(
+                f"a {type(model).__name__} without eos_token_id in its generation_config.json",
+                "the token, or tokens, that end an answer",
+                "add it, as the model's own repository has it",
+            )
         self.depth = len(self._layers)
         self.kv_heads, self.head_dim = self._measure_keys()
 
@@ -249,17 +257,8 @@ class HFBackbone(Backbone):
     def _generated(self, prompts: Batch) -> list[str]:
         """The answers that the model generates."""
         batch = prompts.to(self.device)
-        # A model's own generation_config may ask for sampling. What only sampling reads is unset,
-        # because transformers warns of it otherwise.
-        said = self.vlm.generate(
-            **_arguments(batch),
-            do_sample=False,
-            num_beams=1,
-            temperature=None,
-            top_p=None,
-            top_k=None,
-            max_new_tokens=MAX_ANSWER,
-        )
+        with _greedy(self.vlm):
+            said = self.vlm.generate(**_arguments(batch), max_new_tokens=MAX_ANSWER)
         return self._prompter.decode(said[:, batch.ids.shape[1] :])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
@@ -303,18 +302,24 @@ class HFBackbone(Backbone):
     def _log_likelihood(self, answered: _Answered) -> Tensor:
         """See `answer_log_likelihood`."""
         batch, lengths, said = answered.batch.to(self.device), answered.lengths, answered.said
-        # No position before it predicts a word of an answer, and each position's scores are as many
-        # as the vocabulary has words.
+        # Each position has as many scores as the vocabulary has words, and where images differ in
+        # size a batch has a thousand positions. So none is scored but those that predict an answer.
         first = min(lengths) - 1
-        scores = self._scores(batch, batch.ids.shape[1] - first)
-        total = []
-        for row, length, words in zip(scores, lengths, said, strict=True):
+        rows: list[int] = []
+        columns: list[int] = []
+        for row, (length, words) in enumerate(zip(lengths, said, strict=True)):
             start = length - 1 - first  # the prompt's last token predicts the first word
-            # Only what predicts the answer: where images differ in size, rows are far longer.
-            log_shares = row[start : start + len(words) + 1].log_softmax(-1)
-            answer = log_shares[range(len(words)), words].sum()
+            rows += [row] * (len(words) + 1)
+            columns += range(start, start + len(words) + 1)
+        places = send(torch.tensor([rows, columns]), self.device)
+        with _head_at(self.get_submodule(self._head), *places):
+            (scores,) = self._scores(batch, batch.ids.shape[1] - first)  # [sum of words + 1, V]
+        log_shares = scores.log_softmax(-1).split([len(words) + 1 for words in said])
+        total = []
+        for own, words in zip(log_shares, said, strict=True):
+            answer = own[range(len(words)), words].sum()
             # Any of the end tokens ends the answer, so their probabilities add up.
-            total.append(answer + log_shares[-1, self._ends()].logsumexp(0))
+            total.append(answer + own[-1, self._ends()].logsumexp(0))
         return torch.stack(total)
 
     def _scores(self, batch: Batch, last: int) -> Tensor:
@@ -413,6 +418,36 @@ def _layer_types(text: Any, rotary: nn.Module) -> Sequence[str] | None:
     """
     by_kind = "layer_type" in inspect.signature(rotary.forward).parameters
     return text.layer_types if by_kind else None
+
+
+@contextmanager
+def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Iterator[None]:
+    """Inside the block, a head that is given [B, T, D] sees [1, n, D] of it."""
+
+    def chosen(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
+        return given[0][rows, columns][None], *given[1:]
+
+    handle = head.register_forward_pre_hook(chosen)
+    try:
+        yield
+    finally:
+        handle.remove()
+
+
+@contextmanager
+def _greedy(model: transformers.PreTrainedModel) -> Iterator[None]:
+    """Inside the block, a model generates the likeliest token after each, until one that ends it.
+
+    Its own settings may sample, and may penalise the words that a question has, such as
+    `repetition_penalty`. Of them the tokens that begin, end and fill a text are left.
+    """
+    own = model.generation_config
+    tokens = {name: getattr(own, name) for name in ("bos_token_id", "eos_token_id", "pad_token_id")}
+    model.generation_config = transformers.GenerationConfig(**tokens, do_sample=False, num_beams=1)
+    try:
+        yield
+    finally:
+        model.generation_config = own
 
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:

@@ -51,7 +51,12 @@ def fetch(name: str) -> Path:
 
     try:
         wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
-        return Path(huggingface_hub.snapshot_download(name, allow_patterns=wanted))
+        # Mistral's repositories have their weights twice.
+        unwanted = ["consolidated*"]
+        found = huggingface_hub.snapshot_download(
+            name, allow_patterns=wanted, ignore_patterns=unwanted
+        )
+        return Path(found)
     except (OSError, ValueError) as error:
         raise AegisError(
             f"no folder '{name}', and no model of that name from the Hugging Face hub: "
