@@ -15,7 +15,7 @@ from aegis_cli.anchors import inputs, passes
 from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.spectrum import DENSE, Spectrum
@@ -27,6 +27,9 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     from aegis_cli.data.vqa.dataset import VQASet
 
 SIDES = ("inputs", "outputs")
+# Nats a word. At 0.025 `kfac` holds what it should, and at 0.002 it does not: see
+# docs/results/transfer.md.
+_SURE = 0.01
 
 
 @dataclass
@@ -346,6 +349,23 @@ def measure(
         # They come in the backward pass's order.
         found |= {name: spectra[name] for name in recorder.names}
     return found
+
+
+def warn_of_sure_answers(
+    entropy: float, temperature: float, stage: str, effect: str, on_event: OnEvent
+) -> None:
+    """Warn of a curvature that hangs on the few questions of which the backbone is not sure.
+
+    Args:
+        entropy: of the backbone's own answers, in nats a word.
+        effect: what it does, and what helps.
+    """
+    if entropy < _SURE and temperature == 1:
+        text = (
+            f"the backbone is nearly sure of these answers ({entropy:.4f} nats a word), so their "
+            f"curvature hangs on a few questions, and {effect}"
+        )
+        on_event(Warned(stage, text))
 
 
 def _size(whole: int, module: nn.Module) -> int:

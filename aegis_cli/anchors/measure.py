@@ -15,7 +15,7 @@ from torch import Tensor
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.ranks import Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
@@ -27,10 +27,6 @@ from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
-
-# Nats a word. At 0.025 `kfac` holds what it should, and at 0.002 it does not: see
-# docs/results/transfer.md.
-_SURE = 0.01
 
 
 @dataclass(frozen=True)
@@ -95,19 +91,16 @@ def run(
             measured = _on_frames(backbone, settings, Path(out), demos, shown, on_event, ranks)
         else:
             measured = _on_questions(backbone, settings, Path(out), on_event, ranks)
-        _warn_of_sure_answers(measured.entropy, settings.temperature, on_event)
+        if measured.entropy is not None:
+            curvature.warn_of_sure_answers(
+                measured.entropy,
+                settings.temperature,
+                "anchor",
+                "kfac may lose the others: measure again with anchor.temperature 4 (--temperature "
+                "4), or on harder questions",
+                on_event,
+            )
         return ranks.agree(_written(measured, settings, Path(out)) if ranks.first else None)
-
-
-def _warn_of_sure_answers(entropy: float | None, temperature: float, on_event: OnEvent) -> None:
-    """Warn of a curvature that hangs on the few questions of which the backbone is not sure."""
-    if entropy is not None and entropy < _SURE and temperature == 1:
-        text = (
-            f"the backbone is nearly sure of these answers ({entropy:.4f} nats a word), so their "
-            "curvature hangs on a few questions, and kfac may lose the others: measure again with "
-            "anchor.temperature 4 (--temperature 4), or on harder questions"
-        )
-        on_event(Warned("anchor", text))
 
 
 def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport:

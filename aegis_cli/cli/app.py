@@ -43,6 +43,7 @@ from aegis_cli.cli.options import (
     StoredIn,
     Vqa,
     Wide,
+    above_zero,
     episode_numbers,
     given,
     listed_episodes,
@@ -438,6 +439,14 @@ def merge(
         int,
         Option(help="Questions to measure on where there is no --anchor.", callback=positive),
     ] = 1000,
+    temperature: Annotated[
+        float,
+        Option(
+            help="Where there is no --anchor: what the answers' scores are divided by before the "
+            "curvature's words are drawn; 4 where the model is sure of its answers.",
+            callback=above_zero,
+        ),
+    ] = 1.0,
     frames: Annotated[
         int, Option(help="Robot frames to measure on; at most.", callback=positive)
     ] = 1000,
@@ -491,6 +500,7 @@ def merge(
         skip_bad=asks.skip_bad,
         task_vqa=task_vqa,
         samples=samples,
+        temperature=temperature,
         frames=frames,
         questions=questions,
         batch_size=asks.batch_size,

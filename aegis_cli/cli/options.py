@@ -63,6 +63,13 @@ def not_negative(param: typer.CallbackParam, value: float | None) -> float | Non
     return value
 
 
+def above_zero(param: typer.CallbackParam, value: float) -> float:
+    """A number above 0."""
+    if not 0 < value < math.inf:  # NaN fails both
+        raise _refused(param, f"{value:g}", "a number above 0", param.default)
+    return value
+
+
 def seed_number(param: typer.CallbackParam, value: int) -> int:
     """A seed that NumPy takes."""
     if not SEED.accepts(value):

@@ -78,7 +78,26 @@ def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEv
     asked = asked.sized(base.image_size)
     if part == "inputs":
         return Anchor(inputs=inputs.measure(base, asked, 1.0, settings.batch_size, on_event))
-    return Anchor(curvature=curvature.measure(base, asked, 1.0, 0, settings.batch_size, on_event))
+    surety = curvature.Surety()
+    measured = curvature.measure(
+        base,
+        asked,
+        1.0,
+        0,
+        settings.batch_size,
+        on_event,
+        temperature=settings.temperature,
+        surety=surety,
+    )
+    curvature.warn_of_sure_answers(
+        surety.mean(),
+        settings.temperature,
+        "merge",
+        "a merge returns less of what other questions ask: merge with --temperature 4, which takes "
+        "smaller strengths, or with harder questions",
+        on_event,
+    )
+    return Anchor(curvature=measured)
 
 
 # --- one side -------------------------------------------------------------------------------------

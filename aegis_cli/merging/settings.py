@@ -30,6 +30,9 @@ class MergeSettings:
         vqa: the questions whose answers are to be kept.
         ask: what a question becomes before a model reads it, with {} for it.
         task_vqa: the task as questions, for a model without a run.
+        samples: questions that the anchor is measured on where none is given.
+        temperature: what their answers' scores are divided by before the curvature's words are
+            drawn from them.
         frames: of demonstrations that the task's factors are measured on.
         questions: for validation, of each set.
         batch_size: questions per forward pass.
@@ -45,6 +48,7 @@ class MergeSettings:
     ask: str = "{}"
     task_vqa: str | None = None
     samples: int = 1000
+    temperature: float = 1.0
     frames: int = 1000
     questions: int = 2100
     batch_size: int = 64

@@ -16,6 +16,7 @@ from samples.user_folder import leftovers, snapshot
 from samples.vqa_files import write_jsonl
 
 from aegis_cli import load_policy
+from aegis_cli.anchors import curvature
 from aegis_cli.common import artifacts, locks
 from aegis_cli.merging.merge import MergePoint, _weakest
 from aegis_cli.recipes import MERGES
@@ -60,6 +61,26 @@ def test_a_merged_run_is_a_run_for_every_command(
     assert code == 0 and json.loads(shown)["questions"] == 7
     assert aegis("rollout", out, "--episodes", 1)[0] == 0
     assert load_policy(out).task == "reach"
+
+
+@pytest.mark.parametrize("method", ["kfac-shrink", "factors"])
+def test_a_curvature_of_sure_answers_is_warned_of(
+    method: str,
+    aegis: Aegis,
+    merge_place: Place,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And measured otherwise with a temperature."""
+    monkeypatch.setattr(curvature, "_SURE", 100.0)
+    kept = []
+    for temperature in (1, 4):
+        words = ("--method", method, "--strength", 1, "--temperature", temperature)
+        out = tmp_path / f"{temperature}"
+        _, report, told = aegis("merge", merge_place.run, *words, *SMALL, "--out", out, "--json")
+        assert ("--temperature 4" in told) == (temperature == 1)
+        kept.append(json.loads(report)["kept"])
+    assert kept[0] != kept[1]
 
 
 def test_the_expert_stays_and_the_files_say_what_they_were_made_from(

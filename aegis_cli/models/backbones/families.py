@@ -76,15 +76,16 @@ FAMILIES: dict[str, Family] = {
 }
 
 _LINEAR = "most of its layers are linear attention, which keeps no keys and values of its tokens"
-# Families that transformers has and that cannot be used, whatever is named after a `#`: why.
 _OLD_REPOSITORY = (
     "it is of the model's first repository, whose own code reads the images, and no code of a "
     "model folder is run; transformers' own conversion has a name that ends in -hf"
 )
+# Families that cannot be used, whatever is named after a `#`: why.
 REFUSED: dict[str, str] = {
-    **dict.fromkeys(
-        ("internvl_chat", "llava_llama", "llava_qwen", "llava_mistral"), _OLD_REPOSITORY
-    ),
+    "internvl_chat": _OLD_REPOSITORY,
+    "llava_llama": _OLD_REPOSITORY,
+    "llava_mistral": _OLD_REPOSITORY,
+    "llava_qwen": _OLD_REPOSITORY,
     "qwen3_5": _LINEAR,
     "qwen3_5_moe": _LINEAR,
     "lfm2_vl": "most of its layers are convolutions, which keep no keys and values of their tokens",
