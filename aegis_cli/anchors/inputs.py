@@ -64,7 +64,8 @@ class Reading:
 class Drawn:
     """Which rows count: a share of each call's, drawn without replacement.
 
-    Their mean second moment is an unbiased estimate of that of all rows.
+    The share is rounded to whole rows of each call, so that short calls may count a little more or
+    less than long ones; among some hundred rows that is nothing.
 
     Attributes:
         share: above 0, up to 1, which draws nothing.

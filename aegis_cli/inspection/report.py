@@ -79,7 +79,7 @@ class Bin:
     """The steps from `first_step` to `last_step`, and the energy shed in them.
 
     Attributes:
-        energy_shed: mean over all groups.
+        energy_shed: share of the energy of all groups together, mean over the steps.
         layers: mean per group.
     """
 

@@ -76,7 +76,8 @@ def start(setting: Setting) -> Parts:
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        # One proximal step stands for those after each of so many steps, and is as strong as all.
+        # One proximal step stands for those after each of so many steps. It is as strong as all of
+        # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
             # A schedule may end at a rate of 0.

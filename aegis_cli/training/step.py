@@ -1,10 +1,10 @@
 """The gradients of one optimisation step, from one or two backward passes over one graph.
 
 Several processes may share the step's frames, and each may take its own in several passes
-(`train.accumulate`). Losses are divided by what the whole batch has, so that all passes'
-gradients add up to those of the batch. What a method measures over the frames of a pass, the
-transport penalty for one, it measures over those of all processes; over several passes it is
-averaged.
+(`train.accumulate`). The task's loss is divided by what the whole batch has, so that all passes'
+gradients add up to those of the batch; a method's own loss counts each pass alike. What a method
+measures over the frames of a pass, the transport penalty for one, it measures over those of all
+processes; over several passes it is averaged.
 """
 
 from __future__ import annotations

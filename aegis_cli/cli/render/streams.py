@@ -92,7 +92,7 @@ def _published(report: Any) -> list[RenderableType]:
         (method, *(f"{value:.1f}" for value in figures))
         for method, figures in report.published.items()
     ]
-    title = "As their papers print them, on the whole data sets; not run here"
+    title = "As their papers print them, on the whole data sets; not run here; see task inferred"
     return [plain_table(("Published", "Transfer %", "Average %", "Last %"), rows, title=title)]
 
 
