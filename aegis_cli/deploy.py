@@ -178,29 +178,36 @@ def _picture(given: np.ndarray) -> np.ndarray:
     return found
 
 
-def load_policy(run: str | Path, task: str | None = None, seed: int = 0) -> DeployedPolicy:
+def load_policy(
+    run: str | Path, task: str | None = None, seed: int = 0, precision: str = devices.AUTO
+) -> DeployedPolicy:
     """The policy of a run, on the GPU where there is one.
 
     Args:
         run: what `aegis train` wrote.
         task: which one, if the run is a stream of robot tasks.
         seed: seeds the noise that the flow begins with.
+        precision: of matrix products, bf16 or float32; auto is bf16 on a GPU that multiplies in it,
+            as training does there. What the policy answers is float32.
 
     Raises:
         AegisError: no run, files that are missing, broken or not of one checkpoint, or a task that
             it has not learned.
     """
-    folder = Path(run)
+    folder, device = Path(run), devices.pick()
+    acts_in = devices.acting_precision(device, precision)
     if is_robot_stream_run(folder):
         found = robots.load_policy(folder, task)
-        policy = found.policy.to(devices.pick())
+        policy = found.policy.to(device)
+        policy.acts_in = acts_in
         return DeployedPolicy(policy, found.task, (), found.replan, seed)
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
         raise AegisError(said, "its own", "leave out the task")
+    policy.acts_in = acts_in
     return DeployedPolicy(
-        policy.to(devices.pick()),
+        policy.to(device),
         meta["task"],
         meta.get("cameras", ()),
         meta["replan"],

@@ -12,6 +12,7 @@ import torch
 from samples.training import images, make_policy
 
 from aegis_cli import load_policy
+from aegis_cli.common import devices
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import robots
@@ -177,3 +178,36 @@ def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: 
         load_policy(tmp_path)
     with pytest.raises(AegisError, match="task 'point' for a policy of 'reach'"):
         load_policy(run_folder, task="point")
+
+
+# --- precision ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["cpu", "cuda"])
+@pytest.mark.parametrize("multiplies", [False, True])
+def test_a_policy_acts_in_bf16_by_itself_only_on_a_gpu_that_has_it(
+    kind: str, multiplies: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No processor's features decide what a policy answers."""
+    monkeypatch.setattr(devices, "multiplies_bf16", lambda _: multiplies)
+    device = torch.device(kind)
+    found = devices.acting_precision(device, "auto")
+    assert found == ("bf16" if kind == "cuda" and multiplies else "float32")
+    for wanted in ("bf16", "float32"):
+        assert devices.acting_precision(device, wanted) == wanted
+    with pytest.raises(AegisError, match="the precision 'half'"):
+        devices.acting_precision(device, "half")
+
+
+def test_what_a_policy_answers_in_bf16_is_nearly_what_it_answers_in_float32(
+    run_folder: Path,
+) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    found = {}
+    for precision in ("auto", "float32", "bf16"):
+        policy = load_policy(run_folder, precision=precision)
+        found[precision] = policy.predict_action_chunk(picture, "go to the red pad", [0.1] * 6)
+    np.testing.assert_array_equal(found["auto"], found["float32"])
+    assert found["bf16"].dtype == np.float32 and (found["bf16"] != found["float32"]).any()
+    spread = found["float32"].std()
+    assert np.abs(found["bf16"] - found["float32"]).max() < 0.1 * spread

@@ -35,6 +35,7 @@ from aegis_cli.cli.options import (
     OwnBatchSize,
     OwnVqa,
     PolicyFormat,
+    Precision,
     RecipeAction,
     RecipeArg,
     Resume,
@@ -854,6 +855,9 @@ def serve(
         str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
+    precision: Annotated[
+        Precision, Option(help="Of matrix products; auto is bf16 on a GPU that has it.")
+    ] = Precision.auto,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -877,7 +881,7 @@ def serve(
         sys.stdout.flush()
 
     with stages.computing_on(device):
-        server.run(run, task, host, port, prompt, seed, listening)
+        server.run(run, task, host, port, prompt, seed, precision, listening)
 
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")

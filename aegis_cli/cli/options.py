@@ -26,6 +26,12 @@ class PolicyFormat(StrEnum):
     lerobot = "lerobot"
 
 
+class Precision(StrEnum):
+    auto = "auto"
+    bf16 = "bf16"
+    float32 = "float32"
+
+
 class Dtype(StrEnum):
     source = "source"
     float32 = "float32"

@@ -108,6 +108,19 @@ def autocast(device: torch.device, precision: str) -> contextlib.AbstractContext
     return torch.autocast(device.type, torch.bfloat16, enabled=takes_bf16(device, precision))
 
 
+def acting_precision(device: torch.device, wanted: str) -> str:
+    """What a policy acts in: `auto` is bf16 on a GPU that multiplies in it, and else float32.
+
+    Raises:
+        AegisError: no precision.
+    """
+    if wanted in ("bf16", "float32"):
+        return wanted
+    if wanted != AUTO:
+        raise AegisError(f"the precision '{wanted}'", "auto, bf16 or float32", "leave it out: auto")
+    return "bf16" if device.type == "cuda" and multiplies_bf16(device) else "float32"
+
+
 def takes_bf16(device: torch.device, precision: str) -> bool:
     """Whether `autocast` takes matrix products in bfloat16 there."""
     return precision == "bf16" or (precision == "auto" and multiplies_bf16(device))

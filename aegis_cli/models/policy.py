@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common.devices import send
+from aegis_cli.common.devices import autocast, send
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.data.relative import Origins, Places
@@ -21,6 +21,9 @@ class Policy(nn.Module):
 
     The split is that of pi0 (arXiv 2410.24164). A robot may have fewer positions and actions than
     the expert; the normalizers know how many.
+
+    Attributes:
+        acts_in: the precision of `act`, as `devices.autocast` takes it.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class Policy(nn.Module):
         self.backbone, self.expert = backbone, expert
         self.proprio_scale, self.action_scale = proprio, action
         self.origins = Origins(relative)
+        self.acts_in = "float32"
 
     def encode(self, images: Images, instructions: Sequence[str]) -> Encoding:
         """The backbone's pass over B images (or B tuples of several cameras') and instructions."""
@@ -124,6 +128,12 @@ class Policy(nn.Module):
         self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
     ) -> Tensor:
         """What `act` returns for that noise [B, H, A]."""
+        with autocast(self.backbone.device, self.acts_in):
+            return self._acted(images, instructions, proprio, noise)
+
+    def _acted(
+        self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
+    ) -> Tensor:
         encoding = self.encode(images, instructions)
         proprio = proprio.to(self.backbone.device)
         state = self.proprio_scale(proprio)

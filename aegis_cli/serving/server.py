@@ -47,6 +47,7 @@ def run(
     port: int,
     prompt: str | None,
     seed: int,
+    precision: str,
     on_ready: Callable[[Serving], None],
 ) -> None:
     """Serve a run's policy until a signal ends the process.
@@ -56,13 +57,14 @@ def run(
         port: 0 takes a free one.
         prompt: the instruction for observations without one.
         seed: seeds the noise of every connection alike.
+        precision: see `load_policy`.
         on_ready: is told where, once the server listens.
 
     Raises:
         AegisError: no such run, or an address that cannot be listened at.
         KeyboardInterrupt: a signal has come, and the connections are closed.
     """
-    policy = load_policy(run, task, seed)
+    policy = load_policy(run, task, seed, precision)
     with interrupts.deferred() as signaled:
         asyncio.run(
             listen(policy, host, port, prompt, on_ready, lambda: signaled.number is not None)
