@@ -105,7 +105,8 @@ def save(
     Raises:
         AegisError: the content is not what the kind demands, or the file cannot be written.
     """
-    plain = {name: tensor.detach().cpu() for name, tensor in tensors.items()}
+    # A GPU's come to the CPU one at a time: a training state may be larger than the memory there.
+    plain = {name: tensor.detach() for name, tensor in tensors.items()}
     table = _table(plain, units or {})
     try:
         pure = json.loads(canonical(dict(meta or {})))
@@ -193,7 +194,7 @@ def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> N
 def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
     """What is wrong with values, and with metadata in a damaged file that has no digest."""
     try:
-        yield from KINDS[header.kind].domain(tensors, header.meta)
+        yield from KINDS[header.kind].domain(_OnCpu(tensors), header.meta)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         yield f"metadata of other types ({error})"
 
@@ -236,7 +237,23 @@ def _digest(fields: Mapping[str, Any], tensors: Tensors) -> str:
 
 def _bytes(tensor: Tensor) -> np.ndarray:
     """A tensor's values as they lie in memory [bytes], one after the other."""
-    return tensor.reshape(-1).view(torch.uint8).numpy()
+    return tensor.cpu().reshape(-1).view(torch.uint8).numpy()
+
+
+class _OnCpu(Mapping[str, Tensor]):
+    """Tensors by name, each brought to the CPU when it is asked for."""
+
+    def __init__(self, tensors: Tensors) -> None:
+        self._tensors = tensors
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._tensors[name].cpu()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tensors)
+
+    def __len__(self) -> int:
+        return len(self._tensors)
 
 
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,29 @@ def test_shared_memory_and_gradients_are_no_obstacle(tmp_path: Path) -> None:
         torch.equal(t, e)
         for t, e in zip(artifacts.load(path).tensors.values(), (tied, tied, tied[1:3]))
     )
+
+
+def test_a_gpus_tensors_come_to_the_cpu_one_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the CPU is told to copy, as it would from a GPU."""
+    there: weakref.WeakSet[Tensor] = weakref.WeakSet()
+    most = 0
+
+    def copied(tensor: Tensor) -> Tensor:
+        nonlocal most
+        made = tensor.clone()
+        there.add(made)
+        most = max(most, len(there))
+        return made
+
+    tensors = {f"{i}": torch.full((100,), float(i)) for i in range(20)}
+    monkeypatch.setattr(Tensor, "cpu", copied)
+    artifacts.save(tmp_path / "x.safetensors", "expert", tensors)
+    monkeypatch.undo()
+    assert 1 <= most <= 2
+    found = artifacts.load(tmp_path / "x.safetensors", "expert").tensors
+    assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
 
 
 def test_loaded_tensors_are_private(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
+_PIXEL_MASK = "pixel_attention_mask"
 _IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
 
 
@@ -105,6 +106,8 @@ class Prompter:
         }
         ids, mask = tensors.pop("input_ids"), tensors.pop("attention_mask")
         pixels = tensors.pop("pixel_values")
+        if _PIXEL_MASK in tensors:  # as large as a picture, in eight bytes a pixel
+            tensors[_PIXEL_MASK] = tensors[_PIXEL_MASK].bool()
         self._check_length(ids.shape[1])
         self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
