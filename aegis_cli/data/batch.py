@@ -107,6 +107,8 @@ class RobotBatch:
             no padding; None where nobody has counted.
         prepared: what the backbone has made of the frames of each pass, in their order; empty
             where it makes it when the pass comes.
+        prepared_parts: the same of the first frames of each pass, where the anchor gradient is
+            taken on these alone.
     """
 
     images: Images
@@ -116,13 +118,18 @@ class RobotBatch:
     is_pad: Tensor
     of_step: tuple[int, int] | None = None
     prepared: Sequence[Any] = ()
+    prepared_parts: Sequence[Any] = ()
 
     def __len__(self) -> int:
         return len(self.instructions)
 
     def with_prepared_on(self, device: torch.device) -> RobotBatch:
-        """The batch with what is `prepared` on that device."""
-        return replace(self, prepared=[part.to(device) for part in self.prepared])
+        """The batch with what is prepared on that device."""
+        return replace(
+            self,
+            prepared=[inputs.to(device) for inputs in self.prepared],
+            prepared_parts=[inputs.to(device) for inputs in self.prepared_parts],
+        )
 
     def rows(self, chosen: slice) -> RobotBatch:
         """The frames of these rows, of whose step and preparation nothing is known."""

@@ -163,8 +163,9 @@ def _all_passes(
     for number, (part, of) in enumerate(each):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
         prepared = batch.prepared[number] if batch.prepared else None
+        of_part = batch.prepared_parts[number] if batch.prepared_parts else None
         with masters.rounded():
-            loss, w2, anchor = _backward(settings, part, of, generator, prepared)
+            loss, w2, anchor = _backward(settings, part, of, generator, prepared, of_part)
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
@@ -214,18 +215,33 @@ def passes(
 
 
 def with_prepared(
-    batch: RobotBatch, size: tuple[int, int], backbone: Backbone, ranks: Ranks, accumulate: int
+    batch: RobotBatch,
+    size: tuple[int, int],
+    backbone: Backbone,
+    ranks: Ranks,
+    accumulate: int,
+    fraction: float = 1.0,
 ) -> RobotBatch:
     """The batch with what the backbone makes of each pass's frames, still to be sent to it.
 
     Args:
         batch: this process's frames.
         size: of the whole batch, as `RobotBatch.of_step` has it.
+        fraction: of each pass's frames, which pass once more.
     """
-    batch, found = replace(batch, of_step=size), list[Batch]()
+    batch = replace(batch, of_step=size)
+    found, found_of_parts = list[Batch](), list[Batch]()
     for part, _ in passes(batch, ranks, accumulate, backbone.device):
         found.append(backbone.process(part.images, part.instructions))
-    return replace(batch, prepared=found)
+        if fraction < 1:
+            shown = first_frames(part, fraction)
+            found_of_parts.append(backbone.process(shown.images, shown.instructions))
+    return replace(batch, prepared=found, prepared_parts=found_of_parts)
+
+
+def first_frames(batch: RobotBatch, fraction: float) -> RobotBatch:
+    """The first frames of a batch, a share of it and at least one."""
+    return batch.rows(slice(math.ceil(fraction * len(batch))))
 
 
 def _backward(
@@ -234,11 +250,13 @@ def _backward(
     of: Whole,
     generator: torch.Generator,
     prepared: Batch | None = None,
+    prepared_part: Batch | None = None,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
     """One pass over some frames, and back.
 
     Args:
         prepared: what the backbone has made of all of them already.
+        prepared_part: what it has made of those that the anchor gradient is taken on.
 
     Returns:
         What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
@@ -248,10 +266,8 @@ def _backward(
     backbone, device = policy.backbone, policy.backbone.device
     total = settings.ranks.total if settings.ranks.several else None
 
-    def encode(frames: int) -> tuple[Encoding, Pass]:
-        """The backbone's pass over the first frames of the batch."""
-        shown = batch.rows(slice(frames))
-        inputs = prepared if frames == len(batch) else None
+    def encode(shown: RobotBatch, inputs: Batch | None) -> tuple[Encoding, Pass]:
+        """The backbone's pass over frames of the batch."""
         if inputs is None:
             inputs = backbone.prepare(shown.images, shown.instructions)
         encoding = backbone.encode(inputs)
@@ -268,14 +284,14 @@ def _backward(
         return encoding, seen
 
     def encode_part() -> Pass:
-        frames = math.ceil(parts.fraction * len(batch))
+        shown = first_frames(batch, parts.fraction)
         with devices.autocast(device, settings.precision), torch.enable_grad():
-            return encode(frames)[1]
+            return encode(shown, prepared_part)[1]
 
     with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
         # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding, seen = encode(len(batch))
+            encoding, seen = encode(batch, prepared)
         loss = policy.flow_loss(
             batch, encoding, settings.flow_samples, generator, method.stop_gradient, of
         )

@@ -341,7 +341,9 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         # What the step would wait for: sums over the processes, images to scale and to send.
         size = run.demos.size(run.demos.train[rows], settings.chunk)
         sharing = run.ranks, settings.accumulate
-        return step.with_prepared(batch, size, run.policy.backbone, *sharing)
+        first = index % run.parts.refresh == 0  # the others take the anchor gradient of that one
+        fraction = run.parts.fraction if first else 1.0
+        return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction)
 
     return fetch
 

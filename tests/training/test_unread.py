@@ -85,6 +85,39 @@ def test_steps_between_two_lines_read_no_number(
     assert len(run.ledger) == (5 if METHODS[method].dual else 0)
 
 
+@pytest.mark.parametrize("refresh", [1, 2])
+def test_no_frame_is_prepared_within_a_step(
+    refresh: int,
+    recipe: Recipe,
+    demos_file: Path,
+    anchor_file: Path,
+    tmp_path: Path,
+    waits: None,
+) -> None:
+    """Nor the share of them that the anchor gradient is taken on."""
+    chosen = replace(recipe, aegis=Aegis(fraction=0.5, refresh=refresh))
+    run = begun(chosen, "aegis", demos_file, anchor_file, tmp_path)
+    run.policy.train()
+    fetch = train._fetching(run)
+    batches = [fetch(index) for index in range(2)]
+    assert [len(batch.prepared_parts) for batch in batches] == [1, int(refresh == 1)]
+    (part,) = batches[0].prepared_parts
+    assert len(part.ids) == -(-len(batches[0]) // 2)
+    found = []
+    for ahead in (True, False):
+        run, window = begun(chosen, "aegis", demos_file, anchor_file, tmp_path), train.Window()
+        run.policy.train()
+        with pytest.MonkeyPatch.context() as patch:
+            if ahead:
+                patch.setattr(type(run.policy.backbone), "process", None)
+            for index, batch in enumerate(batches):
+                bare = replace(batch, prepared=(), prepared_parts=())
+                train.update(run, index, batch if ahead else bare, window)
+        train.read(run, window)
+        found.append((window.loss, run.ledger.tensors()["w2"].tolist()))
+    assert found[0] == found[1]
+
+
 def test_what_the_task_leaves_alone_is_moved_by_a_weight_that_is_read(
     recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path, waits: None
 ) -> None:
