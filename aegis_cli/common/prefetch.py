@@ -64,6 +64,26 @@ def ahead(
         torch.set_num_threads(threads)  # what threads that begin later take
 
 
+def one_ahead(make: Callable[[Item], T], following: Callable[[Item], Item]) -> Callable[[Item], T]:
+    """`make`, which has what follows an item ready when that is asked for.
+
+    One thread makes all, one after the other. It is gone when nobody has the function any more.
+
+    Args:
+        following: the item that is asked for after this one, or after others between.
+    """
+    pool = ThreadPoolExecutor(1, "prefetch")
+    waiting: dict[Item, Future[T]] = {}
+
+    def call(item: Item) -> T:
+        made = waiting.pop(item, None) or pool.submit(make, item)
+        upcoming = following(item)
+        waiting[upcoming] = pool.submit(make, upcoming)
+        return made.result()
+
+    return call
+
+
 def _results(
     pool: ThreadPoolExecutor, fetch: Callable[[Item], T], items: Iterable[Item], depth: int
 ) -> Iterator[T]:

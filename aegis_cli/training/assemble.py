@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common import artifacts, devices, launch
+from aegis_cli.common import artifacts, devices, launch, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -22,6 +22,7 @@ from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations
+from aegis_cli.data.batch import Share
 from aegis_cli.data.relative import Places
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
@@ -458,16 +459,28 @@ def _vqa_loss(
     asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
 
-    def loss(seen: Pass) -> Tensor:
+    waits = devices.reading_waits(backbone.device)
+
+    def make(place: tuple[int, Share]) -> tuple[Any, list[str], list[str], Any]:
+        """The images, questions and answers of a share of a step, as the backbone takes them."""
+        number, share = place
         # With the questions of one image side by side, it is passed once.
-        rows = sorted(order.rows(seen.step)[seen.share.rows(options["batch_size"])].tolist())
+        rows = sorted(order.rows(number)[share.rows(options["batch_size"])].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        said = -backbone.answer_log_likelihood(images, texts, answers)
+        prepared = backbone.prepare_answers(images, texts, answers) if waits else None
+        return images, texts, answers, prepared
+
+    # A step would wait for images to be decoded and scaled.
+    fetch = prefetch.one_ahead(make, lambda place: (place[0] + 1, place[1])) if waits else make
+
+    def loss(seen: Pass) -> Tensor:
+        images, texts, answers, prepared = fetch((seen.step, seen.share))
+        said = -backbone.answer_log_likelihood(images, texts, answers, prepared)
         if seen.total is None:
             return said.mean()
-        return said.sum() / seen.total(said.new_tensor(len(rows)))
+        return said.sum() / seen.total(said.new_tensor(len(texts)))
 
     return loss
 

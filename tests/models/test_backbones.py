@@ -176,6 +176,13 @@ def test_who_else_is_in_the_batch_does_not_matter(backbone: Backbone) -> None:
         close(backbone.answer_log_likelihood(*rows, [said[i] for i in order]), scores[order])
 
 
+def test_what_is_prepared_of_answers_gives_the_same_likelihoods(backbone: Backbone) -> None:
+    asked = images(2), TEXTS[:2], ["red", "two"]
+    scores = backbone.answer_log_likelihood(*asked)
+    prepared = backbone.prepare_answers(*asked)
+    assert torch.equal(backbone.answer_log_likelihood(*asked, prepared), scores)
+
+
 def test_an_answer_depends_on_its_own_image(backbone: Backbone) -> None:
     first, second = (
         backbone.answer_log_likelihood(images(1, s), TEXTS[:1], ["red"]) for s in (0, 1)

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -137,11 +138,27 @@ class Backbone(nn.Module, ABC):
             images: one per question, [B, H, W, 3] uint8.
         """
 
+    def prepare_answers(
+        self, images: Images, questions: Sequence[str], answers: Sequence[str]
+    ) -> Any:
+        """What `answer_log_likelihood` takes as `prepared`, made on the CPU ahead of a step.
+
+        It is None for a backbone that makes nothing of it.
+        """
+        return None
+
     @abstractmethod
     def answer_log_likelihood(
-        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+        self,
+        images: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        prepared: Any = None,
     ) -> Tensor:
         """log p(answer and its end | image, question), summed over the answer's tokens.
+
+        Args:
+            prepared: what `prepare_answers` has made of the same.
 
         Returns:
             [B] float32 in nats, with its graph.

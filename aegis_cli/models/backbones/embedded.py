@@ -220,7 +220,11 @@ class EmbeddedVLM(Backbone):
         return [self.tokenizer.decode(said) for said in answers]
 
     def answer_log_likelihood(
-        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+        self,
+        images: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        prepared: None = None,
     ) -> Tensor:
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]

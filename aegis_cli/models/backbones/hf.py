@@ -284,10 +284,19 @@ class HFBackbone(Backbone):
         ends = self.vlm.generation_config.eos_token_id
         return list(ends) if isinstance(ends, list | tuple) else [ends]
 
+    def prepare_answers(
+        self, images: Images, questions: Sequence[str], answers: Sequence[str]
+    ) -> _Answered:
+        return self._answered(images, questions, answers)
+
     def answer_log_likelihood(
-        self, images: Tensor, questions: Sequence[str], answers: Sequence[str]
+        self,
+        images: Tensor,
+        questions: Sequence[str],
+        answers: Sequence[str],
+        prepared: _Answered | None = None,
     ) -> Tensor:
-        return self._log_likelihood(self._answered(images, questions, answers))
+        return self._log_likelihood(prepared or self._answered(images, questions, answers))
 
     def _answered(
         self, images: Images, questions: Sequence[str], answers: Sequence[str]

@@ -29,8 +29,9 @@ from samples.vqa_files import (
     write_official,
 )
 
+from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.batch import Asked
+from aegis_cli.data.batch import Asked, Share
 from aegis_cli.data.vqa import images, sets
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
@@ -325,6 +326,27 @@ def test_cotraining_reads_the_anchors_images(lines: Path, decoded: list[str]) ->
     loss = loss_of(Pass(0, None, (), torch.empty(0), torch.empty(0)))
     assert torch.isfinite(loss) and loss.requires_grad
     assert set(decoded) == {name for name in NAMES if sets.share(name) in sets.PARTS["anchor"]}
+
+
+@pytest.mark.parametrize("shares", [1, 2])
+def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same(
+    shares: int, lines: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = recipe("unused", methods=("cotrain",))
+    settings = dataclasses.replace(
+        settings,
+        train=dataclasses.replace(settings.train, method="cotrain"),
+        cotrain=Cotrain(vqa=str(lines), questions=100, batch_size=2),
+    )
+    model, found = make_tiny(), []
+    for waits in (False, True):
+        monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
+        loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
+        # A run that goes on begins anywhere.
+        places = [(step, Share(i, shares)) for step in (5, 6, 7, 0, 1) for i in range(shares)]
+        each = [Pass(n, None, (), torch.empty(0), torch.empty(0), None, own) for n, own in places]
+        found.append([loss_of(seen).item() for seen in each])
+    assert found[0] == found[1] and len(set(found[0])) > 1
 
 
 def test_a_picture_beside_a_data_set_that_changes_is_noticed(
