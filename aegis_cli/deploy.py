@@ -60,6 +60,11 @@ class DeployedPolicy:
         self.reset()
 
     @property
+    def precision(self) -> str:
+        """Of the matrix products: bf16 or float32."""
+        return self._policy.acts_in
+
+    @property
     def image_size(self) -> int | None:
         """The side in pixels of the squares that the backbone reads; None: it reads any size."""
         return self._policy.backbone.image_size

@@ -22,6 +22,7 @@ class LatencyReport:
     """Milliseconds from pictures to actions, one observation at a time.
 
     Attributes:
+        precision: of the matrix products, as `load_policy` has it by itself.
         p50_ms, p95_ms: half and 95 % of the predictions took at most so long.
         chunk, replan: actions per prediction, and how many of them are executed.
         actions_per_s: `replan` actions per median prediction; a robot whose motion waits for the
@@ -30,6 +31,7 @@ class LatencyReport:
 
     run: str
     device: str
+    precision: str
     p50_ms: float
     p95_ms: float
     chunk: int
@@ -50,6 +52,7 @@ def run(run: Path, repeats: int = 50, on_event: OnEvent = ignore) -> LatencyRepo
     return LatencyReport(
         run=str(run),
         device=str(devices.pick()),
+        precision=policy.precision,
         p50_ms=p50,
         p95_ms=p95,
         chunk=policy.chunk,

@@ -41,6 +41,7 @@ def test_bench_reports_the_latency_of_a_run(naive_run: Path, aegis: Any) -> None
     said = json.loads(out)
     assert (code, said["repeats"], said["chunk"], said["replan"]) == (0, 3, 4, 2)
     assert 0 < said["p50_ms"] <= said["p95_ms"]
+    assert said["precision"] == "float32"  # auto, on any processor
     assert said["actions_per_s"] == pytest.approx(2000 / said["p50_ms"])
 
 
