@@ -27,7 +27,7 @@ from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.lerobot.source import Source
 from aegis_cli.data.selection import ALL, Selection
 
-# The statistics of relative actions are of this many at most; each takes a step of a chunk.
+# The scale of relative actions is fitted to so many at most: each frame has a chunk of them.
 _MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
@@ -140,7 +140,7 @@ class Demonstrations:
     def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
         """Actions [N, A] of the training frames' chunks, less their origins.
 
-        Of more than `_MOST_ROWS`, evenly spaced frames have theirs.
+        Beyond `_MOST_ROWS` they are of evenly spaced frames alone.
         """
         every = -(-len(self.train) * chunk // _MOST_ROWS)
         frames = self.train[:: max(1, every)]
