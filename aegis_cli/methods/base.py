@@ -167,6 +167,10 @@ class Parts:
     compares: bool = True
     every: int = 1
 
+    def reuses(self, step: int) -> bool:
+        """Whether a step, from 0, takes the anchor gradient of one before it."""
+        return step % self.refresh != 0
+
     @property
     def constrains(self) -> bool:
         """Whether the applied update is another than the optimizer's own."""

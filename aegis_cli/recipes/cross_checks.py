@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe
+from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -43,17 +43,7 @@ def cross_checks(
     if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
-    if recipe.train.optimizer != "sgd" and "momentum" in changed(recipe.train):
-        found = f"train.momentum: {recipe.train.momentum:g} with train.optimizer: adamw"
-        yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
-    if recipe.train.relative_exclude is not None and not recipe.train.relative_actions:
-        found = f"train.relative_exclude: {', '.join(recipe.train.relative_exclude)}"
-        fix = "set it, or delete train.relative_exclude"
-        yield Problem(found, "it with train.relative_actions: true", fix)
-    if recipe.train.augment is None and "augment_count" in changed(recipe.train):
-        found = f"train.augment_count: {recipe.train.augment_count} without train.augment"
-        fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
-        yield Problem(found, "transformations to draw from", fix)
+    yield from _train_checks(recipe.train)
     yield from _extension_checks(recipe)
     yield from _source_checks(recipe)
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
@@ -66,6 +56,21 @@ def cross_checks(
             "a suite task, whose episodes have a return",
             "delete demos.drop_below: failures are dropped",
         )
+
+
+def _train_checks(train: Train) -> Iterator[Problem]:
+    """Whether keys of the training have what they belong to."""
+    if train.optimizer != "sgd" and "momentum" in changed(train):
+        found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
+        yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    if train.relative_exclude is not None and not train.relative_actions:
+        found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
+        fix = "set it, or delete train.relative_exclude"
+        yield Problem(found, "it with train.relative_actions: true", fix)
+    if train.augment is None and "augment_count" in changed(train):
+        found = f"train.augment_count: {train.augment_count} without train.augment"
+        fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
+        yield Problem(found, "transformations to draw from", fix)
 
 
 def _extension_checks(recipe: Recipe) -> Iterator[Problem]:

@@ -40,8 +40,8 @@ METHODS = (
     "cotrain",
 )
 TASKS = ("reach", "point")
-NORMALIZATIONS = ("mean_std", "quantiles")
 PRECISIONS = ("auto", "bf16", "float32")
+NORMALIZATIONS = ("mean_std", "quantiles")
 WEIGHTS = ("float32", "bf16", "bf16-master")
 STATES = ("float32", "8bit")
 PARALLEL = ("ddp", "fsdp")

@@ -125,7 +125,7 @@ class TrainingRun:
         self.demos.check_files()
         self.watched.check()
         # The first step of an interval takes a gradient of its own.
-        reused = {} if steps % self.parts.refresh == 0 else self.reused or {}
+        reused = (self.reused or {}) if self.parts.reuses(steps) else {}
         state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
         if parallel.is_sharded(self.policy):
             state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))

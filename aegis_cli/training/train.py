@@ -188,7 +188,7 @@ def _check_behind(
         problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
     elif not lines and done >= settings.log_every:
         problem = f"an empty {folder.METRICS} after {done} steps"
-    elif done < moving and done % run.parts.refresh and not run.reused:
+    elif done < moving and run.parts.reuses(done) and not run.reused:
         problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
     if problem:
         raise AegisError(
@@ -341,8 +341,7 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         # What the step would wait for: sums over the processes, images to scale and to send.
         size = run.demos.size(run.demos.train[rows], settings.chunk)
         sharing = run.ranks, settings.accumulate
-        first = index % run.parts.refresh == 0  # the others take the anchor gradient of that one
-        fraction = run.parts.fraction if first else 1.0
+        fraction = 1.0 if run.parts.reuses(index) else run.parts.fraction
         return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction)
 
     return fetch
@@ -428,7 +427,7 @@ def update(
         index=index,
         flow_samples=settings.flow_samples,
         precision=settings.precision,
-        reused=run.reused if index % run.parts.refresh else None,
+        reused=run.reused if run.parts.reuses(index) else None,
         ranks=run.ranks,
         accumulate=settings.accumulate,
         masters=run.masters,

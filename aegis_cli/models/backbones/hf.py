@@ -265,8 +265,8 @@ class HFBackbone(Backbone):
         """See `Backbone.answers`; for a GPU the next batches are prepared meanwhile."""
 
         def prepare(asked: Asked) -> tuple[Batch, _Answered]:
-            images, questions, answers = asked
-            return self._to_answer(images, questions), self._answered(images, questions, answers)
+            images, questions, _ = asked
+            return self._to_answer(images, questions), self.prepare_answers(*asked)
 
         with prefetch.for_device(prepare, batches, self.device) as prepared:
             for prompts, answered in prepared:
@@ -284,11 +284,6 @@ class HFBackbone(Backbone):
         ends = self.vlm.generation_config.eos_token_id
         return list(ends) if isinstance(ends, list | tuple) else [ends]
 
-    def prepare_answers(
-        self, images: Images, questions: Sequence[str], answers: Sequence[str]
-    ) -> _Answered:
-        return self._answered(images, questions, answers)
-
     def answer_log_likelihood(
         self,
         images: Tensor,
@@ -296,9 +291,9 @@ class HFBackbone(Backbone):
         answers: Sequence[str],
         prepared: _Answered | None = None,
     ) -> Tensor:
-        return self._log_likelihood(prepared or self._answered(images, questions, answers))
+        return self._log_likelihood(prepared or self.prepare_answers(images, questions, answers))
 
-    def _answered(
+    def prepare_answers(
         self, images: Images, questions: Sequence[str], answers: Sequence[str]
     ) -> _Answered:
         """Prompts that the answers follow, on the CPU: to read lengths of a GPU would wait."""
