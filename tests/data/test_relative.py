@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from samples.command import refused
 from samples.lerobot import episodes, save
 from samples.small_run import recipe as small_recipe
 from samples.training import make_policy, robot_batch
@@ -80,6 +81,13 @@ def test_places_of_a_file_that_are_none_are_refused(told: Any) -> None:
 def test_files_without_places_have_absolute_actions() -> None:
     assert relative.of_meta({}, 2, 3) == ()
     assert relative.of_meta({"relative": [2, None]}, 2, 3) == (2, None)
+
+
+def test_words_without_relative_actions_are_refused(aegis: Any, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text("kind: policy\nname: r\ntrain:\n  relative_exclude: [gripper]\n")
+    said = refused(aegis("inspect", path))
+    assert "relative_exclude: gripper" in said and "relative_actions: true" in said
 
 
 # --- what is learned, and what comes out ----------------------------------------------------------

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import json
+import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -132,6 +134,45 @@ def test_any_of_several_ends_ends_an_answer(backbone: HFBackbone) -> None:
         backbone.vlm.generation_config.eos_token_id = ends
         alone.append(backbone.answer_log_likelihood(images(4), TEXTS, SAID).detach())
     close(alone[2], torch.logaddexp(alone[0], alone[1]))
+
+
+def test_every_mask_takes_a_byte_a_number(backbone: HFBackbone) -> None:
+    """That of pixels is as large as the pictures themselves."""
+    batch = backbone.process(images(2), TEXTS[:2])
+    masks = [tensor for name, tensor in batch.extra.items() if name.endswith("attention_mask")]
+    assert all(mask.dtype == torch.bool for mask in (batch.mask, *masks))
+    assert backbone.vlm.config.model_type not in ("smolvlm", "idefics3") or masks
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(
+    ("family", "splits", "whole"),
+    [
+        ("internvl", {}, {"max_patches": 1}),
+        (
+            "smolvlm",
+            {"do_image_splitting": True, "size": {"longest_edge": 64}},
+            {"do_image_splitting": False},
+        ),
+    ],
+)
+def test_splitting_is_switched_off_where_the_docs_say(
+    splits: dict[str, object],
+    whole: dict[str, object],
+    family: str,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+) -> None:
+    """By how many images are made of one."""
+    pictures, found = [torch.zeros(480, 640, 3, dtype=torch.uint8)], []
+    for name, changes in (("splits", splits), ("whole", splits | whole)):
+        folder = tmp_path / name
+        shutil.copytree(hf_folder(family), folder)
+        path = folder / "preprocessor_config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+        batch = backbones.load(str(folder)).prepare(pictures, TEXTS[:1])
+        found.append(batch.pixels.flatten(0, -4).shape[0])
+    assert found[0] > 1 == found[1]
 
 
 def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import transformers
+from huggingface_hub.utils import filter_repo_objects
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from samples.backbones import TEXTS, encode, images
@@ -22,6 +23,7 @@ from transformers.utils import is_torchvision_available
 from aegis_cli import inspection
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
 
 Bad = Callable[..., str]
@@ -49,6 +51,23 @@ def test_a_hub_id_without_network(bad: Bad) -> None:
                 "--set backbone=MODEL",
             ),
         )
+
+
+def test_weights_that_a_repository_has_twice_are_fetched_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As Mistral's have them, for transformers and for its own programs."""
+    there = ["config.json", "model-00001-of-2.safetensors", "consolidated.safetensors", "a.bin"]
+
+    def download(_: str, allow_patterns: list[str], ignore_patterns: list[str]) -> str:
+        for name in filter_repo_objects(
+            there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
+        ):
+            (tmp_path / name).touch()
+        return str(tmp_path)
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    assert {p.name for p in model_folder.fetch("org/name").iterdir()} == set(there[:2])
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
 from aegis_cli.models.policy import Policy
-from aegis_cli.training import checkpoint, step, train
+from aegis_cli.training import assemble, checkpoint, step, train
 
 Made, Loaded = Callable[[str], Path], Callable[[str], Backbone]  # by a family's name
 
@@ -372,6 +372,16 @@ def run(
     settings = small(hf_folder("paligemma"), gradient_checkpointing=True)
     train.run(settings, "aegis", demos_file, hf_anchor("paligemma"), out)
     return out
+
+
+@pytest.mark.parametrize("wanted", [False, True])
+def test_a_training_with_checkpointing_recomputes_its_expert_too(
+    wanted: bool, hf_folder: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("paligemma"), gradient_checkpointing=wanted)
+    naive = METHODS["naive"]
+    begun = assemble.build(settings, naive, demos_file, None, tmp_path, lambda _: None)
+    assert begun.policy.expert.recomputes == wanted
 
 
 def test_the_trained_backbone_is_a_folder_that_from_pretrained_loads(

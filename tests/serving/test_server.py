@@ -16,13 +16,14 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from samples.command import ROOT
+from samples.command import ROOT, refused
 from samples.serving import TEXT, Client, deployed, observation, served
 from samples.training import make_policy
 from websockets.exceptions import ConnectionClosed
 
 from aegis_cli import load_policy
 from aegis_cli.common.errors import AegisError
+from aegis_cli.serving import server
 from aegis_cli.serving.server import Serving, listen
 
 
@@ -224,6 +225,18 @@ def test_a_port_that_is_taken_is_refused() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(AegisError, match=f"cannot listen at 127.0.0.1:{port}"):
             asyncio.run(listen(deployed(), "127.0.0.1", port, None, print, lambda: True))
+
+
+@pytest.mark.parametrize("precision", ["auto", "bf16", "float32"])
+def test_the_policy_acts_in_the_precision_that_was_asked_for(
+    precision: str, aegis: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def loaded(*given: Any) -> None:
+        raise AegisError(f"loaded in {given[-1]}", "nothing", "no more")
+
+    monkeypatch.setattr(server, "load_policy", loaded)
+    words = () if precision == "auto" else ("--precision", precision)
+    assert f"loaded in {precision}" in refused(aegis("serve", "run", *words))
 
 
 def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:

@@ -7,6 +7,8 @@ import io
 import json
 import os
 import pickle
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -339,6 +341,10 @@ def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same
         cotrain=Cotrain(vqa=str(lines), questions=100, batch_size=2),
     )
     model, found = make_tiny(), []
+    prepared: list[str] = []
+    monkeypatch.setattr(
+        model, "prepare_answers", lambda *_: prepared.append(threading.current_thread().name)
+    )
     for waits in (False, True):
         monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
         loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
@@ -347,6 +353,12 @@ def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same
         each = [Pass(n, None, (), torch.empty(0), torch.empty(0), None, own) for n, own in places]
         found.append([loss_of(seen).item() for seen in each])
     assert found[0] == found[1] and len(set(found[0])) > 1
+    # Steps 5 to 8 and 0 to 2, the last of each run of steps for nobody; never by the training.
+    deadline = time.monotonic() + 20
+    while len(prepared) < 7 * shares and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(prepared) == 7 * shares
+    assert all(name.startswith("prefetch") for name in prepared)
 
 
 def test_a_picture_beside_a_data_set_that_changes_is_noticed(
