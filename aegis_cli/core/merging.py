@@ -4,9 +4,8 @@ D [o, d] is how far a map's weights have moved, W_tuned - W_pretrained, with the
 column. C_r [d, d] and G_r [o, o] are second moments of the map's inputs and of the gradients at its
 outputs on the task (robot frames), C_v and G_v those on questions. Gradients on questions are of
 answers that the model itself draws, so that G_v is a factor of the Fisher information. Those on the
-task are of its loss: an empirical Fisher information, beside which the Gauss-Newton matrix of the
-squared error did no better in one trial. Under the Kronecker-factored curvature (K-FAC, arXiv
-1503.05671) of both losses, what is kept of D is the X that minimises
+task are of its loss: an empirical Fisher information. Under the Kronecker-factored curvature
+(K-FAC, arXiv 1503.05671) of both losses, what is kept of D is the X that minimises
 
     tr(G_r (X - D) C_r (X - D)^T) + s tr(G_v X C_v X^T)
 

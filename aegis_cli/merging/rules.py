@@ -93,7 +93,7 @@ def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEv
         surety.mean(),
         settings.temperature,
         "merge",
-        "a merge returns less of what other questions ask: merge with --temperature 4, which takes "
+        "a merge may return less of what others ask: merge with --temperature 4, which takes "
         "smaller strengths, or with harder questions",
         on_event,
     )

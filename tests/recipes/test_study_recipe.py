@@ -414,6 +414,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("regime", 24, 24),
         ("aegis-trial", 150, 150),
         ("merges", 34, 34),
+        ("plateau", 12, 12),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
@@ -452,6 +453,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "regime",
         "aegis-trial",
         "merges",
+        "plateau",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(
