@@ -16,6 +16,8 @@ from typing import Any, BinaryIO
 
 from aegis_cli.common.errors import AegisError
 
+_ATTEMPTS = 100  # at a folder above which others come and go
+
 
 def canonical(obj: Any) -> str:
     """One JSON text for equal values: sorted keys, no spaces; NaN is a ValueError."""
@@ -158,8 +160,16 @@ def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and those above it."""
+    """Create a folder and those above it.
+
+    Another process may remove an empty one of those above meanwhile, as `locks.alone` does at its
+    end. Then they are made again.
+    """
     try:
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(FileNotFoundError):
+                path.mkdir(parents=True, exist_ok=True)
+                return
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         problem = f"cannot create the folder '{path}': {error.strerror or error}"

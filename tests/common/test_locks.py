@@ -86,6 +86,24 @@ def test_a_folder_that_stays_empty_is_gone_again(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "b" / "kept").exists()
 
 
+def test_a_folder_above_that_another_removes_meanwhile_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of two cells of a study: the one that ends removes what the other has just begun to use."""
+    folder, plain = tmp_path / "reach" / "naive" / "0", os.mkdir
+    removed: list[Path] = []
+
+    def make(path: str | Path, mode: int = 0o777) -> None:
+        plain(path, mode)
+        if Path(path) == folder.parent and len(removed) < 3:
+            removed.append(folder.parent)
+            os.rmdir(path)
+
+    monkeypatch.setattr(os, "mkdir", make)
+    with locks.alone(folder):
+        assert folder.is_dir() and len(removed) == 3
+
+
 def test_what_the_lock_is_on_may_be_moved_or_removed(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with locks.alone(folder):

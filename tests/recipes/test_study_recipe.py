@@ -454,6 +454,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "aegis-trial",
         "merges",
         "plateau",
+        "rivals",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(
