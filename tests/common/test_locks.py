@@ -89,7 +89,7 @@ def test_a_folder_that_stays_empty_is_gone_again(tmp_path: Path) -> None:
 def test_a_folder_above_that_another_removes_meanwhile_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As of two cells of a study: the one that ends removes what the other has just begun to use."""
+    """As of two cells of a study: one that ends removes what the other has just begun to use."""
     folder, plain = tmp_path / "reach" / "naive" / "0", os.mkdir
     removed: list[Path] = []
 
