@@ -109,6 +109,7 @@ class RobotBatch:
             where it makes it when the pass comes.
         prepared_parts: the same of the first frames of each pass, where the anchor gradient is
             taken on these alone.
+        prepared_by_method: what the method's own `prepare` has made of the frames of each pass.
     """
 
     images: Images
@@ -119,6 +120,7 @@ class RobotBatch:
     of_step: tuple[int, int] | None = None
     prepared: Sequence[Any] = ()
     prepared_parts: Sequence[Any] = ()
+    prepared_by_method: Sequence[Any] = ()
 
     def __len__(self) -> int:
         return len(self.instructions)

@@ -95,7 +95,7 @@ def bend(
     of_task, of_anchor = combine(*gram)
     if reads or _moves_idle(pairs):
         # One transfer for all groups: on a GPU each number read by itself would wait.
-        of_task, of_anchor = of_task.tolist(), of_anchor.tolist()
+        of_task, of_anchor = torch.stack((of_task, of_anchor)).tolist()
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
         combined = projection.apply(task, pull, wg, wa)
         for parameter, gradient in zip(group, combined, strict=True):

@@ -37,8 +37,8 @@ class Setting:
             its graph; only for a method that trains on questions.
         instructions: every text that the frames come with, so that a method which makes more text
             of them can refuse it before any work; none in a loop of somebody else's.
-        targets: robot frames -> what the expert has to predict of their actions, [B, H, A]; None in
-            a loop of somebody else's.
+        targets: robot frames -> what the expert has to predict of their actions, [B, H, A], on the
+            CPU; None in a loop of somebody else's.
         actions: A, how many numbers an action has.
         owners: the processes each of which has some rows of every weight; one where each has all.
     """
@@ -94,6 +94,7 @@ class Pass:
             somebody else's.
         share: which of the step's frames.
         total: a tensor -> its sum over the processes that make this pass; None for one process.
+        prepared: what the method's own `prepare` has made of the frames; None where nobody has.
     """
 
     step: int
@@ -104,6 +105,7 @@ class Pass:
     frames: RobotBatch | None = None
     share: Share = Share()
     total: Callable[[Tensor], Tensor] | None = None
+    prepared: Any = None
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,8 @@ class Parts:
         keeps_idle: whether the anchor gradient counts only where the task's is not zero.
         auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's
             own.
+        prepare: robot frames -> what `auxiliary` finds in `Pass.prepared`, made on the CPU ahead of
+            a GPU's step; several threads may call it.
         pull: adds to `.grad` after the backward, before the gradient is clipped.
         shares: parameter -> the share of its learning rate that this step is to have, from the
             gradients, a tensor [] where reading it would wait; others have all.
@@ -160,6 +164,7 @@ class Parts:
     fraction: float = 1.0
     keeps_idle: bool = False
     auxiliary: Callable[[Pass], Tensor] | None = None
+    prepare: Callable[[RobotBatch], Any] | None = None
     pull: Callable[[], None] | None = None
     shares: Callable[[], Mapping[Tensor, float | Tensor]] | None = None
     constrain: Callable[[Update], None] | None = None

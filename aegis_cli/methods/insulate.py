@@ -18,12 +18,32 @@ than questions have. The text is a second pass over the image, where the paper s
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+
+
+@dataclass(frozen=True)
+class _Written:
+    """The actions of some frames as text.
+
+    Attributes:
+        asked: what the backbone is asked of each frame.
+        texts: what its answer is to be.
+        numbers: how many numbers all of them have, int64 [].
+        answered: what the backbone has made of all this.
+    """
+
+    asked: Sequence[str]
+    texts: Sequence[str]
+    numbers: Tensor
+    answered: Any
 
 
 def start(setting: Setting) -> Parts:
@@ -35,8 +55,10 @@ def start(setting: Setting) -> Parts:
     """
     weight, vqa_weight = setting.options["weight"], setting.options["vqa_weight"]
     terms: list[Callable[[Pass], Tensor]] = []
+    write = None
     if weight > 0:
-        action_loss = _action_loss(setting)
+        write = _writing(setting)
+        action_loss = _action_loss(setting, write)
         terms.append(lambda seen: weight * action_loss(seen))
     if vqa_weight > 0:
         vqa_loss = setting.vqa_loss
@@ -44,33 +66,51 @@ def start(setting: Setting) -> Parts:
         terms.append(lambda seen: vqa_weight * vqa_loss(seen))
     if not terms:
         return Parts()
-    return Parts(auxiliary=lambda seen: torch.stack([term(seen) for term in terms]).sum())
+    return Parts(
+        auxiliary=lambda seen: torch.stack([term(seen) for term in terms]).sum(), prepare=write
+    )
 
 
-def _action_loss(setting: Setting) -> Callable[[Pass], Tensor]:
+def _action_loss(
+    setting: Setting, write: Callable[[RobotBatch], _Written]
+) -> Callable[[Pass], Tensor]:
     """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
+    backbone = setting.backbone
+
+    def loss(seen: Pass) -> Tensor:
+        frames = seen.frames
+        assert frames is not None
+        written = seen.prepared or write(frames)
+        said = backbone.answer_log_likelihood(
+            frames.images, written.asked, written.texts, written.answered
+        )
+        count = written.numbers
+        if seen.total is not None:
+            count = seen.total(count.to(said.device))
+        return -said.sum() / count
+
+    return loss
+
+
+def _writing(setting: Setting) -> Callable[[RobotBatch], _Written]:
+    """Robot frames -> their actions as text, on the CPU, where to read a number makes none wait."""
     backbone, targets = setting.backbone, setting.targets
     limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
     assert targets is not None
     numbers = _numbers(setting)
     _check_room(setting, " ".join(numbers[-1:] * (horizon * setting.actions)))
 
-    def loss(seen: Pass) -> Tensor:
-        frames = seen.frames
-        assert frames is not None
+    def write(frames: RobotBatch) -> _Written:
         chosen = spread(frames.actions.shape[1], horizon)
         bins = binned(targets(frames)[:, chosen], limit, len(numbers))
         # The actions past an episode's end were never shown.
         shown = ~frames.is_pad[:, chosen]
         texts = as_texts(bins, shown, numbers)
         asked = [prompt.replace("{}", text) for text in frames.instructions]
-        said = backbone.answer_log_likelihood(frames.images, asked, texts)
-        count = shown.sum()
-        if seen.total is not None:
-            count = seen.total(count.to(said.device))
-        return -said.sum() / (int(count) * bins.shape[-1])
+        answered = backbone.prepare_answers(frames.images, asked, texts)
+        return _Written(asked, texts, shown.sum() * bins.shape[-1], answered)
 
-    return loss
+    return write
 
 
 def spread(chunk: int, horizon: int) -> Tensor:
@@ -96,7 +136,7 @@ def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
         numbers: the text of each bin.
     """
     texts = []
-    for steps, valid in zip(bins.cpu(), shown, strict=True):
+    for steps, valid in zip(bins, shown, strict=True):
         texts.append(" ".join(numbers[i] for i in steps[valid].flatten().tolist()))
     return texts
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -57,6 +58,11 @@ class Policy(nn.Module):
         device = self.backbone.device
         origins = self.origins(send(batch.proprio, device))
         return self.action_scale(send(batch.actions, device) - origins)
+
+    def targets_on_cpu(self) -> Callable[[RobotBatch], Tensor]:
+        """What `targets` finds, but without the device: for threads that prepare batches."""
+        scale = copy.deepcopy(self.action_scale).cpu()
+        return lambda batch: scale(batch.actions - self.origins(batch.proprio))
 
     def flow_loss(
         self,

@@ -443,7 +443,7 @@ def _start(
         anchor,
         vqa_loss,
         demos.texts,
-        policy.targets,
+        policy.targets_on_cpu(),
         len(policy.action_scale.mean),
         owners,
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -164,8 +164,11 @@ def _all_passes(
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
         prepared = batch.prepared[number] if batch.prepared else None
         of_part = batch.prepared_parts[number] if batch.prepared_parts else None
+        by_method = batch.prepared_by_method[number] if batch.prepared_by_method else None
         with masters.rounded():
-            loss, w2, anchor = _backward(settings, part, of, generator, prepared, of_part)
+            loss, w2, anchor = _backward(
+                settings, part, of, generator, prepared, of_part, by_method
+            )
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
@@ -221,6 +224,7 @@ def with_prepared(
     ranks: Ranks,
     accumulate: int,
     fraction: float = 1.0,
+    by_method: Callable[[RobotBatch], Any] | None = None,
 ) -> RobotBatch:
     """The batch with what the backbone makes of each pass's frames, still to be sent to it.
 
@@ -228,15 +232,23 @@ def with_prepared(
         batch: this process's frames.
         size: of the whole batch, as `RobotBatch.of_step` has it.
         fraction: of each pass's frames, which pass once more.
+        by_method: the method's own `prepare`.
     """
     batch = replace(batch, of_step=size)
-    found, found_of_parts = list[Batch](), list[Batch]()
+    found, found_of_parts, found_by_method = list[Batch](), list[Batch](), list[Any]()
     for part, _ in passes(batch, ranks, accumulate, backbone.device):
         found.append(backbone.process(part.images, part.instructions))
         if fraction < 1:
             shown = first_frames(part, fraction)
             found_of_parts.append(backbone.process(shown.images, shown.instructions))
-    return replace(batch, prepared=found, prepared_parts=found_of_parts)
+        if by_method is not None:
+            found_by_method.append(by_method(part))
+    return replace(
+        batch,
+        prepared=found,
+        prepared_parts=found_of_parts,
+        prepared_by_method=found_by_method,
+    )
 
 
 def first_frames(batch: RobotBatch, fraction: float) -> RobotBatch:
@@ -251,12 +263,14 @@ def _backward(
     generator: torch.Generator,
     prepared: Batch | None = None,
     prepared_part: Batch | None = None,
+    prepared_by_method: Any = None,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
     """One pass over some frames, and back.
 
     Args:
         prepared: what the backbone has made of all of them already.
         prepared_part: what it has made of those that the anchor gradient is taken on.
+        prepared_by_method: what the method has made of all of them already.
 
     Returns:
         What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
@@ -280,6 +294,7 @@ def _backward(
             shown,
             of.share,
             total,
+            prepared_by_method,
         )
         return encoding, seen
 

@@ -342,7 +342,8 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         size = run.demos.size(run.demos.train[rows], settings.chunk)
         sharing = run.ranks, settings.accumulate
         fraction = 1.0 if run.parts.reuses(index) else run.parts.fraction
-        return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction)
+        by_method = run.parts.prepare
+        return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction, by_method)
 
     return fetch
 

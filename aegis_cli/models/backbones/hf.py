@@ -318,12 +318,17 @@ class HFBackbone(Backbone):
         places = send(torch.tensor([rows, columns]), self.device)
         with _head_at(self.get_submodule(self._head), *places):
             (scores,) = self._scores(batch, batch.ids.shape[1] - first)  # [sum of words + 1, V]
-        log_shares = scores.log_softmax(-1).split([len(words) + 1 for words in said])
+        log_shares = scores.log_softmax(-1)
+        # What predicts the end has no word; there the first stands for none.
+        words = send(torch.tensor([word for own in said for word in (*own, 0)]), self.device)
+        of_words = log_shares.gather(1, words[:, None]).squeeze(1)
+        # Any of the end tokens ends the answer, so their probabilities add up.
+        ends = send(torch.tensor(self._ends()), self.device)
+        of_ends = log_shares.index_select(1, ends).logsumexp(1)
+        counts = [len(own) + 1 for own in said]
         total = []
-        for own, words in zip(log_shares, said, strict=True):
-            answer = own[range(len(words)), words].sum()
-            # Any of the end tokens ends the answer, so their probabilities add up.
-            total.append(answer + own[-1, self._ends()].logsumexp(0))
+        for own_words, own_ends in zip(of_words.split(counts), of_ends.split(counts), strict=True):
+            total.append(own_words[:-1].sum() + own_ends[-1])
         return torch.stack(total)
 
     def _scores(self, batch: Batch, last: int) -> Tensor:
