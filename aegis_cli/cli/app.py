@@ -320,6 +320,7 @@ def train(
     method: Annotated[
         str | None,
         Option(
+            "--method",
             metavar="METHOD",
             help=f"{', '.join(METHODS)}; for a stream {', '.join(LEARNERS)}; default: the recipe's "
             "train.method.",
@@ -393,7 +394,7 @@ def merge(
         ),
     ],
     method: Annotated[
-        str, Option(metavar="METHOD", help=f"What is kept: {', '.join(MERGES)}.")
+        str, Option("--method", metavar="METHOD", help=f"What is kept: {', '.join(MERGES)}.")
     ] = "factors",
     strength: Annotated[
         float | None,
@@ -1058,6 +1059,7 @@ def bench(
     shape: Annotated[
         str | None,
         Option(
+            "--shape",
             metavar="SHAPE",
             help="Random weights of a true shape instead: smolvlm2-256m, smolvlm2-500m or "
             "paligemma2-3b.",

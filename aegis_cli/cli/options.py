@@ -270,6 +270,7 @@ SkipBad = Annotated[
 Device = Annotated[
     str | None,
     Option(
+        "--device",
         metavar="DEVICE",
         help="Where to compute: cpu, cuda, cuda:N or auto; default: AEGIS_DEVICE, else a GPU if "
         "there is one.",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
+import importlib
 import os
 import sys
 
@@ -28,6 +30,7 @@ def choose_backend() -> str:
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if sys.platform != "linux":
         return chosen or "default"
+    _import_triton()
     if chosen:
         _check_library(chosen)
         return chosen
@@ -40,6 +43,16 @@ def choose_backend() -> str:
         "an OpenGL library that renders without a screen",
         "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6)",
     )
+
+
+def _import_triton() -> None:
+    """Import it, where it is installed, before Mesa's renderer.
+
+    PyTorch brings it for GPUs, and transformers imports it. Both hold a copy of LLVM: when Mesa's
+    is at work already, the import of triton ends the process by a segmentation fault.
+    """
+    with contextlib.suppress(ImportError):
+        importlib.import_module("triton")
 
 
 def _check_library(backend: str) -> None:

@@ -16,19 +16,27 @@ from torch import Tensor
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-# How many entries are widened at a time. On a CPU they stay in a core's cache; on a GPU the copy
-# takes 32 MB, and the kernels remain few.
-_BLOCK, _GPU_BLOCK = 1 << 16, 1 << 22
+# How many entries are widened at a time. On a CPU they stay in a core's cache; on a GPU the copies
+# take 0.4 GB, and the kernels remain few.
+_BLOCK, _GPU_BLOCK = 1 << 16, 1 << 24
 
 
 @torch.no_grad()
-def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
+def inner(
+    gs: Gradients, as_: Gradients, device: torch.device | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """tt = <g, g>, ta = <g, a>, aa = <a, a> over one group's parameters, float64 scalars.
 
     A missing gradient (None) counts as zero. Products are taken in float64: the float32 square of a
     gradient of 1e-25 is 0, and the projection would silently vanish with it.
+
+    Args:
+        device: where the result is to be; None: where the gradients are.
     """
-    tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=_device((*gs, *as_)))
+    device = device or _device((*gs, *as_))
+    if device is not None and device.type != "cpu":
+        return _inner_by_few_kernels(gs, as_, device)
+    tt, ta, aa = torch.zeros(3, dtype=torch.float64, device=device)
     for g, a in zip(gs, as_, strict=True):
         for u, v in _widened(g, a):
             if u is not None:
@@ -38,6 +46,49 @@ def inner(gs: Gradients, as_: Gradients) -> tuple[Tensor, Tensor, Tensor]:
             if u is not None and v is not None:
                 ta = ta + u.dot(v)
     return tt, ta, aa
+
+
+def _inner_by_few_kernels(
+    gs: Gradients, as_: Gradients, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same on a GPU, which takes longer to start a kernel than to run it on one bias."""
+    ta = torch.zeros((), dtype=torch.float64, device=device)
+    for u, v in _joined(gs, as_):
+        ta = ta + u.double().dot(v.double())
+    return _energy(gs, device), ta, _energy(as_, device)
+
+
+def _energy(gradients: Gradients, device: torch.device) -> Tensor:
+    """<g, g> over all that are there, a float64 scalar; read once, and not widened in memory."""
+    there = [g for g in gradients if g is not None]
+    if not there:
+        return torch.zeros((), dtype=torch.float64, device=device)
+    norms = torch._foreach_norm(there, dtype=torch.float64)
+    return torch.stack(norms).square().sum()
+
+
+def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
+    """The entries of all pairs, small tensors put together, in blocks [n] of bounded size."""
+    waiting, size = list[tuple[Tensor, Tensor]](), 0
+    for g, a in zip(gs, as_, strict=True):
+        if g is None or a is None:
+            continue
+        for block in zip(_blocks(g), _blocks(a), strict=True):
+            if waiting and size + len(block[0]) > _GPU_BLOCK:
+                yield _one(waiting)
+                waiting, size = [], 0
+            waiting.append(block)
+            size += len(block[0])
+    if waiting:
+        yield _one(waiting)
+
+
+def _one(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Pairs of blocks as one; a single one is not copied."""
+    if len(pairs) == 1:
+        return pairs[0]
+    left, right = zip(*pairs, strict=True)
+    return torch.cat(left), torch.cat(right)
 
 
 def dot(x: Tensor, y: Tensor) -> Tensor:
@@ -69,9 +120,9 @@ def _device(tensors: Iterable[Tensor | None]) -> torch.device | None:
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
     """The inner products of every group, stacked: tt, ta, aa [G]."""
+    # A group without any gradient does not know where the others are.
     device = _device(x for gs, as_ in groups for x in (*gs, *as_))
-    # A group without any gradient has its zeros on the CPU, wherever the others are.
-    rows = [torch.stack(inner(gs, as_)).to(device) for gs, as_ in groups]
+    rows = [torch.stack(inner(gs, as_, device)) for gs, as_ in groups]
     tt, ta, aa = torch.stack(rows).unbind(1)  # of [G, 3]
     return tt, ta, aa
 
@@ -101,7 +152,27 @@ def apply(
     new tensor: the projection moves parameters that the task does not. Weights that are tensors []
     are not read, and so neither saves its work at (1, 0).
     """
-    return [_mix(g, a, wg, wa) for g, a in zip(gs, as_, strict=True)]
+    there = [g for g in gs if g is not None]
+    if there and (isinstance(wg, Tensor) or wg != 1):
+        torch._foreach_mul_(there, _like(wg, there[0]))
+    if not isinstance(wa, Tensor) and wa == 0:
+        return list(gs)
+    both = [(g, a) for g, a in zip(gs, as_, strict=True) if g is not None and a is not None]
+    if both:
+        add_scaled([g for g, _ in both], [a for _, a in both], wa)
+    return [a * wa if g is None and a is not None else g for g, a in zip(gs, as_, strict=True)]
+
+
+def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor) -> None:
+    """x <- x + scale y in place, for each; a scale that is a tensor [] is not read."""
+    if isinstance(scale, Tensor):
+        torch._foreach_add_(list(xs), torch._foreach_mul(list(ys), _like(scale, ys[0])))
+    else:
+        torch._foreach_add_(list(xs), list(ys), alpha=scale)
+
+
+def _like(scale: float | Tensor, x: Tensor) -> float | Tensor:
+    return scale.to(x.dtype) if isinstance(scale, Tensor) else scale
 
 
 def removed_energy(ta: Tensor, aa: Tensor) -> Tensor:
@@ -124,20 +195,3 @@ def ratio(x: Tensor, y: Tensor) -> Tensor:
     """x / y, and 0 where y is exactly 0; NaN stays NaN."""
     zero = y == 0
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
-
-
-def _mix(
-    g: Tensor | None, a: Tensor | None, wg: float | Tensor, wa: float | Tensor
-) -> Tensor | None:
-    if g is not None and (isinstance(wg, Tensor) or wg != 1):
-        g.mul_(wg)
-    if a is None or (not isinstance(wa, Tensor) and wa == 0):
-        return g
-    return a * wa if g is None else add_scaled(g, a, wa)
-
-
-def add_scaled(x: Tensor, y: Tensor, scale: float | Tensor) -> Tensor:
-    """x <- x + scale y in place; a scale that is a tensor [] is not read."""
-    if isinstance(scale, Tensor):
-        return x.addcmul_(y, scale.to(x.dtype))
-    return x.add_(y, alpha=scale)

@@ -133,7 +133,12 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
     )
     run.policy.train()
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
-    return run, run.demos.batch(run.demos.train[rows], recipe.train.chunk)
+    frames, device = run.demos.train[rows], run.policy.backbone.device
+    batch = run.demos.batch(frames, recipe.train.chunk)
+    if devices.reading_waits(device):
+        # Training has it ready on the GPU before its step begins.
+        batch = train.prepared(run, batch, frames, 0).with_prepared_on(device)
+    return run, batch
 
 
 def images(count: int) -> torch.Tensor:

@@ -1,13 +1,16 @@
 """`aegis bench --shape`: what a step of each method, and each part of an anchor, cost at true size.
 
-The model has random weights (models/backbones/shapes.py). Everything is measured in a process of
-its own, one after the other, since a model of true size fits into memory once and a peak never
-falls. So nothing is timed in turn. On a CPU the seconds are those that its cores worked, which
-other work on the machine lengthens least; on a GPU they are of the clock on the wall.
+The model has random weights (models/backbones/shapes.py), and fits into memory once, so that
+everything is measured one after the other and nothing in turn. On a CPU each has a process of its
+own, for its peak of memory never falls; the seconds are those that its cores worked, which other
+work on the machine lengthens least. On a GPU one process measures all: what its tensors need is
+counted anew for each, and the seconds are of the clock on the wall.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import statistics
 import tempfile
 import time
@@ -17,7 +20,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from aegis_cli import methods, recipes
 from aegis_cli.anchors import measure
@@ -25,14 +27,17 @@ from aegis_cli.common import devices, machine, memory
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.processes import WorkerPool
-from aegis_cli.evaluation import bench_runs
+from aegis_cli.evaluation import bench_runs, operations
 from aegis_cli.evaluation.bench_runs import NAIVE
 from aegis_cli.evaluation.peaks import Peak, peak_of
 from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
 
 _BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
-_SAMPLES = 8  # questions of an anchor's parts; a part's time is given for each
+# Questions of an anchor's parts, and how many a pass takes; a part's time is given for each.
+_SAMPLES, _AT_ONCE = 8, 2
+_SAMPLES_OF_GPU, _AT_ONCE_OF_GPU = 64, 8
+_KEPT = 256 * 2**20  # bytes that CUDA's libraries may keep on a GPU for themselves
 _FIX = "free some memory, use a smaller --shape, or leave methods out with --methods"
 T = TypeVar("T")
 
@@ -149,14 +154,14 @@ def run(
         done, total = len(measured) + len(found), len(parts) + len(names)
         on_event(Progress("bench shape", done, total, "processes"))
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _Processes() as processes:
         out = Path(folder)
         for part in parts:
-            measured[part] = _in_process(_measure_part, f"random:{shape}", part, out)
+            measured[part] = processes.run(_measure_part, f"random:{shape}", part, out)
             tell()
         for name, recipe in recipes_by_name.items():
             lacks = any(measured[part] is None for part in methods.get(name).needs)
-            found[name] = None if lacks else _in_process(_measure_method, recipe, out, turns)
+            found[name] = None if lacks else processes.run(_measure_method, recipe, out, turns)
             tell()
     costs = {part: _part_cost(each) for part, each in measured.items() if each is not None}
     return _report(shape, recipes_by_name[NAIVE].train, turns, found, costs)
@@ -196,7 +201,7 @@ def _report(
         weights=used.weights,
         tokens=naive.tokens,
         turns=turns,
-        questions=_SAMPLES,
+        questions=_samples(),
         methods={name: _cost(each, naive, assumed) for name, each in found.items()},
         anchor=costs,
     )
@@ -227,23 +232,53 @@ def _check_fits(shape: shapes.Shape) -> None:
 # --- in processes of their own --------------------------------------------------------------------
 
 
-def _in_process(work: Callable[..., T], *arguments: Any) -> T | None:
-    """What `work` returns in a process of its own; None where its GPU had too little memory."""
-    with WorkerPool(1, "a process of the benchmark", _FIX) as pool:
-        return pool.submit(_unless_full, work, *arguments).result()
+class _Processes:
+    """Where the work is done, within a `with` block: on a CPU in a process for each.
+
+    On a GPU one process goes on until its memory is full, or something is left there.
+    """
+
+    def __init__(self) -> None:
+        self._open = contextlib.ExitStack()
+        self._pool: WorkerPool | None = None
+
+    def __enter__(self) -> _Processes:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
+
+    def run(self, work: Callable[..., T], *arguments: Any) -> T | None:
+        """What `work` returns; None where a GPU had too little memory."""
+        if self._pool is None:
+            pool = WorkerPool(1, "a process of the benchmark", _FIX)
+            self._pool = self._open.enter_context(pool)
+        found, as_new = self._pool.submit(_unless_full, work, *arguments).result()
+        if not as_new:
+            self._open.close()
+            self._pool = None
+        return found
 
 
-def _unless_full(work: Callable[..., T], *arguments: Any) -> T | None:
+def _unless_full(work: Callable[..., T], *arguments: Any) -> tuple[T | None, bool]:
+    """What `work` returns, or None; and whether this process may measure the next."""
     try:
-        return work(*arguments)
+        memory.restart_peak(devices.pick())
+        found = work(*arguments)
     except torch.OutOfMemoryError:
-        return None
+        return None, False
+    if not devices.on_gpu():
+        return found, False
+    gc.collect()
+    torch.cuda.empty_cache()
+    return found, torch.cuda.memory_allocated() <= _KEPT
 
 
 def _measure_part(backbone: str, part: str, out: Path) -> _Measured:
     """Measure a part of the anchor, and write it for the methods."""
+    count, at_once = _samples(), _AT_ONCE_OF_GPU if devices.on_gpu() else _AT_ONCE
     settings = recipes.Anchor(
-        samples=_SAMPLES, fisher_samples=_SAMPLES, batch_size=2, parts=(part,)
+        samples=count, fisher_samples=count, batch_size=at_once, parts=(part,)
     )
     start = _now()
     report = measure.run(backbone, settings, _anchor(out, [part]))
@@ -270,8 +305,7 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
         bench_runs.wait()
         times.append((_now() - start) / steps)
     needed = memory.peak(devices.pick())
-    counter = FlopCounterMode(display=False)
-    with counter:
+    with operations.counter() as counter:
         turn()
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
@@ -283,6 +317,10 @@ def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:
     return out / f"{'-'.join(sorted(parts))}.safetensors"
 
 
+def _samples() -> int:
+    return _SAMPLES_OF_GPU if devices.on_gpu() else _SAMPLES
+
+
 def _now() -> float:
     return time.perf_counter() if devices.on_gpu() else time.process_time()
 
@@ -291,7 +329,7 @@ def _now() -> float:
 
 
 def _part_cost(found: _Measured) -> PartCost:
-    return PartCost(found.seconds / _SAMPLES, found.peak / 1e9, found.megabytes)
+    return PartCost(found.seconds / _samples(), found.peak / 1e9, found.megabytes)
 
 
 def _cost(found: _Measured | None, naive: _Measured, assumed: Peak | None) -> StepCost:

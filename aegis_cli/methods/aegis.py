@@ -117,11 +117,13 @@ def _cost(
 
 def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> projection.Combine:
     rule = projection.aegis if project else projection.naive
+    counts = torch.tensor(chosen)
 
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal counts
         task, anchor = rule(tt, ta, aa)
+        counts = counts.to(anchor)  # once: a copy to a GPU waits for it
         # A group that is not chosen keeps its task gradient, bit for bit.
-        counts = torch.tensor(chosen, dtype=anchor.dtype, device=anchor.device)
         return task, (anchor + restoration) * counts
 
     return combine
@@ -163,9 +165,9 @@ def project_update(
         excess = float(excess)
         if excess == 0:
             return
-    for parameter, a in zip(here, anchor, strict=True):
-        if a is not None:
-            projection.add_scaled(parameter, a, -excess)
+    pulled = [p for p, a in zip(here, anchor, strict=True) if a is not None]
+    if pulled:
+        projection.add_scaled(pulled, [a for a in anchor if a is not None], -excess)
 
 
 METHOD = Method(

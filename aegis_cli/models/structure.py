@@ -403,7 +403,7 @@ def digest(state: Mapping[str, Tensor]) -> str:
     for name, tensor in sorted(state.items()):
         values = whole(tensor.detach()).float().cpu().contiguous()
         found.update(f"{name} {tuple(tensor.shape)}".encode())
-        found.update(values.numpy().tobytes())
+        found.update(values.numpy())
     return found.hexdigest()
 
 

@@ -150,8 +150,8 @@ def _planned(
     method = methods.get(recipe.train.method)
     training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     held = _held(training, there)
-    tokens, activations = _pass_one_frame(training)
-    parts = _memory(training, held, activations * _frames_of_a_pass(recipe.train, ranks))
+    tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks))
+    parts = _memory(training, held, activations)
     written = [] if overwrite else checkpoint.whole(out)
     checkpoints = _to_come(recipe, written)
     disk = checkpoints * _checkpoint_bytes(training)
@@ -297,10 +297,21 @@ def _bytes_here(tensors: Iterable[Tensor]) -> int:
 # --- memory ---------------------------------------------------------------------------------------
 
 
-def _pass_one_frame(training: TrainingRun) -> tuple[int, int]:
-    """Tokens of one frame, and bytes that its forward pass keeps for the backward."""
+def _pass_kept(training: TrainingRun, frames: int) -> tuple[int, int]:
+    """Tokens of one frame, and bytes that the forward pass of some keeps for the backward.
+
+    Two frames' pass and three frames' tell what grows with the frames and what does not: the
+    weights that autocast has rounded. A single one would keep less, being no batch.
+    """
+    tokens, of_two = _pass_some(training, 2)
+    _, of_three = _pass_some(training, 3)
+    return tokens, of_two + (frames - 2) * (of_three - of_two)
+
+
+def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
+    """Tokens of a frame, and bytes that a pass keeps of the first frame, so many times over."""
     settings, policy = training.recipe.train, training.policy.train()
-    batch = training.demos.batch(training.demos.train[:1], settings.chunk)
+    batch = training.demos.batch(training.demos.train[:1].repeat(frames), settings.chunk)
     own: set[int] = set()
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}

@@ -336,16 +336,24 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
             drawn_from = settings.augment, settings.augment_count
             images = augment.augmented(batch.images, frames.tolist(), *drawn_from, seed, index)
             batch = dataclasses.replace(batch, images=images)
-        if not waits:
-            return batch
-        # What the step would wait for: sums over the processes, images to scale and to send.
-        size = run.demos.size(run.demos.train[rows], settings.chunk)
-        sharing = run.ranks, settings.accumulate
-        fraction = 1.0 if run.parts.reuses(index) else run.parts.fraction
-        by_method = run.parts.prepare
-        return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction, by_method)
+        return prepared(run, batch, run.demos.train[rows], index) if waits else batch
 
     return fetch
+
+
+def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) -> RobotBatch:
+    """A batch with what a step would wait for: sums over the processes, images to scale.
+
+    Args:
+        batch: this process's frames of a step.
+        frames: the places of all of the step's frames.
+        index: how many steps come before it.
+    """
+    settings, parts = run.recipe.train, run.parts
+    size = run.demos.size(frames, settings.chunk)
+    sharing = run.ranks, settings.accumulate
+    fraction = 1.0 if parts.reuses(index) else parts.fraction
+    return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction, parts.prepare)
 
 
 @contextmanager

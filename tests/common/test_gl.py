@@ -156,3 +156,16 @@ def test_the_command_says_so_before_any_work(
     assert not re.search(r"^\w+: \d", result.stderr, re.MULTILINE) and not list(
         tmp_path.iterdir()
     )  # no progress, no file
+
+
+def test_triton_comes_before_the_renderer(tmp_path: Path) -> None:
+    """Where Mesa's LLVM is at work, the import of triton's ends the process."""
+    (tmp_path / "triton.py").write_text("import sys; print('mujoco' in sys.modules)")
+    done = subprocess.run(
+        [sys.executable, "-c", "import aegis_cli.sim.scene"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "False\n"), done.stderr

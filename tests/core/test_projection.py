@@ -170,6 +170,35 @@ def test_blocks_add_up_to_the_whole(block: int, monkeypatch: pytest.MonkeyPatch)
     )
 
 
+@pytest.mark.parametrize("block", [1, 7, 40, 10**6])
+@pytest.mark.parametrize("scale", SCALES)
+def test_few_kernels_find_the_same(
+    block: int, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a GPU computes, computed by the CPU: small tensors are put together."""
+    monkeypatch.setattr(projection, "_BLOCK", block)
+    monkeypatch.setattr(projection, "_GPU_BLOCK", block)
+    whole: tuple[list[Tensor | None], ...] = (gradients(0, scale), gradients(1))
+    partly = [None, *whole[0][1:]], [*whole[1][:2], None, whole[1][3]]
+    nothing = [None, None], [None, None]
+    for gs, as_ in (whole, partly, nothing):
+        expected = [float(x) for x in projection.inner(gs, as_)]
+        found = projection._inner_by_few_kernels(gs, as_, torch.device("cpu"))
+        assert [float(x) for x in found] == pytest.approx(expected, rel=1e-12)
+        assert all(x.dtype == torch.float64 and x.shape == () for x in found)
+
+
+@pytest.mark.parametrize("weights", [(2.0, -0.5), (1.0, 0.25), (1.0, 0.0), (0.5, 0.0)])
+def test_weights_that_are_tensors_are_the_same_weights(weights: tuple[float, float]) -> None:
+    gs, as_ = [None, *gradients(0)], [gradients(2)[0], *gradients(1)]
+    as_[-1] = None
+    expected = projection.apply([g if g is None else g.clone() for g in gs], as_, *weights)
+    of_tensors = [torch.tensor(w, dtype=torch.float64) for w in weights]
+    found = projection.apply(gs, as_, *of_tensors)
+    assert (expected[0] is None) == (weights[1] == 0)
+    torch.testing.assert_close(found[1:], expected[1:])
+
+
 def test_gram_stacks_the_groups() -> None:
     groups = [(gradients(i), gradients(i + 10)) for i in range(3)]
     for i, column in enumerate(zip(*projection.gram(groups), strict=True)):

@@ -27,12 +27,12 @@ def here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The small shape, measured in this process; names of what was measured."""
     asked: list[str] = []
 
-    def in_this_process(work: Callable[..., Any], *arguments: Any) -> Any:
+    def in_this_process(_: object, work: Callable[..., Any], *arguments: Any) -> Any:
         asked.append(work.__name__)
-        return bench_shapes._unless_full(work, *arguments)
+        return bench_shapes._unless_full(work, *arguments)[0]
 
     monkeypatch.setitem(shapes.SHAPES, NAME, small(NAME))
-    monkeypatch.setattr(bench_shapes, "_in_process", in_this_process)
+    monkeypatch.setattr(bench_shapes._Processes, "run", in_this_process)
     return asked
 
 

@@ -129,7 +129,8 @@ def test_a_dry_run_counts_what_there_is(
     )  # one copy of the weights
     doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
     bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
-    assert bigger.memory_mb["activations"] == pytest.approx(2 * plain.memory_mb["activations"])
+    twice = pytest.approx(2 * plain.memory_mb["activations"], rel=0.01)
+    assert bigger.memory_mb["activations"] == twice
     assert bigger.epochs == pytest.approx(2 * plain.epochs)
 
 
@@ -252,6 +253,20 @@ def test_what_a_gpu_has_no_memory_for_is_reported_and_no_error(
     assert "more memory than the estimate of" in str(dry_run.shortage(plan))
 
 
+def test_rounded_weights_count_once_and_not_for_each_frame(
+    hf_folder: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    kept = {}
+    for precision in ("float32", "bf16"):
+        for size in (4, 8):
+            settings = small(hf_folder("smolvlm"), precision=precision, batch_size=size)
+            plan = dry_run.run(settings, "naive", demos_file, None, tmp_path / "out")
+            kept[precision, size] = plan.memory_mb["activations"]
+    fixed = {p: 2 * kept[p, 4] - kept[p, 8] for p in ("float32", "bf16")}
+    # Maps, with two bytes a number; tables and norms stay as they are.
+    assert 1e-6 * plan.trainable < fixed["bf16"] - fixed["float32"] < 2e-6 * plan.trainable
+
+
 def test_what_a_pass_has_shrinks_with_passes(
     tiny_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:
@@ -260,7 +275,7 @@ def test_what_a_pass_has_shrinks_with_passes(
         for k in (1, 2)
     ]
     whole, halved = (plan.memory_mb["activations"] for plan in plans)
-    assert halved == pytest.approx(whole / 2)
+    assert halved == pytest.approx(whole / 2, rel=0.01)
 
 
 def test_no_step_is_taken_where_memory_does_not_suffice(

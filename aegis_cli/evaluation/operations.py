@@ -1,0 +1,44 @@
+"""Counting the operations of matrix products, attention's among them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Size
+from torch.utils.flop_counter import FlopCounterMode
+
+aten = torch.ops.aten
+_KERNELS = ("flash_attention", "efficient_attention", "cudnn_attention", "flash_attention_for_cpu")
+
+
+def counter() -> FlopCounterMode:
+    """Count, within its `with` block, what `get_total_flops` then returns.
+
+    PyTorch counts no attention of a CPU. Before 2.13 it also refuses queries of more heads than
+    keys have.
+    """
+    ours = {}
+    for kernel in _KERNELS:
+        forward = getattr(aten, f"_scaled_dot_product_{kernel}")
+        ours[forward] = _attention
+        ours[getattr(aten, f"{forward.__name__}_backward")] = _attention_backward
+    return FlopCounterMode(display=False, custom_mapping=ours)
+
+
+def _attention(query: Size, key: Size, value: Size, *_: Any, **__: Any) -> int:
+    """Operations of the scores [B, H, T, S] and of the values' sum.
+
+    Args:
+        query: [B, H, T, D]; key: [B, h, S, D] of h heads, each for as many of the queries';
+        value: [B, h, S, E].
+    """
+    return 2 * math.prod(query[:3]) * key[2] * (query[3] + value[3])
+
+
+def _attention_backward(
+    gradient: Size, query: Size, key: Size, value: Size, *_: Any, **__: Any
+) -> int:
+    """Operations of its gradients: scores anew, and four products of their size."""
+    return 2 * math.prod(query[:3]) * key[2] * (3 * query[3] + 2 * value[3])

@@ -1,0 +1,297 @@
+"""A device besides the CPU, made of the CPU's own memory, and commands that run on it.
+
+PyTorch offers one name for devices of others' making. Tensors of that device are wrappers here, and
+what they hold is computed by the CPU. As with a GPU, no operation takes tensors of both, and a
+number of it is read by waiting. A process that has such a device keeps it:
+
+    python -m samples.second_device COMMANDS.json stand_in
+
+runs the commands of the file, each a list of `aegis`'s arguments, and prints as JSON what each said
+and how often each place in Aegis waited for the device within a step of training. With `cpu` there
+is no such device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+import threading
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils import backend_registration as registration
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+NAME = "stand_in"
+POSSIBLE = hasattr(registration, "_setup_privateuseone_for_python_backend")
+aten = torch.ops.aten
+# Operations that take tensors of both: copies, and the choice of rows by a CPU's list.
+INDEXING = {
+    aten.index.Tensor,
+    aten.index_put.default,
+    aten.index_put_.default,
+    aten._index_put_impl_.default,
+}
+MIXES = {aten._to_copy.default, aten.copy_.default, aten._pin_memory.default, *INDEXING}
+# Those whose result, or its shape, depends on numbers that have to be read.
+READS = {
+    aten._local_scalar_dense.default,
+    aten.nonzero.default,
+    aten.masked_select.default,
+    aten.equal.default,
+    aten._unique2.default,
+    aten.bincount.default,
+}
+waits: Counter[str] = Counter()
+# Models are loaded on the CPU, by threads of transformers' own.
+_loading = threading.Event()
+
+
+class Mixed(RuntimeError):
+    """An operation takes tensors of both devices."""
+
+
+class StandIn(Tensor):
+    """A tensor of the device; `held` is what it holds."""
+
+    held: Tensor
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> StandIn:
+        made = Tensor._make_wrapper_subclass(
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=torch.device(NAME, 0),
+        )
+        made.held = held
+        return made
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return compute(func, args, kwargs or {})
+
+    def __repr__(self, *, tensor_contents: Any = None) -> str:
+        return f"StandIn({self.held})"
+
+    def tolist(self) -> Any:
+        note_wait()
+        return self.held.tolist()
+
+    def __getitem__(self, index: Any) -> Tensor:
+        return Tensor.__getitem__(self, _as_tensors(index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        Tensor.__setitem__(self, _as_tensors(index), value)
+
+
+def _as_tensors(index: Any) -> Any:
+    """Lists of an index as tensors of the device; torch would make them out of a mode's sight."""
+    if isinstance(index, tuple):
+        return tuple(_as_tensors(one) for one in index)
+    if isinstance(index, list | range):
+        return torch.tensor(list(index)).to(NAME)
+    return index
+
+
+def is_there(device: Any) -> bool:
+    """Whether a device, or its name, is the stand-in."""
+    return device is not None and torch.device(device).type == NAME
+
+
+def compute(func: Any, args: Any, kwargs: Any) -> Any:
+    """One operation, by the CPU, on what the device's tensors hold.
+
+    Raises:
+        Mixed: it takes tensors of both devices.
+    """
+    tensors = [x for x in pytree.tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+    of_device = [x for x in tensors if isinstance(x, StandIn)]
+    if of_device:
+        _check(func, args, tensors)
+        if _reads(func, args, kwargs):
+            note_wait()
+    wanted = kwargs.get("device")
+    there = bool(of_device) if wanted is None else is_there(wanted)
+    if is_there(wanted):
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    known: dict[int, StandIn] = {}
+
+    def unwrap(x: Any) -> Any:
+        if not isinstance(x, StandIn):
+            return x
+        known[id(x.held)] = x
+        return x.held
+
+    def wrap(x: Any) -> Any:
+        if not isinstance(x, Tensor):
+            return x
+        # What an operation changes in place stays the tensor that it was.
+        same = known.get(id(x))
+        if same is not None:
+            return same
+        return StandIn(x) if there else x
+
+    own_args, own_kwargs = pytree.tree_map(unwrap, (args, kwargs))
+    return pytree.tree_map(wrap, func(*own_args, **own_kwargs))
+
+
+def _check(func: Any, args: Any, tensors: Sequence[Tensor]) -> None:
+    if func in INDEXING:
+        tensors = [args[0], *args[2:3]]  # the places may be a CPU's
+    elif func in MIXES:
+        return
+    for x in tensors:
+        # A number may be a CPU's.
+        if not isinstance(x, StandIn) and x.dim() > 0:
+            shapes = [(tuple(one.shape), str(one.device)) for one in tensors]
+            raise Mixed(f"{func} of {shapes}")
+
+
+def _reads(func: Any, args: Any, kwargs: Any) -> bool:
+    """Whether an operation waits for the device."""
+    if func in INDEXING:
+        return any(x is not None and x.dtype == torch.bool for x in args[1])
+    if func is aten._to_copy.default:
+        return kwargs.get("device") is not None and not is_there(kwargs["device"])
+    if func is aten.copy_.default:
+        return not isinstance(args[0], StandIn)
+    return func in READS
+
+
+def note_wait() -> None:
+    """Count a wait within a step, by the place in Aegis, unless a model's own code waits."""
+    frames = [
+        frame
+        for frame in traceback.extract_stack()
+        if "/aegis_cli/" in frame.filename or "/transformers/" in frame.filename
+    ]
+    in_step = any(f.filename.endswith("training/step.py") for f in frames)
+    if in_step and "/transformers/" not in frames[-1].filename:
+        file = frames[-1].filename.rpartition("/aegis_cli/")[2]
+        waits[f"{file}:{frames[-1].name}"] += 1
+
+
+class InReach(TorchDispatchMode):
+    """Within it tensors can be made on the device."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        leaves = pytree.tree_leaves((args, kwargs))
+        if is_there(kwargs.get("device")) or any(isinstance(x, StandIn) for x in leaves):
+            return compute(func, args, kwargs)
+        return func(*args, **kwargs)
+
+
+class _Module(registration._DummyBackendModule if POSSIBLE else object):  # type: ignore[misc]
+    """What PyTorch asks of a device's module."""
+
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16]
+
+    def set_device(self, device: Any) -> None: ...
+
+    def synchronize(self, device: Any = None) -> None: ...
+
+
+@contextlib.contextmanager
+def in_reach() -> Iterator[None]:
+    """Make the device, for the rest of the process, and let Aegis choose it within the block."""
+    from aegis_cli.common import devices
+
+    registration._setup_privateuseone_for_python_backend(NAME, _Module())
+    torch.__future__.set_swap_module_params_on_conversion(True)  # so that a parameter stays itself
+    # Without a view of its own, a tensor of inference mode cannot be of a class of one's own.
+    torch.inference_mode = torch.no_grad  # type: ignore[misc,assignment]
+    makers = torch.tensor, torch.as_tensor
+    torch.tensor, torch.as_tensor = map(_moved_after, makers)
+    _let_threads_reach()
+    _load_outside(makers)
+    devices.pick = lambda: torch.device(NAME, 0)
+    with InReach():
+        yield
+
+
+def _moved_after(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A maker of tensors from numbers, which torch would make out of a mode's sight."""
+
+    def made(data: Any, *args: Any, device: Any = None, **kwargs: Any) -> Tensor:
+        if isinstance(data, StandIn):
+            return data if device is None else data.to(device)
+        if isinstance(data, list | tuple):
+            data = [x.item() if isinstance(x, StandIn) else x for x in data]
+        if not is_there(device):
+            return make(data, *args, **({"device": device} if device else {}), **kwargs)
+        return make(data, *args, **kwargs).to(device)
+
+    return made
+
+
+def _let_threads_reach() -> None:
+    plain = threading.Thread.run
+
+    def run(self: threading.Thread) -> None:
+        with contextlib.nullcontext() if _loading.is_set() else InReach():
+            plain(self)
+
+    threading.Thread.run = run  # type: ignore[method-assign]
+
+
+def _load_outside(makers: Sequence[Callable[..., Tensor]]) -> None:
+    """Let transformers load and save on the CPU, as it would not for wrappers."""
+    from transformers import PreTrainedModel
+
+    load, save = PreTrainedModel.from_pretrained.__func__, PreTrainedModel.save_pretrained
+
+    def loaded(cls: type, *args: Any, **kwargs: Any) -> Any:
+        ours = torch.tensor, torch.as_tensor
+        torch.tensor, torch.as_tensor = makers
+        _loading.set()
+        try:
+            with _disable_current_modes():
+                return load(cls, *args, **kwargs)
+        finally:
+            _loading.clear()
+            torch.tensor, torch.as_tensor = ours
+
+    def saved(self: Any, folder: Any, **kwargs: Any) -> Any:
+        weights = {}
+        for name, x in self.state_dict().items():
+            if name not in (self.all_tied_weights_keys or {}):
+                weights[name] = getattr(x, "held", x).detach().clone()
+        return save(self, folder, state_dict=weights, **kwargs)
+
+    PreTrainedModel.from_pretrained = classmethod(loaded)
+    PreTrainedModel.save_pretrained = saved
+
+
+def main(commands: Path, device: str) -> None:
+    """Run the commands one after the other, and print what each said and where its steps waited."""
+    from aegis_cli.cli.app import app
+
+    found = []
+    with in_reach() if device == NAME else contextlib.nullcontext():
+        for arguments in json.loads(commands.read_text(encoding="utf-8")):
+            waits.clear()
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said):
+                code = app(arguments, standalone_mode=False)
+            if code:  # what went wrong is said on stderr
+                sys.exit(code)
+            found.append({"said": json.loads(said.getvalue()), "waits": dict(waits)})
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2])
