@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, Rotation, additive, block_attention, rotate
+from aegis_cli.models.backbones import compiling
 
 # Shortest and longest period of the flow time's sine features, as in openpi.
 _PERIODS = (4e-3, 4.0)
@@ -134,6 +135,10 @@ class ActionExpert(nn.Module):
         self.layers = nn.ModuleList(ExpertLayer(shape) for _ in range(shape.depth))
         self.final_norm = nn.LayerNorm(width)
         self.action_out = nn.Linear(width, shape.actions)
+
+    def compile_layers(self, backend: str = "inductor") -> None:
+        """Compile the layers, which share what was compiled for the first of them."""
+        compiling.compile_layers(self.layers, backend, keeps_keys=False)
 
     def forward(
         self,

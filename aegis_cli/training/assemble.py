@@ -226,6 +226,7 @@ def build(
     _check_weights(recipe, parts)
     if recipe.train.compile:
         backbone.compile_passes()
+        policy.expert.compile_layers()
     inputs = {"demos": recorded.sha256, "backbone": fingerprint}
     inputs |= _digests(recipe, None if anchor is None else watched.sha256[anchor], source)
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)

@@ -41,6 +41,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
+from aegis_cli.models.expert import ActionExpert
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import assemble, checkpoint, step, train
 
@@ -218,8 +219,9 @@ def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded)
 def test_a_run_with_compiled_layers_trains_alike(
     hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick = functools.partialmethod(HFBackbone.compile_passes, "aot_eager")
-    monkeypatch.setattr(HFBackbone, "compile_passes", quick)
+    for owner, name in ((HFBackbone, "compile_passes"), (ActionExpert, "compile_layers")):
+        quick = functools.partialmethod(getattr(owner, name), "aot_eager")
+        monkeypatch.setattr(owner, name, quick)
     lines = []
     for compiled in (False, True):
         out = tmp_path / str(compiled)
