@@ -122,7 +122,7 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal counts
         task, anchor = rule(tt, ta, aa)
-        counts = counts.to(anchor)  # once: a copy to a GPU waits for it
+        counts = devices.send(counts, anchor.device)
         # A group that is not chosen keeps its task gradient, bit for bit.
         return task, (anchor + restoration) * counts
 

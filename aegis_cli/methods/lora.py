@@ -22,10 +22,13 @@ class LowRankLinear(nn.Module):
         self.base, self.scale = base, alpha / rank
         # The term is small, and so are its steps: half precision would lose them.
         wide = torch.promote_types(base.weight.dtype, torch.float32)
-        self.a = nn.Parameter(base.weight.new_empty(rank, base.in_features, dtype=wide))
+        # Drawn on the CPU, so that a seed begins alike on every device; uniform in +-1/sqrt(in), as
+        # the paper's own code has it.
+        drawn = nn.init.kaiming_uniform_(
+            torch.empty(rank, base.in_features, dtype=wide), a=math.sqrt(5)
+        )
+        self.a = nn.Parameter(drawn.to(base.weight.device))
         self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
-        # This is uniform in +-1/sqrt(in), as the paper's own code has it.
-        nn.init.kaiming_uniform_(self.a, a=math.sqrt(5))
 
     def forward(self, x: Tensor) -> Tensor:
         code = nn.functional.linear(x, self.a.to(x.dtype))  # [..., rank]

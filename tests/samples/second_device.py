@@ -53,6 +53,7 @@ READS = {
 waits: Counter[str] = Counter()
 # Models are loaded on the CPU, by threads of transformers' own.
 _loading = threading.Event()
+_sending = threading.local()  # `on`: what goes to the device now goes by itself
 
 
 class Mixed(RuntimeError):
@@ -124,6 +125,8 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
             note_wait()
     wanted = kwargs.get("device")
     there = bool(of_device) if wanted is None else is_there(wanted)
+    if func is aten._to_copy.default and there and not of_device:
+        note_copy()
     if is_there(wanted):
         kwargs = {**kwargs, "device": torch.device("cpu")}
     known: dict[int, StandIn] = {}
@@ -183,6 +186,23 @@ def note_wait() -> None:
         waits[f"{file}:{frames[-1].name}"] += 1
 
 
+def note_copy() -> None:
+    """Count a copy to the device that waits, as it does unless `devices.send` makes it."""
+    if not getattr(_sending, "on", False):
+        note_wait()
+
+
+def _sent_by_itself(send: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def sent(x: Tensor, device: torch.device) -> Tensor:
+        _sending.on = True
+        try:
+            return send(x, device)
+        finally:
+            _sending.on = False
+
+    return sent
+
+
 class InReach(TorchDispatchMode):
     """Within it tensors can be made on the device."""
 
@@ -202,6 +222,11 @@ class _Module(registration._DummyBackendModule if POSSIBLE else object):  # type
 
     def set_device(self, device: Any) -> None: ...
 
+    def get_rng_state(self, device: Any = None) -> Tensor:
+        return torch.get_rng_state()
+
+    def set_rng_state(self, state: Tensor, device: Any = None) -> None: ...
+
     def synchronize(self, device: Any = None) -> None: ...
 
 
@@ -219,6 +244,10 @@ def in_reach() -> Iterator[None]:
     _let_threads_reach()
     _load_outside(makers)
     devices.pick = lambda: torch.device(NAME, 0)
+    plain, sent = devices.send, _sent_by_itself(devices.send)
+    for module in list(sys.modules.values()):
+        if getattr(module, "send", None) is plain:
+            module.send = sent  # type: ignore[attr-defined]
     with InReach():
         yield
 

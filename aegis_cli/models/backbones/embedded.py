@@ -229,7 +229,7 @@ class EmbeddedVLM(Backbone):
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         ids, mask = self._pad([p + a for p, a in zip(prompts, said, strict=True)])
-        prompt_length = torch.tensor([[len(p)] for p in prompts], device=self.device)
+        prompt_length = send(torch.tensor([[len(p)] for p in prompts]), self.device)
         hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
         scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
         # The scores at a position are those of the token after it.
@@ -273,7 +273,7 @@ class EmbeddedVLM(Backbone):
         """
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
-        row = (begins.cumsum(0) - 1).to(self.device)
+        row = send(begins.cumsum(0) - 1, self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
         found = []
         for key, value in image:
