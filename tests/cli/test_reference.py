@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import typer
+from typer.models import OptionInfo
 
 from aegis_cli.cli import reference
 from aegis_cli.cli.app import app
@@ -44,6 +46,19 @@ def test_every_option_of_a_command_has_a_row() -> None:
         for param in command.params:
             said = param.metavar if param.param_type_name == "argument" else param.opts[0]
             assert re.search(rf"^\| `{re.escape(said)}[ `]", sections[name], re.M)
+
+
+def test_no_option_is_spelled_as_its_metavar() -> None:
+    """As typer 0.27 spelled one of the same letters: `--DEVICE` for `--device DEVICE`."""
+    seen = 0
+    for command in app.registered_commands:
+        hints = get_type_hints(command.callback, include_extras=True)
+        for name, hint in hints.items():
+            for said in getattr(hint, "__metadata__", ()):
+                if isinstance(said, OptionInfo) and (said.metavar or "").lower() == name:
+                    assert said.param_decls == (f"--{name}",), (command.callback, name)
+                    seen += 1
+    assert seen > 10
 
 
 def test_links_within_the_page_lead_to_its_headings() -> None:
