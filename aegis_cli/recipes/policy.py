@@ -340,8 +340,8 @@ class Train:
     )
     compile: bool = key(
         default=False,
-        doc="Compile backbone and expert with torch.compile: of a Hugging Face backbone its layers, "
-        "with prompts padded to multiples of 32 tokens.",
+        doc="Compile backbone and expert with torch.compile: of a Hugging Face backbone its "
+        "layers, with prompts padded to multiples of 32 tokens.",
     )
     accumulate: int = key(
         POSITIVE,

@@ -56,7 +56,8 @@ def test_no_option_is_spelled_as_its_metavar() -> None:
         for name, hint in hints.items():
             for said in getattr(hint, "__metadata__", ()):
                 if isinstance(said, OptionInfo) and (said.metavar or "").lower() == name:
-                    assert said.param_decls == (f"--{name}",), (command.callback, name)
+                    given = said.default, *said.param_decls  # typer takes the first name there
+                    assert f"--{name}" in given, (command.callback, name)
                     seen += 1
     assert seen > 10
 
