@@ -415,6 +415,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("aegis-trial", 150, 150),
         ("merges", 34, 34),
         ("plateau", 12, 12),
+        ("rivals", 139, 139),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
