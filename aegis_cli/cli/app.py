@@ -1085,7 +1085,7 @@ def bench(
     --latency times a trained policy alone, from pictures to actions, one observation at a time.
 
     --shape makes a Hugging Face model of true size from its configuration, with random weights and
-    without a download. It measures each method and each part of an anchor in a process of its own,
+    without a download. It measures each method and each part of an anchor one after the other,
     and says which share of the device's peak a step reaches (MFU).
 
     \b

@@ -275,11 +275,12 @@ def test_shares_without_numbers_are_the_same(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_weight_that_is_a_tensor_gives_the_same_bits(dtype: torch.dtype) -> None:
+def test_a_weight_that_is_a_tensor_rounds_once_more_at_most(dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(0)
     task, anchor = torch.randn(2, 4099, generator=generator, dtype=dtype)
     for weight in (0.37, 1e-5, 12345.678):
         (one,) = projection.apply([task.clone()], [anchor], 1.0, weight)
         wa = torch.tensor(weight, dtype=torch.float64)
         (other,) = projection.apply([task.clone()], [anchor], torch.tensor(1.0), wa)
-        assert torch.equal(one, other)  # type: ignore[arg-type]
+        rounding = torch.finfo(dtype).eps * ((weight * anchor).abs() + one.abs())
+        assert ((one - other).abs() <= rounding).all()
