@@ -456,6 +456,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "merges",
         "plateau",
         "rivals",
+        "metaworld-study",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(
