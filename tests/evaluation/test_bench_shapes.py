@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -67,6 +68,12 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     assert found.precision == "float32" and found.clock == "cpu" and found.assumed is None
     assert json.loads(json.dumps(found.to_json()))["methods"]["naive"]["step_time"] == 1
     assert "peak not known" in shown(found) and "CPU seconds" in shown(found)
+
+
+def test_on_a_cpu_each_measurement_has_a_process_of_its_own() -> None:
+    with bench_shapes._Processes() as processes:
+        found = {processes.run(os.getpid), processes.run(os.getpid), os.getpid()}
+    assert len(found) == 3
 
 
 def test_what_does_not_fit_has_dashes_and_the_rest_goes_on(

@@ -29,7 +29,7 @@ def build(name: str, seed: int = 0) -> HFBackbone:
     """The model of that shape in float32, on the device that is chosen.
 
     As those of the hub's models, its weights are numbers in bfloat16. On a device equal seeds give
-    equal weights. A GPU draws the billions of them in a second, which takes a CPU a minute.
+    equal weights. A GPU draws them itself, for a CPU takes long over billions.
 
     Raises:
         AegisError: no such shape.
