@@ -8,7 +8,7 @@ from pathlib import Path
 from aegis_cli.cli import render
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import Recipe, StreamStudyRecipe, StudyRecipe, options
+from aegis_cli.recipes import AnyStudy, Recipe, RobotStreamStudyRecipe, StreamStudyRecipe, options
 from aegis_cli.recipes.study_cells import cell
 
 _SCENES = "scenes"
@@ -34,12 +34,16 @@ def of_training(recipe: Recipe, anchor: Path | None) -> None:
     of_questions(recipe.backbone, _measured_on(anchor), _trained_on(recipe))
 
 
-def of_run(recipe: Recipe | StudyRecipe | StreamStudyRecipe) -> None:
+def of_run(recipe: Recipe | AnyStudy) -> None:
     """Warn of what a recipe's anchors and probes ask; streams of images have none."""
     if isinstance(recipe, StreamStudyRecipe):
         return
     if isinstance(recipe, Recipe):
         of_questions(recipe.backbone, *_asked(recipe))
+        return
+    if isinstance(recipe, RobotStreamStudyRecipe):
+        one = cell(recipe, next(iter(recipe.variants)), recipe.tasks, recipe.seeds[0])
+        of_questions(one.backbone, one.probe.vqa)
         return
     place, seed = recipe.tasks[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():

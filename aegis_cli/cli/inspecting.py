@@ -114,7 +114,7 @@ def _table(folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
 
 def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
     """A table of `aegis run`, and a study's frontier."""
-    from aegis_cli.studies.comparison import StudyReport
+    from aegis_cli.studies.comparison import RobotStreamStudyReport, StudyReport
     from aegis_cli.studies.pipeline import PipelineReport
 
     if plot is not None and not isinstance(report, StudyReport):
@@ -123,7 +123,11 @@ def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bo
         raise AegisError(found, expected, "leave out --plot")
     if plot is not None:
         render.frontier_plot(report, plot)
-    views = {PipelineReport: render.pipeline, StudyReport: render.study}
+    views = {
+        PipelineReport: render.pipeline,
+        StudyReport: render.study,
+        RobotStreamStudyReport: render.robot_stream_study,
+    }
     render.show(report, views.get(type(report), render.stream_study), as_json, wide)
 
 

@@ -22,6 +22,7 @@ from aegis_cli.recipes import (
     PretrainRecipe,
     Recipe,
     RobotStreamRecipe,
+    RobotStreamStudyRecipe,
     StreamRecipe,
     StreamStudyRecipe,
     StudyRecipe,
@@ -131,6 +132,7 @@ RUN: dict[type, Stage] = {
     Recipe: Stage("studies.pipeline", render.pipeline, shared=True),
     StudyRecipe: Stage("studies.study", render.study),
     StreamStudyRecipe: Stage("studies.study", render.stream_study),
+    RobotStreamStudyRecipe: Stage("studies.study", render.robot_stream_study),
 }
 
 

@@ -45,7 +45,7 @@ from aegis_cli.models.structure import digest
 from aegis_cli.recipes import Demos, RobotStreamRecipe
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.training import assemble, train
-from aegis_cli.training.up_to_date import StageRecords
+from aegis_cli.training.up_to_date import Made, StageRecords
 
 # Training frames, evenly spaced, on which routers are measured, always with the same noise.
 CALIBRATION_FRAMES = 32
@@ -455,13 +455,18 @@ def _demos(
 
 def _demos_path(recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent) -> Path:
     """Where a task's demonstrations lie; they are recorded if the recipe names no file."""
-    settings = recipe.demos
-    if settings.paths is not None:
-        return Path(settings.paths[number])
-    asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
+    if recipe.demos.paths is not None:
+        return Path(recipe.demos.paths[number])
     home = out.parent / "demos"
     make_folder(home)
-    return StageRecords(home, on_event).demonstrations(recipe.tasks[number], asked).path
+    return record(recipe, number, StageRecords(home, on_event)).path
+
+
+def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
+    """The demonstrations of one task, recorded as the recipe says unless they are there."""
+    settings = recipe.demos
+    asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
+    return records.demonstrations(recipe.tasks[number], asked)
 
 
 def share(
@@ -564,7 +569,8 @@ class RobotEvaluator:
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
         # settings are chosen by other questions than those that figures are of
         part = "validation" if run.recipe.rollout.split == "validation" else "probe"
-        self._asked = source.choose(part, count, probe.PROBE_SEED, [check], on_event)
+        seed = run.recipe.probe.seed
+        self._asked = source.choose(part, count, seed, [check], on_event)
 
     def row(self, done: int) -> list[float]:
         """S[t, :] after tasks 0 to t = `done`, of these alone."""
@@ -584,6 +590,7 @@ class RobotEvaluator:
             settings.replan,
             split,
             on_event=self._named(name),
+            seed=settings.seed,
         )
         share = found.return_share if found.success is None else found.success
         assert share is not None

@@ -10,17 +10,14 @@ from aegis_cli.recipes.policy import Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import did_you_mean, line_of
-from aegis_cli.recipes.studies import StreamStudyRecipe, StudyRecipe
-
-AnyRecipe = (
-    Recipe
-    | StreamRecipe
-    | RobotStreamRecipe
-    | StudyRecipe
-    | StreamStudyRecipe
-    | PretrainRecipe
-    | DualRecipe
+from aegis_cli.recipes.studies import (
+    AnyStudy,
+    RobotStreamStudyRecipe,
+    StreamStudyRecipe,
+    StudyRecipe,
 )
+
+AnyRecipe = Recipe | StreamRecipe | RobotStreamRecipe | AnyStudy | PretrainRecipe | DualRecipe
 
 
 class Kind(NamedTuple):
@@ -43,6 +40,9 @@ KINDS: dict[str, Kind] = {
     "stream": Kind(StreamRecipe, "a stream of tasks, a recipe", ("train",)),
     "robot-stream": Kind(RobotStreamRecipe, "a stream of robot tasks, a recipe", ("train",)),
     "stream-study": Kind(StreamStudyRecipe, "a study of several runs, a recipe", ("run",)),
+    "robot-stream-study": Kind(
+        RobotStreamStudyRecipe, "a study of several runs, a recipe", ("run",)
+    ),
     "pretrain": Kind(PretrainRecipe, "a recipe", ("pretrain",)),
     "pretrain-dual": Kind(DualRecipe, "a recipe", ("pretrain",)),
 }

@@ -169,7 +169,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     if isinstance(recipe, RobotStreamRecipe):
         everything = dataclasses.asdict(recipe)
         own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
-        return {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
+        part = {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
+        return part | {"rollout": recorded(recipe.rollout)}
     if isinstance(recipe, StreamRecipe):
         shared = (
             "stream",

@@ -139,6 +139,9 @@ class RobotRollout:
     """How success is measured after each task of a stream."""
 
     episodes: int = key(POSITIVE, 50, doc="Number of episodes per task.")
+    seed: int = key(
+        SEED, 0, later=True, doc="Seed of the episodes, none of which is a demonstration's."
+    )
     colors: str = key(
         choice(*COLOR_SETS), "seen", doc="Set of colours that the targets are drawn from."
     )

@@ -18,10 +18,11 @@ from aegis_cli.recipes.keys import (
     section,
 )
 from aegis_cli.recipes.policy import METHODS, TASK
-from aegis_cli.recipes.streams import LEARNERS
+from aegis_cli.recipes.streams import LEARNERS, ROBOT_LEARNERS
 
 # what a study may draw anew with every seed -> the section of a recipe whose seed that is
 PER_SEED = {"demos": "demos", "anchor": "anchor", "questions": "probe", "episodes": "rollout"}
+_NO_ANCHOR = [name for name in PER_SEED if name != "anchor"]
 _SOME = Check("at least one", bool)
 
 
@@ -191,3 +192,56 @@ class StreamStudyRecipe:
     keep_runs: bool = key(
         default=False, doc="Keep the run folders of streams that have been measured."
     )
+
+
+@section
+class RobotStreamVariant(Variant):
+    """A learner with some keys of its own, and the knobs that are tuned, if any."""
+
+    method: str = key(choice(*ROBOT_LEARNERS), doc="Learner of the variant.")
+
+
+@section
+class RobotStreamTuning:
+    """How each variant's knob is chosen.
+
+    Among the values whose success on all tasks, on validation episodes after the last task, is near
+    its best, it is the one with the highest VQA accuracy.
+    """
+
+    seed: int = key(
+        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+    )
+    within: float = key(
+        NOT_NEGATIVE,
+        3.0,
+        doc="How far from its best success a value may be, in percentage points.",
+    )
+
+
+@section
+class RobotStreamStudyRecipe:
+    """Compares learners over seeds on one stream of robot tasks, each at the best of its knobs."""
+
+    name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
+    tasks: tuple[str, ...] = key(TASK, doc="Tasks in the order in which they are learned.")
+    seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
+    variants: dict[str, RobotStreamVariant] = key(
+        _SOME, doc="What is compared: a name for each variant."
+    )
+    shared: dict[str, Any] = key(
+        factory=dict, doc="Keys of a recipe of kind robot-stream, for every training."
+    )
+    tuning: RobotStreamTuning | None = None
+    per_seed: tuple[str, ...] | None = key(
+        choice(*_NO_ANCHOR),
+        None,
+        doc="What is drawn anew with every seed. What is not named is one and the same for all "
+        "seeds: an interval says nothing of others then.",
+    )
+    keep_runs: bool = key(
+        default=False, doc="Keep the run folders of streams that have been measured."
+    )
+
+
+AnyStudy = StudyRecipe | StreamStudyRecipe | RobotStreamStudyRecipe

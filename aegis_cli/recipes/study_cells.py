@@ -12,8 +12,13 @@ from typing import Any, overload
 from aegis_cli import recipes
 from aegis_cli.recipes import (
     AnyRecipe,
+    AnyStudy,
     PolicyVariant,
     Recipe,
+    RobotStreamRecipe,
+    RobotStreamStudyRecipe,
+    RobotStreamTuning,
+    RobotStreamVariant,
     StreamRecipe,
     StreamStudyRecipe,
     StreamTuning,
@@ -47,6 +52,7 @@ class _CellRules:
     Attributes:
         recipe: the kind of a cell's recipe.
         place: the recipe's key for what variants are measured on; `places` is the study's.
+        listed: whether all that the study names there are one place, a stream of these tasks.
         given: a recipe's keys that the study gives each cell -> the study's own keys for them.
         for_all: further keys that no variant may set, since all share them.
         references: a variant that others are measured against -> the method that it has to have.
@@ -63,16 +69,15 @@ class _CellRules:
     given: Mapping[str, str]
     for_all: tuple[str, ...]
     references: Mapping[str, str]
-    any_place: str
+    any_place: str | Sequence[str]
     tuning_seed: int
     tuning_keys: str
     together: Callable[[Any], Iterable[Problem]]
     problems: Callable[[Mapping[str, Any]], Iterable[Problem]]
+    listed: bool = False
 
 
-def load(
-    path: str | Path, overrides: Sequence[str] = ()
-) -> Recipe | StudyRecipe | StreamStudyRecipe:
+def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | AnyStudy:
     """What `aegis run` takes: a recipe, or a study of tasks or of streams.
 
     Raises:
@@ -82,7 +87,7 @@ def load(
     path = Path(path)
     raw, problems = recipes.read(path)
     kind = recipes.take_kind(raw, path)
-    if kind not in (StudyRecipe, StreamStudyRecipe):
+    if kind not in _CELL_RULES:
         return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
@@ -102,13 +107,23 @@ def cell(
 ) -> StreamRecipe: ...
 
 
+@overload
 def cell(
-    study: StudyRecipe | StreamStudyRecipe, variant: str, place: str, seed: int, value: Any = None
-) -> Recipe | StreamRecipe:
+    study: RobotStreamStudyRecipe,
+    variant: str,
+    place: Sequence[str],
+    seed: int,
+    value: Any = None,
+) -> RobotStreamRecipe: ...
+
+
+def cell(
+    study: AnyStudy, variant: str, place: str | Sequence[str], seed: int, value: Any = None
+) -> Recipe | StreamRecipe | RobotStreamRecipe:
     """The recipe of one training.
 
     Args:
-        place: the task or stream.
+        place: the task or stream; of a stream of robot tasks its tasks.
         value: what the variant's knob is set to, if it has one.
 
     Raises:
@@ -122,7 +137,7 @@ def cell(
     raw |= {"name": study.name, rules.place: place, "seed": seed}
     for dotted in _drawn(study):
         put(raw, dotted, seed)
-    made: Recipe | StreamRecipe = build(rules.recipe, raw, problems)
+    made: Recipe | StreamRecipe | RobotStreamRecipe = build(rules.recipe, raw, problems)
     refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
     return made
 
@@ -135,7 +150,7 @@ def load_any(path: str | Path) -> AnyRecipe:
     """
     path = Path(path)
     kind = recipes.take_kind(recipes.read(path)[0], path)
-    return load(path) if kind in (StudyRecipe, StreamStudyRecipe) else recipes.load(path, kind=kind)
+    return load(path) if kind in _CELL_RULES else recipes.load(path, kind=kind)
 
 
 def written_out(recipe: AnyRecipe) -> dict[str, Any]:
@@ -144,13 +159,13 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     A study's `shared` has every key of its cells' recipes that the study does not give them.
     """
     plain = {"kind": recipes.name_of(type(recipe)), **_plain(recipe)}
-    if not isinstance(recipe, StudyRecipe | StreamStudyRecipe):
+    if not isinstance(recipe, AnyStudy):
         return plain
     rules = _CELL_RULES[type(recipe)]
     given = {"name": "cell", rules.place: rules.any_place}
     shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
-    del shared["train"]["method"]
-    for dotted in _drawn(recipe):
+    given_below = [dotted for dotted in rules.given if "." in dotted]
+    for dotted in (*given_below, *_drawn(recipe)):
         section, name = dotted.split(".")
         del shared[section][name]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
@@ -188,8 +203,9 @@ def _check(
     readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
-    places = _readable(raw.get(rules.places)) if rules.recipe is Recipe else []
-    given = [{"name": "cell", rules.place: place} for place in places or [rules.any_place]]
+    places = [] if rules.recipe is StreamRecipe else _readable(raw.get(rules.places))
+    checked = [places] if rules.listed and places else places or [rules.any_place]
+    given = [{"name": "cell", rules.place: place} for place in checked]
     problems += variants.cell_problems(
         rules.recipe,
         raw.get("shared", {}),
@@ -205,9 +221,9 @@ def _check(
     return readable
 
 
-def _drawn(study: StudyRecipe | StreamStudyRecipe) -> list[str]:
+def _drawn(study: AnyStudy) -> list[str]:
     """The keys of a cell's recipe that are its seed, in a study that has been read."""
-    return _per_seed(study.per_seed or ()) if isinstance(study, StudyRecipe) else []
+    return [] if isinstance(study, StreamStudyRecipe) else _per_seed(study.per_seed or ())
 
 
 def _per_seed(names: Iterable[str]) -> list[str]:
@@ -228,12 +244,13 @@ def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """Demonstrations that are given are the same with every seed."""
     shared, names = raw.get("shared"), raw.get("per_seed")
     settings = shared.get("demos") if isinstance(shared, dict) else None
-    path = settings.get("path") if isinstance(settings, dict) else None
-    if path is None or not isinstance(names, list) or "demos" not in names:
+    given = settings if isinstance(settings, dict) else {}
+    named = [key for key in ("path", "paths") if given.get(key) is not None]
+    if not named or not isinstance(names, list) or "demos" not in names:
         return []
     return [
         Problem(
-            f"per_seed: demos with shared: demos.path: {path}",
+            f"per_seed: demos with shared: demos.{named[0]}: {given[named[0]]}",
             "demonstrations that are recorded, to have others with every seed",
             "take demos out of per_seed: the seeds still hold out other episodes",
         )
@@ -351,5 +368,26 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         tuning_keys="stream, seed, within",
         together=recipes.cross_checks,
         problems=_pair_problems,
+    ),
+    RobotStreamStudyRecipe: _CellRules(
+        recipe=RobotStreamRecipe,
+        variant=RobotStreamVariant,
+        place="tasks",
+        places="tasks",
+        listed=True,
+        given={
+            "name": "name",
+            "tasks": "tasks",
+            "seed": "seeds",
+            "train.method": "variants",
+            "rollout.split": "tuning",
+        },
+        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors"),
+        references={ISOLATED: "isolated-lora"},
+        any_place=("reach",),
+        tuning_seed=RobotStreamTuning().seed,
+        tuning_keys="seed, within",
+        together=recipes.cross_checks,
+        problems=_drawn_problems,
     ),
 }

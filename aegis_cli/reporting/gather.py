@@ -19,6 +19,11 @@ from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.recipes.study_cells import written_out
 from aegis_cli.studies import table
+from aegis_cli.studies.comparison import (
+    RobotStreamStudyReport,
+    StreamStudyReport,
+    StudyReport,
+)
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
 
@@ -92,7 +97,7 @@ class JobDocument:
 
 @dataclass(frozen=True)
 class StudyDocument:
-    """A study as far as it is finished. `kind` is `study`, or `stream-study`."""
+    """A study as far as it is finished. `kind` is that of its recipe, such as `study`."""
 
     kind: str
     path: str
@@ -115,6 +120,12 @@ class StreamDocument:
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
+
+_STUDIES: dict[type, str] = {
+    StudyReport: "study",
+    StreamStudyReport: "stream-study",
+    RobotStreamStudyReport: "robot-stream-study",
+}
 
 Document = RunDocument | JobDocument | StudyDocument | StreamDocument
 
@@ -147,9 +158,8 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
 def _of_table(path: Path) -> Document:
     found = table.load(path)
     if not isinstance(found, PipelineReport):
-        streams = hasattr(found, "streams")
         again = _command("aegis", "run", "RECIPE", "--out", path.parent)
-        return StudyDocument("stream-study" if streams else "study", str(path), found, [again])
+        return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
     runs = [run_document(path / row.method) for row in found.rows]
     # Each method's recipe names all methods of the job, with every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"

@@ -20,7 +20,7 @@ from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.common.processes import SPAWN, WorkerPool, threads_per_worker
-from aegis_cli.recipes import Recipe, StreamRecipe, StreamStudyRecipe, StudyRecipe
+from aegis_cli.recipes import AnyStudy, Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.studies.comparison import Cost, Findings, Report
 from aegis_cli.studies.decoding import Misfit, decode
 from aegis_cli.studies.figures import Divergence, Figures, Outcome
@@ -29,7 +29,7 @@ from aegis_cli.studies.tuning import Point, Rule
 CELLS = "cells.json"
 _LISTEN_S = 0.2  # between looks at what the processes report
 _FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
-CellRecipe = Recipe | StreamRecipe
+CellRecipe = Recipe | StreamRecipe | RobotStreamRecipe
 Entry = TypeVar("Entry")
 
 
@@ -67,7 +67,7 @@ MakeRunner = Callable[[Path, OnEvent], CellRunner]
 
 
 class StudyKind(Protocol):
-    """Policies on tasks, or learners on streams.
+    """Policies on tasks, or learners on streams, of images or of robot tasks.
 
     Attributes:
         recipe: the study, with `variants`, `seeds`, `tuning` and `keep_runs`.
@@ -78,7 +78,7 @@ class StudyKind(Protocol):
         tunes_fixed: whether variants without a choice are measured with the tuned ones.
     """
 
-    recipe: StudyRecipe | StreamStudyRecipe
+    recipe: AnyStudy
     places: Sequence[str]
     figures: type[Figures]
     make_runner: MakeRunner

@@ -18,7 +18,13 @@ from typing import Annotated, Any
 from aegis_cli.evaluation.bootstrap import Units
 from aegis_cli.recipes import Pairs, PolicyVariant, Variant
 from aegis_cli.recipes.study_cells import HALF, ISOLATED, NAIVE, ZERO_SHOT
-from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, StreamFigures
+from aegis_cli.studies.figures import (
+    Divergence,
+    Outcome,
+    PolicyFigures,
+    RobotStreamFigures,
+    StreamFigures,
+)
 from aegis_cli.studies.metrics import (
     Bar,
     Column,
@@ -35,9 +41,10 @@ from aegis_cli.studies.metrics import (
     bar,
     lowest,
     measure,
+    over_seeds,
     ratio,
 )
-from aegis_cli.studies.tuning import PolicyPoint, StreamPoint
+from aegis_cli.studies.tuning import PolicyPoint, RobotStreamPoint, StreamPoint
 
 
 def _gain(
@@ -634,4 +641,164 @@ def _samples(
     return samples
 
 
-Report = StudyReport | StreamStudyReport
+# --- robot streams --------------------------------------------------------------------------------
+
+
+def _right_after_learning(figures: RobotStreamFigures) -> float:
+    return statistics.fmean(row[-1] for row in figures.success)
+
+
+def _vqa_at_the_end(figures: RobotStreamFigures) -> float:
+    return figures.vqa[-1]
+
+
+def _forgotten_points(figures: RobotStreamFigures) -> float | None:
+    return None if figures.forgetting is None else 100 * figures.forgetting
+
+
+def _lost_at_the_end(figures: RobotStreamFigures) -> float:
+    return 100 * (figures.vqa[0] - figures.vqa[-1])
+
+
+@dataclass(frozen=True)
+class AfterTask:
+    """A variant after one more task of the stream: means over seeds.
+
+    Attributes:
+        task: the task that has just been learned.
+        success: a share in [0, 1] for each task so far, this one included.
+        drop_points: VQA accuracy lost since before the first task, in percentage points.
+    """
+
+    task: str
+    success: list[Mean]
+    drop_points: Mean
+
+
+@dataclass(frozen=True)
+class RobotStreamResult:
+    """One variant on a stream of robot tasks, over seeds.
+
+    Attributes:
+        diverged: the seeds whose training did, which no mean counts.
+        last, average: success on all tasks after the last one, and over the whole triangle.
+        learned: success on each task right after it was learned, mean over tasks.
+        forgetting: of success; None for a single task.
+        accuracy, drop_points: VQA after the last task, and what of it was lost since before the
+            first.
+        parameters: numbers stored at the end beside the bare backbone.
+        trained_mean: parameters that learn, mean over steps and tasks.
+        reuse: routing mass on experts of earlier tasks.
+        last_gain_points, parameters_ratio: against the variant isolated-lora of the same seed.
+        after: the matrix of success, and VQA beside it, task by task.
+    """
+
+    variant: str
+    method: str
+    knob: str | None
+    value: Any
+    diverged: list[int]
+    last: Annotated[Mean, Metric("Success at the end %", 1, percent=True, more_is_better=True)]
+    learned: Annotated[
+        Mean,
+        Metric(
+            "Right after learning %",
+            1,
+            percent=True,
+            of=_right_after_learning,
+            more_is_better=True,
+        ),
+    ]
+    average: Annotated[Mean, Metric("Average %", 1, percent=True, more_is_better=True)]
+    forgetting: Annotated[
+        Mean, Metric("Forgetting (points)", 1, of=_forgotten_points, more_is_better=False)
+    ]
+    accuracy: Annotated[
+        Mean, Metric("VQA %", 1, percent=True, of=_vqa_at_the_end, more_is_better=True)
+    ]
+    drop_points: Annotated[
+        Mean, Metric("VQA lost (points)", 2, of=_lost_at_the_end, more_is_better=False)
+    ]
+    parameters: Annotated[Mean, Metric("Final parameters")]
+    parameters_ratio: Annotated[
+        Mean,
+        Contrast(
+            "x isolated LoRA's", 2, of=attrgetter("parameters"), against=ISOLATED, compare=ratio
+        ),
+    ]
+    trained_mean: Annotated[Mean, Metric("Trained, mean of steps")]
+    reuse: Annotated[Mean, Metric("Mass on history %", 1, percent=True)]
+    minutes: Annotated[Mean, Metric("Minutes", 1)]
+    last_gain_points: Annotated[
+        Mean, _gain("At the end - isolated LoRA's (points)", "last", ISOLATED, 1)
+    ]
+    after: list[AfterTask]
+
+
+@dataclass(frozen=True)
+class RobotStreamStudyReport:
+    """A study of a stream of robot tasks so far, also written to `table.json`.
+
+    `finished` of `cells` runs are measured.
+    """
+
+    name: str
+    finished: int
+    cells: int
+    tasks: list[str]
+    seeds: list[int]
+    results: list[RobotStreamResult]
+    within: float | None
+    tuning: list[RobotStreamPoint]
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def robot_stream_results(
+    found: Mapping[str, Mapping[Setting, Outcome]],
+    variants: Mapping[str, Variant],
+    values: Mapping[str, Any],
+    tasks: Sequence[str],
+) -> list[RobotStreamResult]:
+    """One result per variant.
+
+    Args:
+        found: variant -> place and seed -> what that run led to.
+        values: variant -> what its knob is set to.
+        tasks: of the stream, in their order.
+    """
+    samples = {
+        name: Sample({run: row for run, row in own.items() if measured(row)})
+        for name, own in found.items()
+    }
+    return [
+        RobotStreamResult(
+            variant=name,
+            method=variants[name].method,
+            knob=variants[name].knob,
+            value=values.get(name),
+            diverged=sorted(seed for (_, seed), row in own.items() if not measured(row)),
+            **measure(RobotStreamResult, samples[name], samples),
+            after=_task_by_task(samples[name], tasks),
+        )
+        for name, own in found.items()
+    ]
+
+
+def _task_by_task(sample: Sample, tasks: Sequence[str]) -> list[AfterTask]:
+    """The variant's means after each task."""
+    cells = sample.figures.items()
+    rows = []
+    for t, task in enumerate(tasks):
+        success = [
+            over_seeds({setting: figures.success[t][i] for setting, figures in cells})
+            for i in range(t + 1)
+        ]
+        lost = {run: 100 * (figures.vqa[0] - figures.vqa[t + 1]) for run, figures in cells}
+        rows.append(AfterTask(task, success, over_seeds(lost)))
+    return rows
+
+
+Report = StudyReport | StreamStudyReport | RobotStreamStudyReport

@@ -121,6 +121,37 @@ class StreamFigures:
 
 
 @dataclass(frozen=True)
+class RobotStreamFigures:
+    """One stream of robot tasks, learned once.
+
+    Shares in [0, 1]; Average, Last and forgetting are of success, with the task told.
+
+    Attributes:
+        success: row t with t + 1 entries: success on each task so far after task t.
+        vqa: VQA accuracy with no task active, before the first task and after each; `cross_entropy`
+            in nats likewise.
+        parameters: numbers stored beside the bare backbone at the end.
+        trained_mean: parameters that learned, mean over all steps and tasks.
+        reuse: routing mass on experts of earlier tasks; None without experts, or with one task.
+        minutes: time of training and evaluation.
+        code: version and digest of the package that measured the cell.
+    """
+
+    method: str
+    success: tuple[tuple[float, ...], ...]
+    average: float
+    last: float
+    forgetting: float | None
+    vqa: tuple[float, ...]
+    cross_entropy: tuple[float, ...]
+    parameters: int
+    trained_mean: float
+    reuse: float | None
+    minutes: float
+    code: str | None = None
+
+
+@dataclass(frozen=True)
 class Divergence:
     """A training that met a number that is not finite, after so many good steps.
 
@@ -130,5 +161,5 @@ class Divergence:
     good_steps: int
 
 
-Figures = PolicyFigures | StreamFigures
+Figures = PolicyFigures | StreamFigures | RobotStreamFigures
 Outcome = Figures | Divergence

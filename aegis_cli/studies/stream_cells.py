@@ -1,19 +1,16 @@
-"""The cells of a study of streams: an interrupted one goes on, if it is still the same."""
+"""The cells of a study of streams of images: learners on streams, and what they lead to."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
-from aegis_cli.common import files
-from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
-from aegis_cli.continual import images, learners, train
+from aegis_cli.continual import images, learners
 from aegis_cli.continual.report import ImageStreamReport
 from aegis_cli.recipes import (
     TEST,
@@ -26,11 +23,9 @@ from aegis_cli.recipes import (
 from aegis_cli.studies.cells import Cell, CellStore
 from aegis_cli.studies.comparison import Findings, StreamStudyReport, stream_results
 from aegis_cli.studies.figures import Divergence, StreamFigures
+from aegis_cli.studies.stream_runs import StreamRuns
 from aegis_cli.studies.tuning import STREAM_RULE, StreamPoint
-from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import digest
-
-_BEGUN = ".begun"  # ends the name of the note beside a run that a study has started
 
 
 class StreamStudy:
@@ -117,14 +112,11 @@ class StreamStudy:
         )
 
 
-class StreamRunner:
-    """Learns cells; a label is a run's place below the folder: `primer-1/igsp/0`.
-
-    Beside a run lies a note of what it was begun with.
-    """
+class StreamRunner(StreamRuns):
+    """Learns the cells of streams of images."""
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
-        self.folder, self.on_event = folder, on_event
+        super().__init__(folder, on_event)
         self._fingerprints: dict[str, str] = {}
         self._image_sets: dict[tuple[Any, ...], str] = {}
 
@@ -141,38 +133,13 @@ class StreamRunner:
             self._image_sets[which] = images.image_set(recipe)
         return cell_key(cell, self._fingerprints[recipe.encoder], self._image_sets[which])
 
-    def begin_anew(self) -> None:
-        """Let every stream be learned again; that a study began its run is remembered."""
-        for note in self.folder.rglob(f"*{_BEGUN}"):
-            files.write_text(note, "")
+    def learned(self, cell: Cell) -> StreamRecipe:
+        """The recipe that is learned, on validation parts if the cell is of the tuning."""
+        return dataclasses.replace(cell.recipe, split=VALIDATION if cell.validation else TEST)
 
-    def measure(self, cell: Cell) -> StreamFigures | Divergence:
-        """Learn the stream. One that diverges is a finding."""
-        out, key = self.folder / cell.label, self.key(cell)
-        recipe = dataclasses.replace(cell.recipe, split=VALIDATION if cell.validation else TEST)
-        begun = _note(out).exists()
-        same = begun and _note(out).read_text(encoding="utf-8") == key
-        if not same or _named_otherwise(out, recipe):
-            run_folder.clear(out, ours=begun)
-            files.make_folder(out.parent)
-            files.write_text(_note(out), key)
-
-        def named(event: Any) -> None:
-            self.on_event(dataclasses.replace(event, stage=f"{cell.label}/{event.stage}"))
-
-        try:
-            return stream_figures(train.run(recipe, out, resume=True, on_event=named))
-        except Diverged as end:
-            return Divergence(end.good_steps)
-
-    def clear(self, label: str) -> None:
-        """Remove a run, its note, and the folders that are empty then."""
-        out = self.folder / label
-        shutil.rmtree(out, ignore_errors=True)
-        _note(out).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # other runs are there
-            for folder in out.parents[: len(Path(label).parts) - 1]:
-                folder.rmdir()
+    def figures(self, report: ImageStreamReport) -> StreamFigures:
+        """The figures of a learned stream that studies compare."""
+        return stream_figures(report)
 
 
 def cell_key(cell: Cell, fingerprint: str, image_set: str) -> str:
@@ -232,15 +199,3 @@ def stream_figures(report: ImageStreamReport) -> StreamFigures:
         first_change=report.oracle[-1][0] - report.oracle[0][0],
         minutes=report.minutes,
     )
-
-
-def _named_otherwise(out: Path, recipe: StreamRecipe) -> bool:
-    """Whether a run of the same key cannot go on all the same.
-
-    Its recipe tells where the encoder lay, the key does not.
-    """
-    return (out / "recipe.yaml").exists() and not run_folder.goes_on(out, recipe)
-
-
-def _note(out: Path) -> Path:
-    return out.with_name(f"{out.name}{_BEGUN}")

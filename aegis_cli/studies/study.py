@@ -21,12 +21,13 @@ from typing import Any
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.recipes import StreamStudyRecipe, StudyRecipe
+from aegis_cli.recipes import AnyStudy, RobotStreamStudyRecipe, StudyRecipe
 from aegis_cli.studies.cells import CELLS, Cell, CellStore, StudyKind
 from aegis_cli.studies.comparison import Findings, Report
 from aegis_cli.studies.figures import Outcome
 from aegis_cli.studies.metrics import Setting
 from aegis_cli.studies.policy_cells import PolicyStudy
+from aegis_cli.studies.robot_stream_cells import RobotStreamStudy
 from aegis_cli.studies.stream_cells import StreamStudy
 from aegis_cli.studies.tuning import choose
 
@@ -34,7 +35,7 @@ Trials = Mapping[str, list[tuple[Any, Cell]]]  # variant -> its knob's values an
 
 
 def run(
-    study: StudyRecipe | StreamStudyRecipe,
+    study: AnyStudy,
     root: Path,
     on_event: OnEvent = ignore,
     workers: int = 1,
@@ -55,7 +56,7 @@ def run(
         AegisError: a cell that is no recipe (before any work), another process that is at the
             folder, or whatever a stage finds wrong.
     """
-    kind: StudyKind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
+    kind = kind_of(study)
     tried = trials(kind)
     kind.check([cell.recipe for own in tried.values() for _, cell in own])
     folder = Path(root) / study.name
@@ -66,7 +67,7 @@ def run(
         return _run(kind, tried, store)
 
 
-def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent = ignore) -> Report:
+def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
     """What a study's finished cells say, without anything being measured.
 
     Variants that have not been tuned to the end are left out, unless all are.
@@ -77,7 +78,7 @@ def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent 
     Raises:
         AegisError: no cells, or none of this study.
     """
-    kind: StudyKind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
+    kind = kind_of(study)
     with tempfile.TemporaryDirectory() as aside:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
@@ -92,6 +93,15 @@ def told(study: StudyRecipe | StreamStudyRecipe, cells: Path, on_event: OnEvent 
             "give the recipe its earlier values, or run the study",
         )
     return dataclasses.replace(report, out=str(cells))
+
+
+def kind_of(study: AnyStudy) -> StudyKind:
+    """What a study's cells are, and how they are measured and told."""
+    if isinstance(study, StudyRecipe):
+        return PolicyStudy(study)
+    if isinstance(study, RobotStreamStudyRecipe):
+        return RobotStreamStudy(study)
+    return StreamStudy(study)
 
 
 def _tuned_whole(kind: StudyKind, store: CellStore) -> list[str]:

@@ -8,12 +8,16 @@ from typing import get_args
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.studies.comparison import StreamStudyReport, StudyReport
+from aegis_cli.studies.comparison import (
+    RobotStreamStudyReport,
+    StreamStudyReport,
+    StudyReport,
+)
 from aegis_cli.studies.decoding import Misfit, decode
 from aegis_cli.studies.pipeline import PipelineReport
 
 NAME = "table.json"
-Report = PipelineReport | StudyReport | StreamStudyReport
+Report = PipelineReport | StudyReport | StreamStudyReport | RobotStreamStudyReport
 
 
 def load(folder: Path) -> Report:

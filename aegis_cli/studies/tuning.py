@@ -47,7 +47,22 @@ class StreamPoint:
     chosen: bool = False
 
 
-Point = PolicyPoint | StreamPoint
+@dataclass(frozen=True)
+class RobotStreamPoint:
+    """One value of a variant's knob (None: it has none) and what it led to after the last task.
+
+    Shares in [0, 1], on validation episodes and questions; None if the training diverged.
+    """
+
+    variant: str
+    method: str
+    value: Any
+    last: float | None
+    accuracy: float | None
+    chosen: bool = False
+
+
+Point = PolicyPoint | StreamPoint | RobotStreamPoint
 
 
 @dataclass(frozen=True)
@@ -85,6 +100,13 @@ STREAM_RULE: Rule = Rule(
     merit=lambda point: -(point.parameters or 0),
     sentence="on validation parts of {place}: of a variant's values within {within:g} points of "
     "its best Last, the one with the fewest final parameters; ties by Last",
+)
+ROBOT_STREAM_RULE: Rule = Rule(
+    ability=lambda point: point.last,
+    merit=lambda point: point.accuracy or 0.0,
+    sentence="on validation episodes and questions of {place}: of a variant's values within "
+    "{within:g} points of its best success on all tasks, the one with the highest VQA accuracy "
+    "after the last task; ties by success",
 )
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -21,12 +22,13 @@ from aegis_cli.recipes import (
     ROBOT_LEARNERS,
     TASKS,
     Aegis,
+    AnyStudy,
     DualRecipe,
     PretrainRecipe,
     Recipe,
     RobotStreamRecipe,
+    RobotStreamStudyRecipe,
     StreamRecipe,
-    StreamStudyRecipe,
     StudyRecipe,
     Train,
     changed,
@@ -387,6 +389,8 @@ def test_a_shipped_recipe_says_its_kind_and_an_older_one_without_it_is_the_same(
     text, shipped = path.read_text(), study_cells.load_any(path)
     line = f"kind: {name_of(type(shipped))}\n"
     assert line in text and to_yaml(shipped).startswith(line)
+    if isinstance(shipped, RobotStreamStudyRecipe):
+        return  # a kind that every file of it has said
     older = write(tmp_path, text.replace(line, ""))
     if not isinstance(shipped, PretrainRecipe):  # `aegis pretrain` alone reads these by default
         assert study_cells.load_any(older) == shipped
@@ -396,7 +400,7 @@ def test_a_shipped_recipe_says_its_kind_and_an_older_one_without_it_is_the_same(
 def test_every_kind_is_written_and_read_again(tmp_path):
     given = {StreamRecipe: {"stream": "primer"}, RobotStreamRecipe: {"tasks": ("reach",)}}
     for name, kind in KINDS.items():
-        if kind.recipe not in (StudyRecipe, StreamStudyRecipe):
+        if kind.recipe not in get_args(AnyStudy):
             made = kind.recipe(name="x", **given.get(kind.recipe, {}))
             path = write(tmp_path, to_yaml(made))
             assert path.read_text().startswith(f"kind: {name}\n")

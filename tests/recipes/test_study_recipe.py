@@ -19,8 +19,8 @@ from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import metrics
 from aegis_cli.studies import study as stage
 from aegis_cli.studies.cells import Cell
-from aegis_cli.studies.policy_cells import PolicyRunner, PolicyStudy
-from aegis_cli.studies.stream_cells import StreamRunner, StreamStudy
+from aegis_cli.studies.policy_cells import PolicyRunner
+from aegis_cli.studies.stream_runs import StreamRuns
 
 RECIPES = Path(__file__).parent.parent.parent / "recipes"
 CELL = ("naive", "reach", 1, 1e-3)  # variant, task, seed and the knob's value
@@ -429,7 +429,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
     fake_bench(monkeypatch)
     without_bootstraps(monkeypatch)
     monkeypatch.setattr(PolicyRunner, "anchor", lambda *_: SimpleNamespace(path=tmp_path))
-    for runner in (PolicyRunner, StreamRunner):
+    for runner in (PolicyRunner, StreamRuns):
         monkeypatch.setattr(runner, "measure", lambda _, cell: pytest.fail(f"{cell.label} is new"))
     shipped = RECIPES / "results" / f"{name}.cells.json"
     kept = files.load_json(shipped).values()
@@ -465,7 +465,7 @@ def test_every_shipped_entry_is_a_cell_of_its_study(
     """Some are of values that are not chosen any more since another seed has been added."""
     without_bootstraps(monkeypatch)
     study = study_cells.load(RECIPES / f"{name}.yaml")
-    kind = PolicyStudy(study) if isinstance(study, StudyRecipe) else StreamStudy(study)
+    kind = stage.kind_of(study)
     cells = [cell for own in stage.trials(kind).values() for _, cell in own]
     for variant, settings in study.variants.items():
         for place in kind.places:

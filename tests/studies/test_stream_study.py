@@ -59,7 +59,7 @@ def learned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
         places.append(("/".join(out.parts[-3:]), recipe.split == "validation"))
         return work(recipe, out, *args, **kwargs)
 
-    monkeypatch.setattr(stream_cells.train, "run", run)
+    monkeypatch.setattr(train, "run", run)
     return places
 
 

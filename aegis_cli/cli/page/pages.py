@@ -267,6 +267,20 @@ def _stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
     return title, parts
 
 
+def _robot_stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
+    compared = found["table"]
+    title = str(compared["name"])
+    tasks = ", ".join(compared["tasks"].value)
+    lead = f"{compared['finished']} of {compared['cells']} runs are finished, "
+    lead += f"on {tasks}, one after the other, with seeds {_seeds(compared)}."
+    parts = [
+        _header("Study of a robot stream", title, lead),
+        section("Results", *view(render.robot_stream_study(report.table))),
+        about.commands(found),
+    ]
+    return title, parts
+
+
 def _stream(found: At, report: Any) -> tuple[str, list[Child]]:
     stream = found["report"]
     title = Path(report.path).resolve().name
@@ -312,6 +326,7 @@ _PAGES = {
     "job": _job,
     "study": _study,
     "stream-study": _stream_study,
+    "robot-stream-study": _robot_stream_study,
     "stream-run": _stream,
     "robot-stream-run": _stream,
 }

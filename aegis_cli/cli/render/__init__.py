@@ -11,7 +11,7 @@ from aegis_cli.cli.render.output import error, note, show, text, write_any_chara
 from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
-from aegis_cli.cli.render.studies import stream_study, study
+from aegis_cli.cli.render.studies import robot_stream_study, stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
     bench_shape,
@@ -58,6 +58,7 @@ __all__ = [
     "stream_inspect",
     "stream_probe",
     "stream_study",
+    "robot_stream_study",
     "study",
     "text",
     "write_any_character",

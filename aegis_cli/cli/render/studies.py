@@ -26,7 +26,7 @@ from aegis_cli.cli.render.layout import (
     unmarked,
 )
 from aegis_cli.studies.metrics import Column, columns
-from aegis_cli.studies.tuning import POLICY_RULE, STREAM_RULE, Rule
+from aegis_cli.studies.tuning import POLICY_RULE, ROBOT_STREAM_RULE, STREAM_RULE, Rule
 
 
 def study(report: Any) -> RenderableType:
@@ -78,6 +78,20 @@ def stream_study(report: Any) -> RenderableType:
     return Group(*parts, Text("\n".join(_stream_notes(report))))
 
 
+def robot_stream_study(report: Any) -> RenderableType:
+    """Everything a study of a stream of robot tasks found."""
+    parts: list[RenderableType] = [Text(f"{report.name}: {', '.join(report.tasks)}", "bold")]
+    if report.tuning:
+        parts += _robot_tuning(report)
+    if report.results:
+        parts += [
+            _table(report.results, _ACTED, knob=True, title="Success, with the task told"),
+            _table(report.results, _KNOWN, title="What is known at the end, and its price"),
+            *(_matrix(result, report.tasks) for result in report.results),
+        ]
+    return Group(*parts, Text("\n".join(_robot_notes(report))))
+
+
 # --- columns that results declare -----------------------------------------------------------------
 
 _KEPT = ("drop_points", "cross_entropy")
@@ -92,6 +106,16 @@ _STORED = (
     "minutes",
 )
 _PAIR = ("added", "new_experts", "reuse", "second_gain_points", "first_change_points")
+_ACTED = ("last", "learned", "average", "forgetting", "last_gain_points")
+_KNOWN = (
+    "accuracy",
+    "drop_points",
+    "parameters",
+    "parameters_ratio",
+    "trained_mean",
+    "reuse",
+    "minutes",
+)
 _MEANS_ALONE = {"inference_parameters"}  # a count that hardly varies
 
 
@@ -350,6 +374,49 @@ def _verdict(bar: Any) -> str:
         said = f"has no verdict; not measured: {', '.join(unknown)}"
         return textwrap.fill(said, 100, subsequent_indent="  ")
     return "\n  ".join(["misses the bar" + (":" if failed else ""), *failed])
+
+
+# --- robot streams --------------------------------------------------------------------------------
+
+
+def _robot_tuning(report: Any) -> list[RenderableType]:
+    rows = [
+        (
+            p.variant,
+            value_text(p.value),
+            percent(p.last),
+            percent(p.accuracy),
+            "x" if p.chosen else "",
+        )
+        for p in report.tuning
+    ]
+    header = ("Variant", "Value", "Validation success %", "Validation VQA %", "Chosen")
+    rule = _rule(ROBOT_STREAM_RULE, "the stream", report.within)
+    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
+
+
+def _matrix(result: Any, tasks: Sequence[str]) -> Table:
+    """A line per task that was learned: the success on all so far, and what VQA has lost."""
+    rows = []
+    for after in result.after:
+        shown = [spread(found, percent) for found in after.success]
+        missing = ["-"] * (len(tasks) - len(shown))
+        lost = spread(after.drop_points, lambda value: fixed(value, 2))
+        rows.append((after.task, *shown, *missing, lost))
+    header = ("After", *(f"{task} %" for task in tasks), "VQA lost (points)")
+    return plain_table(header, rows, title=f"{result.variant}: task by task")
+
+
+def _robot_notes(report: Any) -> list[str]:
+    seeds = ", ".join(map(str, report.seeds))
+    notes = [f"mean ±95 % interval (Student's t) over seeds {seeds}; {MARKS}"]
+    if report.finished < report.cells:
+        notes.append(f"{report.finished} of {report.cells} runs are finished")
+    for r in report.results:
+        if r.diverged:
+            runs = ", ".join(map(str, r.diverged))
+            notes.append(f"{r.variant}: diverged with seed {runs}; its figures are of the others")
+    return [*notes, f"files: {report.out}"]
 
 
 # --- words ----------------------------------------------------------------------------------------

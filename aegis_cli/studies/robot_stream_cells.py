@@ -1,0 +1,211 @@
+"""The cells of a study of robot streams: learners on one stream of tasks, which share its data."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from aegis_cli import recipes, sim
+from aegis_cli.common import gl, version
+from aegis_cli.common.events import OnEvent
+from aegis_cli.continual import robots
+from aegis_cli.continual.report import RobotStreamReport
+from aegis_cli.data import demonstrations
+from aegis_cli.data.vqa import sets
+from aegis_cli.models import backbones
+from aegis_cli.recipes import (
+    Probe,
+    RobotStreamRecipe,
+    RobotStreamStudyRecipe,
+    RobotStreamTuning,
+    study_cells,
+)
+from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.comparison import Findings, RobotStreamStudyReport, robot_stream_results
+from aegis_cli.studies.figures import Divergence, RobotStreamFigures
+from aegis_cli.studies.stream_runs import StreamRuns
+from aegis_cli.studies.tuning import ROBOT_STREAM_RULE, RobotStreamPoint
+from aegis_cli.training.up_to_date import StageRecords, digest
+
+PLACE = "stream"  # the one place on which all variants are measured
+
+
+class RobotStreamStudy:
+    """The kind of study whose cells are learners of one stream of robot tasks."""
+
+    figures = RobotStreamFigures
+    rule = ROBOT_STREAM_RULE
+    tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
+    places = (PLACE,)
+
+    def __init__(self, recipe: RobotStreamStudyRecipe) -> None:
+        self.recipe = recipe
+        self.make_runner = RobotStreamRunner
+
+    def cell(self, variant: str, place: str, seed: int, value: Any) -> RobotStreamRecipe:
+        """The recipe of one learner; there is one `place`."""
+        return study_cells.cell(self.recipe, variant, self.recipe.tasks, seed, value)
+
+    def trial(self, variant: str, value: Any) -> RobotStreamRecipe:
+        """The recipe by which a knob's value is judged."""
+        tuning = self.recipe.tuning or RobotStreamTuning()
+        return self.cell(variant, PLACE, tuning.seed, value)
+
+    def check(self, trials: Sequence[RobotStreamRecipe]) -> None:
+        """Raise AegisError for a task that is not there, before any work."""
+        for task in self.recipe.tasks:
+            sim.check(task)
+
+    def prepare(self, runner: RobotStreamRunner, cells: Sequence[Cell], together: bool) -> None:
+        """Check the questions, and record what processes would share.
+
+        Raises:
+            AegisError: questions that cannot be read, or no rendering on this machine.
+        """
+        gl.check()
+        for asked in dict.fromkeys(cell.recipe.probe for cell in cells):
+            runner.questions(asked)
+        for cell in cells if together else ():
+            runner.demonstrations(cell.recipe)
+
+    def point(
+        self, variant: str, value: Any, found: RobotStreamFigures | Divergence
+    ) -> RobotStreamPoint:
+        """What a knob's value led to."""
+        method = self.recipe.variants[variant].method
+        if isinstance(found, Divergence):
+            return RobotStreamPoint(variant, method, value, None, None)
+        return RobotStreamPoint(variant, method, value, found.last, found.vqa[-1])
+
+    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
+        """A learner's minutes are among its figures; nothing is timed apart."""
+        return {}
+
+    def report(self, findings: Findings, store: CellStore) -> RobotStreamStudyReport:
+        """The table of what is known."""
+        study = self.recipe
+        return RobotStreamStudyReport(
+            name=study.name,
+            finished=store.done,
+            cells=store.total,
+            tasks=list(study.tasks),
+            seeds=list(study.seeds),
+            results=robot_stream_results(
+                findings.cells, study.variants, findings.chosen, study.tasks
+            ),
+            within=study.tuning and study.tuning.within,
+            tuning=findings.points,
+            out=str(store.folder),
+        )
+
+
+class RobotStreamRunner(StreamRuns):
+    """Learns the cells of a stream of robot tasks, which share demonstrations."""
+
+    def __init__(self, folder: Path, on_event: OnEvent) -> None:
+        super().__init__(folder, on_event)
+        self._records = StageRecords(folder, on_event)
+        self._fingerprints: dict[str, str] = {}
+        self._sources: dict[Probe, robots.Questions] = {}
+        self._digests: dict[str, str] = {}
+
+    def key(self, cell: Cell) -> str:
+        """Digest of all that shapes the figures.
+
+        The run's label, and where the backbone and given demonstrations lie, are no part of it.
+        """
+        recipe = cell.recipe
+        if recipe.backbone not in self._fingerprints:
+            self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
+        given = [self._digest(path) for path in recipe.demos.paths or ()]
+        state = self.questions(recipe.probe).state
+        return cell_key(cell, self._fingerprints[recipe.backbone], given, state)
+
+    def questions(self, settings: Probe) -> robots.Questions:
+        """The set of questions that a recipe's probe asks.
+
+        Raises:
+            AegisError: it cannot be read.
+        """
+        if settings not in self._sources:
+            self._sources[settings] = sets.read(
+                settings.vqa, settings.skip_bad, self.on_event, settings.ask
+            )
+        return self._sources[settings]
+
+    def demonstrations(self, recipe: RobotStreamRecipe) -> tuple[str, ...]:
+        """Where the demonstrations of each task lie; they are recorded unless they are given."""
+        if recipe.demos.paths is not None:
+            return recipe.demos.paths
+        made = [robots.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
+        return tuple(str(one.path) for one in made)
+
+    def _digest(self, path: str) -> str:
+        """What changes when given demonstrations do."""
+        if path not in self._digests:
+            self._digests[path] = demonstrations.digest(Path(path))
+        return self._digests[path]
+
+    def learned(self, cell: Cell) -> RobotStreamRecipe:
+        """The recipe that is learned, on validation episodes if the cell is of the tuning."""
+        recipe = cell.recipe
+        split = "validation" if cell.validation else "evaluation"
+        return dataclasses.replace(
+            recipe,
+            demos=dataclasses.replace(recipe.demos, paths=self.demonstrations(recipe)),
+            rollout=dataclasses.replace(recipe.rollout, split=split),
+        )
+
+    def figures(self, report: RobotStreamReport) -> RobotStreamFigures:
+        """The figures of a learned stream that studies compare."""
+        return RobotStreamFigures(
+            method=report.method,
+            success=report.success,
+            average=report.scores.average,
+            last=report.scores.last,
+            forgetting=report.scores.forgetting,
+            vqa=tuple(score.accuracy for score in report.vqa),
+            cross_entropy=tuple(score.cross_entropy for score in report.vqa),
+            parameters=report.parameters,
+            trained_mean=report.trained_mean,
+            reuse=report.reuse,
+            minutes=report.minutes,
+            code=version.code(),
+        )
+
+
+def cell_key(
+    cell: Cell,
+    fingerprint: str,
+    demos_sha256: Sequence[str],
+    vqa_state: Mapping[str, Any],
+) -> str:
+    """Digest of a robot stream's settings.
+
+    Options at their defaults are left out: one that is added later makes no finished cell stale.
+
+    Args:
+        fingerprint: of the backbone that the recipe names.
+        demos_sha256: of given demonstrations, one per task; none where they are recorded.
+        vqa_state: of the question files that it reads, if any.
+    """
+    recipe = cell.recipe
+    method = recipe.train.method
+    sections = {name: getattr(recipe, name) for name in ("train", "expert", "rollout", "probe")}
+    sections["demos"] = dataclasses.replace(recipe.demos, paths=None)
+    sections[method] = getattr(recipe, method.replace("-", "_"), None)
+    shaping: dict[str, Any] = {
+        name: recipes.changed(section) for name, section in sections.items() if section is not None
+    }
+    shaping |= {
+        "tasks": list(recipe.tasks),
+        "method": method,
+        "seed": recipe.seed,
+        "validation": cell.validation,
+        "backbone": fingerprint,
+    }
+    if demos_sha256:
+        shaping["demos"] = list(demos_sha256)
+    return digest(shaping | ({"vqa": dict(vqa_state)} if vqa_state else {}))
