@@ -42,8 +42,9 @@ def of_run(recipe: Recipe | AnyStudy) -> None:
         of_questions(recipe.backbone, *_asked(recipe))
         return
     if isinstance(recipe, RobotStreamStudyRecipe):
-        one = cell(recipe, next(iter(recipe.variants)), recipe.tasks, recipe.seeds[0])
-        of_questions(one.backbone, one.probe.vqa)
+        name, first = next(iter(recipe.variants.items()))
+        asked = cell(recipe, name, recipe.tasks, recipe.seeds[0], first.values[0])
+        of_questions(asked.backbone, asked.probe.vqa)
         return
     place, seed = recipe.tasks[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():

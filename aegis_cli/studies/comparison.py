@@ -43,6 +43,7 @@ from aegis_cli.studies.metrics import (
     measure,
     over_seeds,
     ratio,
+    unless_alike,
 )
 from aegis_cli.studies.tuning import PolicyPoint, RobotStreamPoint, StreamPoint
 
@@ -660,6 +661,27 @@ def _lost_at_the_end(figures: RobotStreamFigures) -> float:
     return 100 * (figures.vqa[0] - figures.vqa[-1])
 
 
+def _knows_the_same(figures: RobotStreamFigures) -> bool:
+    """Whether the backbone has not moved: else no answer is as sure as before to the last digit."""
+    return len({*figures.cross_entropy}) == 1
+
+
+def _cannot_forget(figures: RobotStreamFigures) -> bool:
+    """Whether nothing changes what serves a learned task."""
+    from aegis_cli.continual import learners  # loads torch, which tables do without
+
+    return learners.get(figures.method).frozen
+
+
+def _no_units(figures: RobotStreamFigures) -> None:
+    """What the figures are means of is not kept, so that there is one interval: Student's t."""
+
+
+def _acted(header: str, of: Callable[[RobotStreamFigures], float] | None = None) -> Metric:
+    """A share of successes."""
+    return Metric(header, 1, percent=True, of=of, units=_no_units, more_is_better=True)
+
+
 @dataclass(frozen=True)
 class AfterTask:
     """A variant after one more task of the stream: means over seeds.
@@ -698,26 +720,33 @@ class RobotStreamResult:
     knob: str | None
     value: Any
     diverged: list[int]
-    last: Annotated[Mean, Metric("Success at the end %", 1, percent=True, more_is_better=True)]
-    learned: Annotated[
+    last: Annotated[Mean, _acted("Success at the end %")]
+    learned: Annotated[Mean, _acted("Right after learning %", _right_after_learning)]
+    average: Annotated[Mean, _acted("Average %")]
+    forgetting: Annotated[
         Mean,
         Metric(
-            "Right after learning %",
+            "Forgetting (points)",
             1,
-            percent=True,
-            of=_right_after_learning,
-            more_is_better=True,
+            of=_forgotten_points,
+            units=_no_units,
+            sure=_cannot_forget,
+            more_is_better=False,
         ),
-    ]
-    average: Annotated[Mean, Metric("Average %", 1, percent=True, more_is_better=True)]
-    forgetting: Annotated[
-        Mean, Metric("Forgetting (points)", 1, of=_forgotten_points, more_is_better=False)
     ]
     accuracy: Annotated[
         Mean, Metric("VQA %", 1, percent=True, of=_vqa_at_the_end, more_is_better=True)
     ]
     drop_points: Annotated[
-        Mean, Metric("VQA lost (points)", 2, of=_lost_at_the_end, more_is_better=False)
+        Mean,
+        Metric(
+            "VQA lost (points)",
+            2,
+            of=_lost_at_the_end,
+            units=_no_units,
+            sure=_knows_the_same,
+            more_is_better=False,
+        ),
     ]
     parameters: Annotated[Mean, Metric("Final parameters")]
     parameters_ratio: Annotated[
@@ -730,7 +759,7 @@ class RobotStreamResult:
     reuse: Annotated[Mean, Metric("Mass on history %", 1, percent=True)]
     minutes: Annotated[Mean, Metric("Minutes", 1)]
     last_gain_points: Annotated[
-        Mean, _gain("At the end - isolated LoRA's (points)", "last", ISOLATED, 1)
+        Mean, _gain("At the end - isolated LoRA's (points)", "last", ISOLATED, 1, _no_units)
     ]
     after: list[AfterTask]
 
@@ -791,13 +820,14 @@ def _task_by_task(sample: Sample, tasks: Sequence[str]) -> list[AfterTask]:
     """The variant's means after each task."""
     cells = sample.figures.items()
     rows = []
+    still = all(_knows_the_same(figures) for _, figures in cells)
     for t, task in enumerate(tasks):
-        success = [
-            over_seeds({setting: figures.success[t][i] for setting, figures in cells})
-            for i in range(t + 1)
-        ]
-        lost = {run: 100 * (figures.vqa[0] - figures.vqa[t + 1]) for run, figures in cells}
-        rows.append(AfterTask(task, success, over_seeds(lost)))
+        success = []
+        for i in range(t + 1):
+            acted = over_seeds({run: figures.success[t][i] for run, figures in cells})
+            success.append(acted and unless_alike(acted, sure=False))
+        lost = over_seeds({r: 100 * (found.vqa[0] - found.vqa[t + 1]) for r, found in cells})
+        rows.append(AfterTask(task, success, lost and unless_alike(lost, still)))
     return rows
 
 

@@ -161,13 +161,20 @@ def measure(
         made = column.summary(known if seeded else _once(known))
         if isinstance(made, Estimate) and column.units is not None:
             crossed = _crossed(column.units, known, sample, other)
-            # Seeds that came out alike by chance do not tell how seeds vary.
-            alike = made.interval is not None and made.interval[1] - made.interval[0] <= ROUNDING
-            blind = alike and crossed is None and not _surely(column, known, sample, other)
-            interval = None if blind else made.interval
-            made = dataclasses.replace(made, interval=interval, crossed=crossed)
+            sure = crossed is not None or _surely(column, known, sample, other)
+            made = dataclasses.replace(unless_alike(made, sure), crossed=crossed)
         measured[name] = made
     return measured
+
+
+def unless_alike(found: Estimate, sure: bool) -> Estimate:
+    """Without an interval where seeds came out alike by chance: they do not tell how seeds vary.
+
+    Args:
+        sure: whether it was no chance, or is known from elsewhere.
+    """
+    alike = found.interval is not None and found.interval[1] - found.interval[0] <= ROUNDING
+    return dataclasses.replace(found, interval=None) if alike and not sure else found
 
 
 def _surely(column: Metric, known: Values, sample: Sample, other: Sample | None) -> bool:

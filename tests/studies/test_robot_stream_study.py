@@ -178,10 +178,12 @@ def test_processes_find_what_one_finds(
 def test_the_command_runs_a_study_and_writes_its_tables(
     tiny_folder: Path, tmp_path: Path, aegis: Aegis
 ) -> None:
-    keys = raw(tiny_folder, seeds=[3], variants={"sequential": {"method": "sequential"}})
+    tuned = {"sequential": {"method": "sequential", "tune": {"sequential.lr": [1e-4, 1e-3]}}}
+    keys = raw(tiny_folder, seeds=[3], variants=tuned, tuning={"seed": 9})
     code, out, err = aegis("run", write(tmp_path, keys), "--out", tmp_path / "runs")
     folder = tmp_path / "runs" / "small"
     assert code == 0 and "sequential: task by task" in out, err
+    assert "Knobs" in out and "highest VQA accuracy after the last task" in " ".join(out.split())
     assert (folder / "table.md").is_file() and (folder / "report.html").is_file()
 
 
@@ -263,12 +265,29 @@ def test_means_are_over_seeds_and_differences_are_of_the_same_seed() -> None:
     variants = {name: type("V", (), {"method": "igsp", "knob": None}) for name in found}
     lora, igsp, wild = comparison.robot_stream_results(found, variants, {}, TASKS)
     assert lora.last.mean == pytest.approx(0.45) and lora.learned.mean == pytest.approx(0.625)
-    assert igsp.last_gain_points.mean == pytest.approx(10) and igsp.last_gain_points.half < 1e-6
+    assert (
+        igsp.last_gain_points.mean == pytest.approx(10) and igsp.last_gain_points.interval is None
+    )
     assert igsp.parameters_ratio.mean == 0.5 and lora.last_gain_points.mean == 0
     assert igsp.drop_points.mean == pytest.approx(20) and igsp.accuracy.mean == 0.7
     assert [a.drop_points.mean for a in igsp.after] == pytest.approx([10, 20])
     assert igsp.forgetting.mean == 25 and igsp.reuse is None
     assert wild.diverged == [0] and wild.drop_points.mean == 0 and wild.last.interval is None
+
+
+def test_seeds_that_came_out_alike_by_chance_have_no_interval() -> None:
+    still = {"vqa": (0.9, 0.9, 0.9), "cross_entropy": (0.1, 0.1, 0.1)}
+    moved = still | {"method": "sequential", "cross_entropy": (0.1, 0.2, 0.2)}
+    found = {
+        name: {("stream", s): figures(**keys) for s in (0, 1)}
+        for name, keys in {"igsp": still, "sequential": moved}.items()
+    }
+    variants = {name: type("V", (), {"method": name, "knob": None}) for name in found}
+    igsp, moving = comparison.robot_stream_results(found, variants, {}, TASKS)
+    assert igsp.last.interval is None and igsp.after[1].success[0].interval is None
+    assert igsp.drop_points.interval == (0, 0) == igsp.after[1].drop_points.interval
+    assert moving.drop_points.interval is None is moving.after[1].drop_points.interval
+    assert igsp.forgetting.interval == (25, 25) and moving.forgetting.interval is None
 
 
 def test_a_knob_is_chosen_by_success_and_then_by_what_is_known() -> None:
