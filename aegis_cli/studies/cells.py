@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from multiprocessing import Queue
@@ -57,7 +57,10 @@ class CellRunner(Protocol):
         """Train and measure a cell."""
 
     def clear(self, label: str) -> None:
-        """Remove what a measured cell leaves and nobody reads."""
+        """Remove what a measured cell leaves and nobody reads; others may be at work."""
+
+    def tidy(self, labels: Iterable[str]) -> None:
+        """Remove what is left of cleared cells, when nobody is at work any more."""
 
     def begin_anew(self) -> None:
         """Take nothing in the folder for finished."""
@@ -182,6 +185,11 @@ class CellStore:
                 for cell in waiting:
                     if keys[cell.label] == key:
                         yield cell, self._deliver(key)
+
+    def tidy(self, cells: Iterable[Cell]) -> None:
+        """Remove what is left of these cells' cleared runs; all of them are measured."""
+        if not self.known_only and not self.kind.recipe.keep_runs:
+            self.runner.tidy(cell.label for cell in cells)
 
     def _measure(self, cells: list[Cell], together: bool) -> Iterator[tuple[Cell, Outcome]]:
         """What cells led to, as they finish, measured here or by several processes."""

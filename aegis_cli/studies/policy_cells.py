@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -424,6 +424,9 @@ class PolicyRunner:
         """Remove the checkpoints, which are large and no result."""
         for run in (self.folder / label, self.folder / label / MERGED):
             shutil.rmtree(run / "checkpoints", ignore_errors=True)
+
+    def tidy(self, labels: Iterable[str]) -> None:
+        """Nothing: the runs' records stay."""
 
     def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
         """Train `recipe.train.method`, merge it if the recipe says so, probe it and roll it out.

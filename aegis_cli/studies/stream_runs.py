@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +68,21 @@ class StreamRuns(ABC):
             return Divergence(end.good_steps)
 
     def clear(self, label: str) -> None:
-        """Remove a run, its note, and the folders that are empty then."""
+        """Remove a run and its note.
+
+        The folder that they lay in stays until `tidy`, for another process may be about to begin
+        its run there.
+        """
         out = self.folder / label
         shutil.rmtree(out, ignore_errors=True)
         _note(out).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # other runs are there
-            for folder in out.parents[: len(Path(label).parts) - 1]:
-                folder.rmdir()
+
+    def tidy(self, labels: Iterable[str]) -> None:
+        """Remove the folders that are empty once the cells of these labels are measured."""
+        for label in labels:
+            with contextlib.suppress(OSError):  # other runs are there, or it is gone
+                for folder in (self.folder / label).parents[: len(Path(label).parts) - 1]:
+                    folder.rmdir()
 
 
 def _named_otherwise(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> bool:

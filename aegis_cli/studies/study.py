@@ -135,6 +135,7 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
             # A table of many cells takes seconds, and the last one is written below.
             if known <= number < len(cells):
                 _write(kind, store, findings)
+    store.tidy([cell for own in tuned.values() for _, cell in own] + cells)
     costs = kind.costs(store, chosen)
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
 

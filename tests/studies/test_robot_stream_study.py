@@ -187,6 +187,22 @@ def test_the_command_runs_a_study_and_writes_its_tables(
     assert (folder / "table.md").is_file() and (folder / "report.html").is_file()
 
 
+def test_a_run_is_cleared_without_the_folder_where_another_may_begin(tmp_path: Path) -> None:
+    runner = RobotStreamRunner(tmp_path, ignore)
+    folder = tmp_path / "stream" / "igsp"
+    (folder / "3").mkdir(parents=True)
+    (folder / "3.begun").write_text("key")
+    runner.clear("stream/igsp/3")
+    assert folder.is_dir() and not list(folder.iterdir())
+    (folder / "4.begun").write_text("of a process that has just begun")
+    runner.tidy(["stream/igsp/3"])
+    assert (folder / "4.begun").is_file()
+    runner.clear("stream/igsp/4")
+    (tmp_path / "stream" / "kept").mkdir()  # nobody's label
+    runner.tidy(["stream/igsp/3", "stream/igsp/4"])
+    assert not folder.exists() and (tmp_path / "stream" / "kept").is_dir()
+
+
 # --- seeds of a stream ---------------------------------------------------------------------------
 
 
