@@ -15,7 +15,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +30,7 @@ from aegis_cli.common.processes import WorkerPool
 from aegis_cli.evaluation import bench_runs, operations
 from aegis_cli.evaluation.bench_runs import NAIVE
 from aegis_cli.evaluation.peaks import Peak, peak_of
+from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
 
@@ -49,6 +50,9 @@ class StepCost:
     Attributes:
         step_s: seconds.
         step_time: seconds over naive's.
+        own_share: seconds that the method's constraint of the update takes, at its share of a step,
+            over naive's step. It is timed by itself, and so known better than `step_time`, which is
+            the ratio of two medians. None for a method without one.
         peak_gb: 10^9 bytes that the process, or the GPU, needed at most.
         peak_memory: that over naive's.
         tflop: 10^12 operations of its matrix products.
@@ -59,6 +63,7 @@ class StepCost:
 
     step_s: float | None = None
     step_time: float | None = None
+    own_share: float | None = None
     peak_gb: float | None = None
     peak_memory: float | None = None
     tflop: float | None = None
@@ -119,6 +124,7 @@ class _Measured:
 
     seconds: float
     peak: int
+    own: float | None = None
     flop: int = 0
     tokens: int = 0
     megabytes: float = 0.0
@@ -291,26 +297,48 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
 
     The operations are those of a turn after the peak: to count them takes memory as well.
     """
-    needs = methods.get(recipe.train.method).needs
+    method, own = _timing_constraints(methods.get(recipe.train.method))
     bench_runs.save_demos(out, recipe.task)
-    anchor = _anchor(out, needs) if needs else None
-    run, batch = bench_runs.begun(recipe, anchor, out)
+    anchor = _anchor(out, method.needs) if method.needs else None
+    run, batch = bench_runs.begun(recipe, anchor, out, method)
     turn, steps = bench_runs.turn_of(run, batch)
     turn()
-    times = []
-    for _ in range(turns):
-        bench_runs.wait()
-        start = _now()
-        turn()
-        bench_runs.wait()
-        times.append((_now() - start) / steps)
+    own.clear()
+    times = [_seconds(turn) / steps for _ in range(turns)]
+    constrained = sum(own) / (turns * steps) if own else None
     needed = memory.peak(devices.pick())
     with operations.counter() as counter:
         turn()
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
     flop = counter.get_total_flops() // steps
-    return _Measured(statistics.median(times), needed, flop, tokens)
+    return _Measured(statistics.median(times), needed, constrained, flop, tokens)
+
+
+def _timing_constraints(method: Method) -> tuple[Method, list[float]]:
+    """The method, and a list to which it adds the seconds that each of its constraints takes.
+
+    What it does before the first of the steps that a constraint covers is part of it.
+    """
+    seconds: list[float] = []
+
+    def timed(work: Callable[..., None] | None) -> Callable[..., None] | None:
+        return None if work is None else lambda *given: seconds.append(_seconds(work, *given))
+
+    def start(setting: Setting) -> Parts:
+        parts = method.start(setting)
+        return replace(parts, constrain=timed(parts.constrain), begin=timed(parts.begin))
+
+    return replace(method, start=start), seconds
+
+
+def _seconds(work: Callable[..., object], *arguments: Any) -> float:
+    """How long the work takes, alone on the device."""
+    bench_runs.wait()
+    start = _now()
+    work(*arguments)
+    bench_runs.wait()
+    return _now() - start
 
 
 def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:
@@ -341,6 +369,7 @@ def _cost(found: _Measured | None, naive: _Measured, assumed: Peak | None) -> St
     return StepCost(
         step_s=found.seconds,
         step_time=found.seconds / naive.seconds,
+        own_share=None if found.own is None else found.own / naive.seconds,
         peak_gb=found.peak / 1e9,
         peak_memory=found.peak / naive.peak,
         tflop=found.flop / 1e12,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
@@ -13,11 +14,13 @@ import torch
 from rich.console import Console
 from samples.shapes import small
 
+from aegis_cli import methods
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.evaluation import bench_shapes
 from aegis_cli.evaluation.peaks import peak_of
+from aegis_cli.methods.base import Parts
 from aegis_cli.models.backbones import shapes
 
 NAME = "smolvlm2-256m"
@@ -63,6 +66,11 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     # The second backward pass goes through the backbone alone.
     assert aegis.tflop is not None and naive.tflop is not None
     assert 1 < aegis.tflop / naive.tflop < 5 / 3
+    # Only what constrains the update is timed by itself.
+    assert naive.own_share is None is aegis.own_share
+    constrained = found.methods["nullspace"]
+    assert constrained.own_share is not None
+    assert 0 < constrained.own_share < constrained.step_time
     assert found.anchor["inputs"].question_s > 0 and found.anchor["inputs"].megabytes > 0
     assert found.batch_size == 2 and found.tokens == 4 + 7  # an image's, and the words
     assert found.precision == "float32" and found.clock == "cpu" and found.assumed is None
@@ -130,3 +138,24 @@ def test_mfu_counts_what_training_needs() -> None:
     found = bench_shapes._cost(twice, naive, peak)
     assert found.mfu == pytest.approx(10**12 / (4 * 989e12))
     assert (found.step_time, found.peak_memory) == (2.0, 1.1)
+
+
+def test_a_constraint_is_timed_with_what_comes_before_its_steps() -> None:
+    """Of each turn, by a clock that these parts alone move."""
+    now = [0.0]
+
+    def spend(seconds: float) -> Callable[..., None]:
+        return lambda *_: now.__setitem__(0, now[0] + seconds)
+
+    parts = Parts(constrain=spend(3.0), begin=spend(1.0), every=2)
+    method = dataclasses.replace(methods.get("naive"), start=lambda _: parts)
+    timed, seconds = bench_shapes._timing_constraints(method)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_shapes, "_now", lambda: now[0])
+        begun = timed.start(None)
+        begun.begin()
+        now[0] += 10  # the steps themselves
+        begun.constrain(None)
+    assert seconds == [1.0, 3.0] and begun.every == 2
+    plain, nothing = bench_shapes._timing_constraints(methods.get("naive"))
+    assert plain.start(None) == Parts() and nothing == []

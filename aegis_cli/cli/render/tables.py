@@ -213,18 +213,19 @@ def bench(report: Any) -> RenderableType:
 def bench_shape(report: Any) -> RenderableType:
     def row(name: str, cost: Any) -> tuple[str, ...]:
         if cost.step_s is None:
-            return name, "out of memory", *("-",) * 4
-        mfu = "-" if cost.mfu is None else percent(cost.mfu)
+            return name, "out of memory", *("-",) * 5
+        own, mfu = ("-" if x is None else percent(x) for x in (cost.own_share, cost.mfu))
         return (
             name,
             fixed(cost.step_s, 2),
             fixed(cost.step_time, 2),
+            own,
             fixed(cost.peak_gb, 2),
             fixed(cost.peak_memory, 2),
             mfu,
         )
 
-    header = ("Method", "s/step", "x naive", "Peak GB", "x naive", "MFU %")
+    header = ("Method", "s/step", "x naive", "Constraint %", "Peak GB", "x naive", "MFU %")
     parts = [plain_table(header, [row(*each) for each in report.methods.items()])]
     if report.anchor:
         rows = []
