@@ -18,7 +18,6 @@ from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.batch import RobotBatch
-from aegis_cli.methods.base import Method
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import assemble, train
 from aegis_cli.training.assemble import TrainingRun
@@ -116,22 +115,17 @@ def turn_of(run: TrainingRun, batch: RobotBatch) -> tuple[Callable[[], None], in
     return turn, steps
 
 
-def begun(
-    recipe: Recipe, anchor: Path | None, out: Path, method: Method | None = None
-) -> tuple[TrainingRun, RobotBatch]:
+def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, RobotBatch]:
     """A run before its first step, and a batch of noise for it, whatever the recipe names.
 
     Its learning rates are 0, which takes the same time. With those of a study, a variant that
     diverges would have no costs.
-
-    Args:
-        method: in place of the recipe's own, whose name it has.
     """
     still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
     recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
     run = assemble.build(
         recipe,
-        method or methods.get(recipe.train.method),
+        methods.get(recipe.train.method),
         demos_file(out, recipe.task),
         anchor,
         out / "run",

@@ -30,9 +30,9 @@ from aegis_cli.common.processes import WorkerPool
 from aegis_cli.evaluation import bench_runs, operations
 from aegis_cli.evaluation.bench_runs import NAIVE
 from aegis_cli.evaluation.peaks import Peak, peak_of
-from aegis_cli.methods.base import Method, Parts, Setting
 from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
+from aegis_cli.training.assemble import TrainingRun
 
 _BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
 # Questions of an anchor's parts, and how many a pass takes; a part's time is given for each.
@@ -50,9 +50,10 @@ class StepCost:
     Attributes:
         step_s: seconds.
         step_time: seconds over naive's.
-        own_share: seconds that the method's constraint of the update takes, at its share of a step,
-            over naive's step. It is timed by itself, and so known better than `step_time`, which is
-            the ratio of two medians. None for a method without one.
+        own_share: seconds a step that the method takes between the passes, for what it does to the
+            gradient and to the update, over naive's step. They are timed by themselves, and known
+            better than `step_time`, which is the ratio of two medians. None for a method that does
+            nothing there; what `aegis` does with two gradients is not in it.
         peak_gb: 10^9 bytes that the process, or the GPU, needed at most.
         peak_memory: that over naive's.
         tflop: 10^12 operations of its matrix products.
@@ -297,48 +298,60 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
 
     The operations are those of a turn after the peak: to count them takes memory as well.
     """
-    method, own = _timing_constraints(methods.get(recipe.train.method))
+    needs = methods.get(recipe.train.method).needs
     bench_runs.save_demos(out, recipe.task)
-    anchor = _anchor(out, method.needs) if method.needs else None
-    run, batch = bench_runs.begun(recipe, anchor, out, method)
+    anchor = _anchor(out, needs) if needs else None
+    run, batch = bench_runs.begun(recipe, anchor, out)
     turn, steps = bench_runs.turn_of(run, batch)
     turn()
-    own.clear()
-    times = [_seconds(turn) / steps for _ in range(turns)]
-    constrained = sum(own) / (turns * steps) if own else None
+    times = [_seconds(turn)[0] / steps for _ in range(turns)]
     needed = memory.peak(devices.pick())
+    own = _own_seconds(run, turn)
     with operations.counter() as counter:
         turn()
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
     flop = counter.get_total_flops() // steps
-    return _Measured(statistics.median(times), needed, constrained, flop, tokens)
+    return _Measured(statistics.median(times), needed, own and own / steps, flop, tokens)
 
 
-def _timing_constraints(method: Method) -> tuple[Method, list[float]]:
-    """The method, and a list to which it adds the seconds that each of its constraints takes.
+def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:
+    """The seconds of one more turn that the method takes between the passes; None if none.
 
-    What it does before the first of the steps that a constraint covers is part of it.
+    That is what it does to the gradient before the optimizer's step, and to the update after it,
+    copies of the weights included. On a GPU to time that is to wait, which is why other turns say
+    what a step takes.
     """
+    parts, stepper = run.parts, run.stepper
+    if not parts.constrains and parts.pull is None:
+        return None
     seconds: list[float] = []
 
-    def timed(work: Callable[..., None] | None) -> Callable[..., None] | None:
-        return None if work is None else lambda *given: seconds.append(_seconds(work, *given))
+    def timed(work: Callable[..., T]) -> Callable[..., T]:
+        def measured(*given: Any) -> T:
+            taken, result = _seconds(work, *given)
+            seconds.append(taken)
+            return result
 
-    def start(setting: Setting) -> Parts:
-        parts = method.start(setting)
-        return replace(parts, constrain=timed(parts.constrain), begin=timed(parts.begin))
+        return measured
 
-    return replace(method, start=start), seconds
+    run.parts = replace(
+        parts,
+        pull=parts.pull and timed(parts.pull),
+        shares=parts.shares and timed(parts.shares),
+    )
+    stepper.begin, stepper.end = timed(stepper.begin), timed(stepper.end)  # type: ignore
+    turn()
+    return sum(seconds)
 
 
-def _seconds(work: Callable[..., object], *arguments: Any) -> float:
-    """How long the work takes, alone on the device."""
+def _seconds(work: Callable[..., T], *arguments: Any) -> tuple[float, T]:
+    """How long the work takes, alone on the device, and what it returns."""
     bench_runs.wait()
     start = _now()
-    work(*arguments)
+    result = work(*arguments)
     bench_runs.wait()
-    return _now() - start
+    return _now() - start, result
 
 
 def _anchor(out: Path, parts: Sequence[str] | frozenset[str]) -> Path:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import os
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,13 +14,13 @@ import torch
 from rich.console import Console
 from samples.shapes import small
 
-from aegis_cli import methods
 from aegis_cli.cli import render
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress
 from aegis_cli.evaluation import bench_shapes
 from aegis_cli.evaluation.peaks import peak_of
 from aegis_cli.methods.base import Parts
+from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.backbones import shapes
 
 NAME = "smolvlm2-256m"
@@ -66,7 +66,7 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     # The second backward pass goes through the backbone alone.
     assert aegis.tflop is not None and naive.tflop is not None
     assert 1 < aegis.tflop / naive.tflop < 5 / 3
-    # Only what constrains the update is timed by itself.
+    # Of these only nullspace does something between the passes that is timed by itself.
     assert naive.own_share is None is aegis.own_share
     constrained = found.methods["nullspace"]
     assert constrained.own_share is not None
@@ -140,22 +140,33 @@ def test_mfu_counts_what_training_needs() -> None:
     assert (found.step_time, found.peak_memory) == (2.0, 1.1)
 
 
-def test_a_constraint_is_timed_with_what_comes_before_its_steps() -> None:
-    """Of each turn, by a clock that these parts alone move."""
+def test_all_that_a_method_does_between_the_passes_is_timed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By a clock that these parts alone move, and the passes, which are not of them."""
     now = [0.0]
 
-    def spend(seconds: float) -> Callable[..., None]:
-        return lambda *_: now.__setitem__(0, now[0] + seconds)
+    def spend(seconds: float, result: Any = None) -> Callable[..., Any]:
+        def work(*_: Any) -> Any:
+            now[0] += seconds
+            return result
 
-    parts = Parts(constrain=spend(3.0), begin=spend(1.0), every=2)
-    method = dataclasses.replace(methods.get("naive"), start=lambda _: parts)
-    timed, seconds = bench_shapes._timing_constraints(method)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_shapes, "_now", lambda: now[0])
-        begun = timed.start(None)
-        begun.begin()
-        now[0] += 10  # the steps themselves
-        begun.constrain(None)
-    assert seconds == [1.0, 3.0] and begun.every == 2
-    plain, nothing = bench_shapes._timing_constraints(methods.get("naive"))
-    assert plain.start(None) == Parts() and nothing == []
+        return work
+
+    slowed: dict[Any, float] = {torch.zeros(1): 0.5}
+    parts = Parts(
+        pull=spend(1.0), shares=spend(2.0, slowed), constrain=spend(4.0), begin=spend(8.0)
+    )
+    model = torch.nn.Linear(1, 1)
+    run = SimpleNamespace(parts=parts, stepper=Stepper(model, parts))
+    monkeypatch.setattr(run.stepper, "_copies", spend(16.0, {}))
+
+    def turn() -> None:
+        run.parts.pull()
+        assert run.parts.shares() is slowed
+        run.stepper.step(1, spend(100.0), {})
+
+    monkeypatch.setattr(bench_shapes, "_now", lambda: now[0])
+    assert bench_shapes._own_seconds(run, turn) == 31.0 and now[0] == 131.0
+    naive = SimpleNamespace(parts=Parts(), stepper=None)
+    assert bench_shapes._own_seconds(naive, turn) is None and now[0] == 131.0

@@ -225,7 +225,7 @@ def bench_shape(report: Any) -> RenderableType:
             mfu,
         )
 
-    header = ("Method", "s/step", "x naive", "Constraint %", "Peak GB", "x naive", "MFU %")
+    header = ("Method", "s/step", "x naive", "Own %", "Peak GB", "x naive", "MFU %")
     parts = [plain_table(header, [row(*each) for each in report.methods.items()])]
     if report.anchor:
         rows = []
