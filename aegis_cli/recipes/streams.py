@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     FOLDER_NAME,
@@ -27,6 +29,12 @@ LEARNERS = (
     "igsp",
 )
 ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
+# Rates of `train` that a learner never reads -> what it reads instead; None: nothing learns by it.
+UNREAD_RATES: Mapping[str, Mapping[str, str | None]] = {
+    "zero-shot": {"train.lr": None, "train.router_lr": None},
+    "sequential": {"train.lr": "sequential.lr", "train.router_lr": None},
+    "moe-adapters": {"train.router_lr": "moe_adapters.router_lr"},
+}
 SPLITS = ("evaluation", "validation")  # of episodes and questions
 PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
 

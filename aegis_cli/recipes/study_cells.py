@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
@@ -228,7 +228,8 @@ def _drawn(study: AnyStudy) -> list[str]:
 
 def _per_seed(names: Iterable[str]) -> list[str]:
     """The keys of a cell's recipe that are its seed."""
-    return [f"{PER_SEED[name]}.seed" for name in names if name in PER_SEED]
+    known = [name for name in names if isinstance(name, str) and name in PER_SEED]
+    return [f"{PER_SEED[name]}.seed" for name in known]
 
 
 def _readable(tasks: Any) -> list[str]:
@@ -242,19 +243,32 @@ def _readable(tasks: Any) -> list[str]:
 
 def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """Demonstrations that are given are the same with every seed."""
-    shared, names = raw.get("shared"), raw.get("per_seed")
-    settings = shared.get("demos") if isinstance(shared, dict) else None
-    given = settings if isinstance(settings, dict) else {}
-    named = [key for key in ("path", "paths") if given.get(key) is not None]
-    if not named or not isinstance(names, list) or "demos" not in names:
+    names = raw.get("per_seed")
+    if not isinstance(names, list) or "demos" not in names:
         return []
     return [
         Problem(
-            f"per_seed: demos with shared: demos.{named[0]}: {given[named[0]]}",
+            f"per_seed: demos with {where}",
             "demonstrations that are recorded, to have others with every seed",
             "take demos out of per_seed: the seeds still hold out other episodes",
         )
+        for where in _given_demos(raw)
     ]
+
+
+def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
+    """Where a study names demonstrations: for all cells, or for those of a variant."""
+    shared, named = raw.get("shared"), raw.get("variants")
+    settings = shared.get("demos") if isinstance(shared, dict) else None
+    for key in ("path", "paths") if isinstance(settings, dict) else ():
+        if settings.get(key) is not None:
+            yield f"shared: demos.{key}: {settings[key]}"
+    for name, variant in named.items() if isinstance(named, dict) else ():
+        for part in ("set", "tune"):
+            own = variant.get(part) if isinstance(variant, dict) else None
+            for key in ("demos.path", "demos.paths"):
+                if isinstance(own, dict) and own.get(key) is not None:
+                    yield f"variants.{name}.{part}: {key}: {own[key]}"
 
 
 def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
@@ -336,7 +350,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
             "methods": "variants",
             "train.method": "variants",
         },
-        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors"),
+        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors", "rollout.seed"),
         references={NAIVE: "naive"},
         any_place="reach",
         tuning_seed=Tuning().seed,
@@ -382,7 +396,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
             "train.method": "variants",
             "rollout.split": "tuning",
         },
-        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors"),
+        for_all=("backbone", "probe", "rollout.episodes", "rollout.colors", "rollout.seed"),
         references={ISOLATED: "isolated-lora"},
         any_place=("reach",),
         tuning_seed=RobotStreamTuning().seed,

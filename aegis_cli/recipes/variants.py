@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from aegis_cli.common.files import canonical
 from aegis_cli.recipes import FOLDER_NAME, LEARNERS, METHODS, Variant
 from aegis_cli.recipes.decoding import build
+from aegis_cli.recipes.streams import UNREAD_RATES
 from aegis_cli.recipes.strict_yaml import Problem, line_of, put
 
 V = TypeVar("V", bound=Variant)
@@ -105,6 +106,12 @@ def _problems(
             if section in SECTIONS and section != variant.method.replace("-", "_"):
                 expected = f"keys that method '{variant.method}' reads"
                 fix = f"delete it, or set method: {section.replace('_', '-')}"
+                found.append(Problem(f"{where}.{part}: {dotted}", expected, fix))
+            unread = UNREAD_RATES.get(variant.method, {})
+            if dotted in unread:
+                instead = unread[dotted]
+                fix = "delete it" if instead is None else f"set {instead} instead"
+                expected = f"keys that method '{variant.method}' reads"
                 found.append(Problem(f"{where}.{part}: {dotted}", expected, fix))
             for problem in found:
                 yield problem._replace(line=lines.get(dotted))

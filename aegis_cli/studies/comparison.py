@@ -666,7 +666,7 @@ def _knows_the_same(figures: RobotStreamFigures) -> bool:
     return len({*figures.cross_entropy}) == 1
 
 
-def _cannot_forget(figures: RobotStreamFigures) -> bool:
+def _is_frozen(figures: RobotStreamFigures) -> bool:
     """Whether nothing changes what serves a learned task."""
     from aegis_cli.continual import learners  # loads torch, which tables do without
 
@@ -677,8 +677,8 @@ def _no_units(figures: RobotStreamFigures) -> None:
     """What the figures are means of is not kept, so that there is one interval: Student's t."""
 
 
-def _acted(header: str, of: Callable[[RobotStreamFigures], float] | None = None) -> Metric:
-    """A share of successes."""
+def _reached(header: str, of: Callable[[RobotStreamFigures], float] | None = None) -> Metric:
+    """A share of successes, or of correct answers, at which seeds may come out alike by chance."""
     return Metric(header, 1, percent=True, of=of, units=_no_units, more_is_better=True)
 
 
@@ -720,9 +720,9 @@ class RobotStreamResult:
     knob: str | None
     value: Any
     diverged: list[int]
-    last: Annotated[Mean, _acted("Success at the end %")]
-    learned: Annotated[Mean, _acted("Right after learning %", _right_after_learning)]
-    average: Annotated[Mean, _acted("Average %")]
+    last: Annotated[Mean, _reached("Success at the end %")]
+    learned: Annotated[Mean, _reached("Right after learning %", _right_after_learning)]
+    average: Annotated[Mean, _reached("Average %")]
     forgetting: Annotated[
         Mean,
         Metric(
@@ -730,13 +730,11 @@ class RobotStreamResult:
             1,
             of=_forgotten_points,
             units=_no_units,
-            sure=_cannot_forget,
+            sure=_is_frozen,
             more_is_better=False,
         ),
     ]
-    accuracy: Annotated[
-        Mean, Metric("VQA %", 1, percent=True, of=_vqa_at_the_end, more_is_better=True)
-    ]
+    accuracy: Annotated[Mean, _reached("VQA %", _vqa_at_the_end)]
     drop_points: Annotated[
         Mean,
         Metric(

@@ -178,7 +178,12 @@ def unless_alike(found: Estimate, sure: bool) -> Estimate:
 
 
 def _surely(column: Metric, known: Values, sample: Sample, other: Sample | None) -> bool:
-    """Whether none of these cells, nor of those that they are compared with, could differ."""
+    """Whether none of these cells, nor of those that they are compared with, could differ.
+
+    A variant that is compared with itself cannot differ from itself.
+    """
+    if other is sample:
+        return True
     figures = [each.figures[s] for each in (sample, other) if each is not None for s in known]
     return column.sure is not None and all(column.sure(found) for found in figures)
 

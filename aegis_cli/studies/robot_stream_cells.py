@@ -111,6 +111,11 @@ class RobotStreamRunner(StreamRuns):
         self._sources: dict[Probe, robots.Questions] = {}
         self._digests: dict[str, str] = {}
 
+    def begin_anew(self) -> None:
+        """Let everything be recorded and learned again."""
+        super().begin_anew()
+        self._records.begin_anew()
+
     def key(self, cell: Cell) -> str:
         """Digest of all that shapes the figures.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
@@ -68,13 +67,13 @@ class StreamRuns(ABC):
             return Divergence(end.good_steps)
 
     def clear(self, label: str) -> None:
-        """Remove a run and its note.
+        """Remove a run and its note; one with somebody's own files is moved beside it.
 
         The folder that they lay in stays until `tidy`, for another process may be about to begin
         its run there.
         """
         out = self.folder / label
-        shutil.rmtree(out, ignore_errors=True)
+        run_folder.clear(out, ours=True)
         _note(out).unlink(missing_ok=True)
 
     def tidy(self, labels: Iterable[str]) -> None:

@@ -29,6 +29,7 @@ from aegis_cli.recipes import (
     RobotStreamRecipe,
     RobotStreamStudyRecipe,
     StreamRecipe,
+    StreamTrain,
     StudyRecipe,
     Train,
     changed,
@@ -37,12 +38,14 @@ from aegis_cli.recipes import (
     load_pretrain,
     load_training,
     name_of,
+    options,
     recorded,
     study_cells,
     to_yaml,
     training_part,
 )
 from aegis_cli.recipes.keys import POSITIVE, is_retired, key
+from aegis_cli.recipes.streams import UNREAD_RATES
 
 RECIPES = sorted((Path(__file__).parent.parent.parent / "recipes").glob("*.yaml"))
 
@@ -488,3 +491,14 @@ def test_the_training_part_is_what_it_was_before_optimizers_and_refreshing():
     sgd = Recipe(name="x", train=Train(method="aegis", optimizer="sgd"), aegis=Aegis(refresh=4))
     assert training_part(sgd)["train"]["optimizer"] == "sgd"
     assert training_part(sgd)["aegis"]["refresh"] == 4
+
+
+def test_a_study_knows_which_rates_a_learner_never_reads():
+    for name in LEARNERS:
+        learner = learners.get(name)
+        unread = set(UNREAD_RATES.get(name, {}))
+        if learner.trains == "experts":
+            own = options(StreamRecipe(name="x", stream="primer", train=StreamTrain(method=name)))
+            assert unread == ({"train.router_lr"} if "router_lr" in own else set())
+        else:
+            assert unread == {"train.lr", "train.router_lr"}

@@ -11,15 +11,19 @@ import json
 import statistics
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from samples.robots import Make
 from samples.vqa_files import write_jsonl
 
+from aegis_cli.common import files, version
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.continual import train
+from aegis_cli.continual.report import vqa_scores
+from aegis_cli.core.accuracy_matrix import SeenScores
 from aegis_cli.recipes import RobotStreamRecipe, RobotStreamStudyRecipe, load_training, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.studies import comparison, robot_stream_cells
@@ -109,12 +113,33 @@ def test_the_figures_are_those_of_the_streams_alone(
 ) -> None:
     report, folder, _ = finished
     assert report.finished == report.cells == 4 and report.tasks == list(TASKS)
+    cells = files.load_json(folder / "cells.json")
+    runner = RobotStreamRunner(tmp_path / "keys", ignore)
     for result in report.results:
         alone = []
         for seed in (3, 4):
             recipe = load_training(folder / "stream" / result.variant / str(seed) / "recipe.yaml")
             assert isinstance(recipe, RobotStreamRecipe) and recipe.seed == seed
-            alone.append(train.run(recipe, tmp_path / result.variant / str(seed)))
+            one = train.run(recipe, tmp_path / result.variant / str(seed))
+            recorded = dataclasses.replace(
+                recipe, demos=dataclasses.replace(recipe.demos, paths=None)
+            )
+            cell = cells[runner.key(Cell("any", recorded))]
+            assert cell["success"] == [list(row) for row in one.success]
+            assert cell["vqa"] == [each.accuracy for each in one.vqa]
+            assert cell["cross_entropy"] == [each.cross_entropy for each in one.vqa]
+            alone.append(one)
+    told = [cell["cross_entropy"] for cell in cells.values()]
+    assert len({tuple(one) for one in told}) == 4  # each asks other questions, or learns otherwise
+    for result in report.results:
+        alone = [
+            train.run(
+                load_training(folder / "stream" / result.variant / str(seed) / "recipe.yaml"),
+                tmp_path / result.variant / str(seed),
+                resume=True,
+            )
+            for seed in (3, 4)
+        ]
         assert result.last.mean == statistics.fmean(one.scores.last for one in alone)
         lost = statistics.fmean(one.vqa[-1].drop_points for one in alone)
         assert result.drop_points.mean == pytest.approx(lost, abs=1e-9)
@@ -168,10 +193,15 @@ def test_a_finished_study_is_told_shown_and_not_run_again(
 def test_processes_find_what_one_finds(
     finished: tuple[Any, Path, list[Path]], tiny_folder: Path, tmp_path: Path
 ) -> None:
-    report, _, _ = finished
+    report, folder, _ = finished
     together = stage.run(study(tmp_path, tiny_folder), tmp_path, workers=2)
     for one, other in zip(report.results, together.results, strict=True):
         assert dataclasses.replace(other, minutes=one.minutes) == one
+    cells = [files.load_json(at / "cells.json") for at in (folder, tmp_path / "small")]
+    for found in cells:
+        for cell in found.values():
+            del cell["minutes"]
+    assert cells[0] == cells[1]
     assert not (tmp_path / "small" / "stream").exists()  # runs are cleared unless they are kept
 
 
@@ -201,6 +231,34 @@ def test_a_run_is_cleared_without_the_folder_where_another_may_begin(tmp_path: P
     (tmp_path / "stream" / "kept").mkdir()  # nobody's label
     runner.tidy(["stream/igsp/3", "stream/igsp/4"])
     assert not folder.exists() and (tmp_path / "stream" / "kept").is_dir()
+
+
+def test_a_file_of_somebody_elses_is_moved_with_its_run_not_removed(tmp_path: Path) -> None:
+    runner = RobotStreamRunner(tmp_path, ignore)
+    run = tmp_path / "stream" / "igsp" / "3"
+    run.mkdir(parents=True)
+    (run / "my-notes.txt").write_text("mine")
+    runner.clear("stream/igsp/3")
+    assert not run.exists()
+    assert [p.read_text() for p in (tmp_path / "stream").rglob("my-notes.txt")] == ["mine"]
+
+
+def test_begun_anew_a_study_records_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded: list[str] = []
+
+    def run(task: str, episodes: int, seed: int, out: Path, *_: Any, **__: Any) -> None:
+        recorded.append(task)
+        out.write_bytes(b"frames")
+
+    monkeypatch.setattr("aegis_cli.training.up_to_date.record.run", run)
+    recipe = RobotStreamStudy(study(tmp_path)).cell("sequential", "stream", 3, None)
+    RobotStreamRunner(tmp_path, ignore).demonstrations(recipe)
+    RobotStreamRunner(tmp_path, ignore).demonstrations(recipe)
+    assert recorded == ["reach", "point"]
+    anew = RobotStreamRunner(tmp_path, ignore)
+    anew.begin_anew()
+    anew.demonstrations(recipe)
+    assert recorded == ["reach", "point"] * 2
 
 
 # --- seeds of a stream ---------------------------------------------------------------------------
@@ -266,6 +324,25 @@ def test_a_cell_is_another_where_what_shapes_it_is(
         key(dataclasses.replace(plain, sequential=type(plain.sequential)(lr=1.0))),
     ]
     assert set(same) == {keys[0]}
+
+
+def test_a_cell_keeps_what_its_report_says() -> None:
+    vqa = vqa_scores([(0.9, 0.1), (0.8, 0.2), (0.6, 0.3)])
+    report = SimpleNamespace(
+        method="igsp",
+        success=((0.5,), (0.25, 0.75)),
+        scores=SeenScores(average=0.1, last=0.2, forgetting=0.3),
+        vqa=vqa,
+        parameters=7,
+        trained_mean=5.0,
+        reuse=0.4,
+        minutes=2.0,
+    )
+    found = RobotStreamRunner(Path("any"), ignore).figures(report)
+    assert (found.average, found.last, found.forgetting) == (0.1, 0.2, 0.3)
+    assert found.vqa == (0.9, 0.8, 0.6) and found.cross_entropy == (0.1, 0.2, 0.3)
+    assert found.success == report.success and found.parameters == 7 and found.reuse == 0.4
+    assert found.trained_mean == 5.0 and found.minutes == 2.0 and found.code == version.code()
 
 
 # --- tables --------------------------------------------------------------------------------------
@@ -364,6 +441,20 @@ def test_a_divergence_is_kept_as_a_finding(tmp_path: Path, monkeypatch: pytest.M
         ({"variants": {"x": {"method": "igsp", "set": {"rollout.seed": 3}}}}, "rollout.seed"),
         ({"variants": {"isolated-lora": {"method": "igsp"}}}, "isolated-lora"),
         ({"variants": {"x": {"method": "igsp", "tune": {"igsp.rank": [1, 2]}}}}, "tune"),
+        ({"per_seed": [["demos"]]}, "per_seed"),
+        ({"per_seed": [{"demos": 1}]}, "per_seed"),
+        (
+            {"variants": {"x": {"method": "igsp", "set": {"demos.paths": ["a", "b"]}}}},
+            "variants.x.set: demos.paths",
+        ),
+        ({"variants": {"x": {"method": "sequential", "set": {"train.lr": 1}}}}, "sequential.lr"),
+        (
+            {
+                "variants": {"x": {"method": "igsp", "set": {"rollout.seed": 3}}},
+                "per_seed": ["demos"],
+            },
+            "rollout.seed",
+        ),
     ],
 )
 def test_a_bad_study_is_refused_before_any_work(
