@@ -563,6 +563,7 @@ def probe(
     questions: Annotated[
         int, Option(help="Number of held-out questions; of files, at most.", callback=positive)
     ] = 5000,
+    seed: Annotated[int, Option(help="Seed of the choice of questions.", callback=seed_number)] = 0,
     ask: OwnAsk = None,
     skip_bad: SkipBad = False,
     predictions: Annotated[
@@ -621,6 +622,7 @@ def probe(
             predictions=predictions,
             skip_bad=asks.skip_bad,
             ask=asks.ask,
+            seed=seed,
             keep=True,
             device=device,
             as_json=as_json,
@@ -740,6 +742,12 @@ def rollout(
     ] = None,
     episodes: Episodes = 50,
     colors: Annotated[Colors, Option(help="Colours the targets are drawn from.")] = Colors.seen,
+    seed: Annotated[
+        int,
+        Option(
+            help="Seed of the episodes, none of which is a demonstration's.", callback=seed_number
+        ),
+    ] = 0,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     device: Device = None,
     as_json: Json = False,
@@ -763,6 +771,7 @@ def rollout(
         colors.value,
         video,
         load=load_acting,
+        seed=seed,
         keep=True,
         device=device,
         as_json=as_json,

@@ -105,6 +105,7 @@ def run(
     keep: bool = False,
     on_event: OnEvent = ignore,
     ask: str = sets.PLAIN,
+    seed: int = PROBE_SEED,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
@@ -117,6 +118,7 @@ def run(
         keep: write the report into the run's folder, if `target` is a run or one of its
             checkpoints.
         ask: what a question becomes before a model reads it, with {} for it.
+        seed: of the choice of questions.
 
     Where torchrun has started several processes, each calls this, and they share the questions.
 
@@ -140,7 +142,7 @@ def run(
     measured = None if anchor is None else _anchor(anchor, model, before)
     # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
-    asked = source.choose("probe", questions, PROBE_SEED, checks, on_event)
+    asked = source.choose("probe", questions, seed, checks, on_event)
     with joined() as ranks:
         after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
@@ -155,7 +157,8 @@ def run(
         files.write_text(predictions, "".join(lines))
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
-        settings = {"vqa": vqa, "ask": ask, "questions": questions, "baseline": baseline}
+        settings = {"vqa": vqa, "ask": ask, "questions": questions, "seed": seed}
+        settings |= {"baseline": baseline}
         settings |= {"max_drop": max_drop, "gate": gate}
         name = f"probe-{source.name}"
         results.keep(Path(target), name, report.to_json() | wrong, settings)

@@ -218,15 +218,21 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None)
     commands = [_command("aegis", "train", again, *inputs)]
     for vqa in sets:
         counted = ("--vqa", vqa, "--questions", recipe.probe.questions)
-        commands.append(_command("aegis", "probe", new, *counted, *asked))
+        drawn = _seed(recipe.probe.seed)
+        commands.append(_command("aegis", "probe", new, *counted, *drawn, *asked))
     if task is not None:
-        episodes = ("--episodes", recipe.rollout.episodes)
+        episodes = ("--episodes", recipe.rollout.episodes, *_seed(recipe.rollout.seed))
         colors = [("--colors", each) for each in recipe.rollout.colors]
         commands += [
             _command("aegis", "rollout", new, *episodes, *own)
             for own in (colors if sim.has_colors(task) else [()])
         ]
     return commands
+
+
+def _seed(seed: int) -> tuple[object, ...]:
+    """The option of a seed that is not the default."""
+    return ("--seed", seed) if seed else ()
 
 
 def _beside(path: Path, name: str) -> str:

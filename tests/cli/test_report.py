@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from samples.command import refused
 from samples.reports import HOSTILE, METHODS, write_job
 from samples.studies import found
@@ -97,6 +98,20 @@ def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:
     assert document["kind"] == "run" and document["label"] == "aegis"
     check_figures(page, document)
     assert "aegis train" in page.said and "aegis rollout NEW_FOLDER" in page.said
+
+
+def test_the_commands_of_a_run_ask_and_play_by_its_seeds(aegis, job: Path) -> None:
+    run = next(path.parent for path in sorted(job.glob("*/recipe.yaml")))
+    keys = yaml.safe_load((run / "recipe.yaml").read_text())
+    assert not any("--seed" in line for line in _commands(aegis, run))
+    keys["probe"]["seed"], keys["rollout"]["seed"] = 5, 6
+    (run / "recipe.yaml").write_text(yaml.safe_dump(keys))
+    seeds = {line.split()[1]: line for line in _commands(aegis, run)}
+    assert "--seed 5" in seeds["probe"] and "--seed 6" in seeds["rollout"]
+
+
+def _commands(aegis, run: Path) -> list[str]:
+    return json.loads(aegis("report", run, "--json")[1])["commands"]
 
 
 def test_a_page_loads_nothing_and_runs_nothing(aegis, job: Path) -> None:

@@ -412,6 +412,17 @@ def test_a_run_is_asked_the_questions_that_its_recipe_names(
     assert code == 0 and json.loads(text)["questions"] == 8
 
 
+def test_another_seed_asks_other_questions(aegis, taught: Path, tmp_path: Path) -> None:
+    asked = {}
+    for name, options in {"plain": (), "0": ("--seed", 0), "7": ("--seed", 7)}.items():
+        out = tmp_path / f"{name}.jsonl"
+        code, _, err = aegis("probe", taught, "--questions", 40, "--predictions", out, *options)
+        assert code == 0, err
+        lines = [json.loads(line) for line in out.read_text().splitlines()]
+        asked[name] = [(line["question"], line["reference"]) for line in lines]
+    assert asked["plain"] == asked["0"] != asked["7"] and len(asked["7"]) == 40
+
+
 def test_stop_gradient_keeps_every_answer(
     taught: Path, own_anchor: Path, demos_file: Path, tmp_path: Path
 ) -> None:

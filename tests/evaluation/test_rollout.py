@@ -264,6 +264,24 @@ def test_json_keys(aegis, run_folder: Path) -> None:
     ) == 2
 
 
+def test_another_seed_plays_other_episodes(aegis, run_folder: Path) -> None:
+    kept = run_folder / "results" / "rollout-seen.json"
+    for seed in (0, 7):
+        code, _, err = aegis("rollout", run_folder, "--episodes", 2, "--seed", seed)
+        assert code == 0 and json.loads(kept.read_text())["settings"]["seed"] == seed, err
+    with pytest.MonkeyPatch.context() as patch:
+        begun: list[tuple[int, int]] = []
+        begin = rollout._begin
+
+        def noted(task: str, seed: int, stream: int, number: int, *rest: Any) -> Any:
+            begun.append((seed, number))
+            return begin(task, seed, stream, number, *rest)
+
+        patch.setattr(rollout, "_begin", noted)
+        assert aegis("rollout", run_folder, "--episodes", 2, "--seed", 7)[0] == 0
+    assert begun == [(7, 0), (7, 1)]
+
+
 def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
     code, out, _ = aegis("rollout", run_folder, "--episodes", 1)
     assert code == 0 and "success" in out and " %" in out
