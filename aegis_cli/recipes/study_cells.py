@@ -199,7 +199,7 @@ def _check(
     drawn = raw.get("per_seed")
     per_seed = _per_seed(drawn if isinstance(drawn, list) else ())
     places_given = {**rules.given, **dict.fromkeys(per_seed, "per_seed")}
-    reserved = {**places_given, **dict.fromkeys(rules.for_all)}
+    reserved = {**dict.fromkeys(rules.for_all), **places_given}
     readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
