@@ -10,9 +10,11 @@ demonstrations.
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,6 +43,10 @@ class DeployedPolicy:
             that is not known, or the backbone reads squares of `image_size`.
         positions, actions: P and A, how many numbers each of them has.
         chunk: how many actions are predicted at once, of which `replan` are executed.
+        action_names, state_names: of the A actions and the P positions, in their order; None where
+            the demonstrations had none, or the policy is older than these names.
+        fps: actions per second, as many as the demonstrations had frames; None where that is not
+            known.
     """
 
     def __init__(
@@ -51,12 +57,23 @@ class DeployedPolicy:
         replan: int,
         seed: int = 0,
         sizes: Sequence[tuple[int, int]] = (),
+        recorded: Mapping[str, Any] | None = None,
     ) -> None:
+        """Begin the first episode.
+
+        Args:
+            recorded: what a checkpoint's meta says of the demonstrations: `action_names`,
+                `proprio_names` and `fps`, each only where it is known.
+        """
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self.replan, self._seed = task, tuple(cameras), replan, seed
         self.sizes = tuple(sizes)
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
         self.chunk = policy.expert.shape.chunk
+        known = recorded or {}
+        self.action_names = _names(known.get("action_names"))
+        self.state_names = _names(known.get("proprio_names"))
+        self.fps: float | None = known.get("fps")
         self.reset()
 
     @property
@@ -71,13 +88,15 @@ class DeployedPolicy:
 
     def begin(self) -> DeployedPolicy:
         """The same policy at the beginning of an episode of its own; the weights are shared."""
-        return DeployedPolicy(
-            self._policy, self.task, self.cameras, self.replan, self._seed, self.sizes
-        )
+        other = copy.copy(self)
+        other._generator = torch.Generator()
+        other.reset()
+        return other
 
     def reset(self) -> None:
         """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[np.ndarray] = deque()
+        self._follows: str | None = None  # the instruction that the actions ahead are of
         self._generator.manual_seed(self._seed)
 
     def select_action(
@@ -85,14 +104,19 @@ class DeployedPolicy:
     ) -> np.ndarray:
         """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
+        Another instruction than that of the chunk predicts at once, and drops what is left of it.
+
         Raises:
             AegisError: what `predict_action_chunk` finds wrong, at each call: a robot whose sensor
                 fails does not move on by an older prediction.
         """
         self._checked(pictures, instruction, positions)
+        if instruction != self._follows:
+            self._ahead.clear()
         if not self._ahead:
             chunk = self.predict_action_chunk(pictures, instruction, positions)
             self._ahead.extend(chunk[: self.replan])
+            self._follows = instruction
         return self._ahead.popleft()
 
     def predict_action_chunk(
@@ -177,10 +201,18 @@ def _picture(given: np.ndarray) -> np.ndarray:
         AegisError: it is none.
     """
     found = np.asarray(given)
-    if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
+    is_picture = found.ndim == 3 and found.shape[2] == 3 and found.dtype == np.uint8
+    if not is_picture or 0 in found.shape:
         said = f"a picture of shape {found.shape} and type {found.dtype}"
-        raise AegisError(said, "[H, W, 3] uint8, RGB", "channels come last, values are 0 to 255")
+        fix = "channels come last, values are 0 to 255"
+        if is_picture:
+            fix = "see whether the camera has given a frame"
+        raise AegisError(said, "[H, W, 3] uint8, RGB, of at least one pixel", fix)
     return found
+
+
+def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:
+    return None if given is None else tuple(given)
 
 
 def load_policy(
@@ -218,6 +250,7 @@ def load_policy(
         meta["replan"],
         seed,
         checkpoint.sizes_of(meta),
+        meta,
     )
 
 

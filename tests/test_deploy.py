@@ -11,16 +11,17 @@ import pytest
 import torch
 from samples.training import images, make_policy
 
-from aegis_cli import load_policy
+from aegis_cli import load_policy, sim
 from aegis_cli.common import devices
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import robots
 from aegis_cli.continual.train import run as learn_stream
 from aegis_cli.deploy import DeployedPolicy
+from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint
 
-TEXT, REPLAN = "go to the red target", 2
+TEXT, OTHER, REPLAN = "go to the red target", "go to the blue target", 2
 POSITIONS = [0.3, -0.1, 0.2]
 
 
@@ -47,6 +48,30 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
     assert (own.task, own.cameras, own.replan) == ("reach", (), meta["replan"])
 
 
+def test_it_knows_the_names_of_its_numbers_and_its_rate(run_folder: Path, tmp_path: Path) -> None:
+    """Those of the demonstrations, also of another episode and after each export and back."""
+    spec = sim.make("reach").spec
+    expected = (spec.action_names, spec.proprio_names, spec.control_hz)
+    export.run(run_folder, tmp_path / "lerobot")
+    export.run(tmp_path / "lerobot", tmp_path / "back", card.AEGIS)
+    export.run(run_folder, tmp_path / "plain", card.AEGIS)
+    for folder in (run_folder, *(tmp_path / name for name in ("lerobot", "back", "plain"))):
+        for own in (load_policy(folder), load_policy(folder).begin()):
+            assert (own.action_names, own.state_names, own.fps) == expected
+
+
+def test_an_older_checkpoint_has_neither_names_nor_rate() -> None:
+    old = Path(__file__).parent / "samples" / "old_runs" / "policy-2e38d13" / "run"
+    own = load_policy(old)
+    assert (own.action_names, own.state_names, own.fps) == (None, None, None)
+
+
+def test_an_empty_picture_of_a_runs_policy_is_refused(run_folder: Path) -> None:
+    own = load_policy(run_folder)
+    with pytest.raises(AegisError, match=r"\(0, 640, 3\)"):
+        own.select_action(np.zeros((0, 640, 3), np.uint8), TEXT, [0.0] * own.positions)
+
+
 @pytest.mark.parametrize("task", ["reach", "point"])
 def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path: Path) -> None:
     learn_stream(make("igsp"), tmp_path / "run")
@@ -70,6 +95,26 @@ def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_pictur
     np.testing.assert_array_equal(
         np.stack(taken), np.concatenate([first[:REPLAN], second[:REPLAN]])
     )
+
+
+def test_another_instruction_drops_the_chunk_of_the_one_before() -> None:
+    """What is left of a chunk is not played on, nor taken up again."""
+    own, other = deployed(), deployed()
+    first = other.predict_action_chunk(frame(0), TEXT, POSITIONS)
+    second = other.predict_action_chunk(frame(1), OTHER, POSITIONS)
+    third = other.predict_action_chunk(frame(3), TEXT, POSITIONS)
+    texts = (TEXT, OTHER, OTHER, TEXT, TEXT)
+    taken = [own.select_action(frame(i), text, POSITIONS) for i, text in enumerate(texts)]
+    np.testing.assert_array_equal(
+        np.stack(taken), np.concatenate([first[:1], second[:REPLAN], third[:REPLAN]])
+    )
+
+
+def test_an_unknown_word_is_refused_before_a_chunk_has_ended() -> None:
+    own = deployed()
+    own.select_action(frame(), TEXT, POSITIONS)
+    with pytest.raises(AegisError, match="xylophone"):
+        own.select_action(frame(), "go to the xylophone", POSITIONS)
 
 
 def test_an_episode_begins_anew_after_reset() -> None:
@@ -150,6 +195,8 @@ def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
         ((), frame()[None], POSITIONS, ("shape (1, ", "[H, W, 3] uint8")),
         ((), frame().astype(np.float32) / 255, POSITIONS, ("float32", "0 to 255")),
         ((), frame().transpose(2, 0, 1), POSITIONS, ("shape (3, ", "channels come last")),
+        ((), np.zeros((0, 64, 3), np.uint8), POSITIONS, ("shape (0, 64, 3)", "given a frame")),
+        ((), np.zeros((64, 0, 3), np.uint8), POSITIONS, ("shape (64, 0, 3)", "one pixel")),
         ((), {"top": frame()}, POSITIONS, ("pictures of top", "one picture")),
         (("top", "wrist"), frame(), POSITIONS, ("2 cameras", "top, wrist")),
         (("top", "wrist"), {"top": frame()}, POSITIONS, ("pictures of top", "top, wrist")),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,6 +54,8 @@ class Demonstrations:
         cameras: names of the LeRobot folder's cameras that these frames come from.
         watched: the files that frames are read from.
         action_names, proprio_names: of their A and P numbers; empty where the data names none.
+        fps: frames per second, which is the rate at which the robot was controlled; None where the
+            data does not say.
     """
 
     task: str | None
@@ -68,6 +71,24 @@ class Demonstrations:
     watched: tuple[WatchedFiles | WatchedPaths, ...] = ()
     action_names: tuple[str, ...] = ()
     proprio_names: tuple[str, ...] = ()
+    fps: float | None = None
+
+    @property
+    def recorded(self) -> dict[str, Any]:
+        """What a policy's meta says of the robot: `action_names`, `proprio_names` and `fps`.
+
+        Names are left out unless each number has one, and so is a rate that is not known.
+        """
+        told = {
+            "action_names": (self.action_names, self.tensors["actions"]),
+            "proprio_names": (self.proprio_names, self.tensors["proprio"]),
+        }
+        found: dict[str, Any] = {
+            key: list(names)
+            for key, (names, rows) in told.items()
+            if all(names) and len(names) == rows.shape[1] > 0
+        }
+        return found if self.fps is None else {**found, "fps": self.fps}
 
     def check_files(self) -> None:
         """Raise AegisError if somebody has written to what the frames are read from."""
@@ -266,6 +287,7 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
         watched=(watched,),
         action_names=tuple(meta.get("action_names", ())),
         proprio_names=tuple(meta.get("proprio_names", ())),
+        fps=float(meta["control_hz"]) if "control_hz" in meta else None,
     )
 
 
@@ -314,6 +336,7 @@ def _load_folder(
         (WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
         action_names,
         proprio_names,
+        found.info.fps,
     )
 
 
@@ -326,7 +349,7 @@ def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, t
     read = [rows.read_vectors(source, name) for name in chosen]
     joined = np.concatenate([np.zeros((source.dataset.info.frames, 0), np.float32), *read], axis=1)
     names = [source.dataset.info.features[name].components for name in chosen]
-    named = tuple(itertools.chain(*names)) if all(names) else ()
+    named = tuple(itertools.chain(*names)) if all(map(any, names)) else ()
     return torch.from_numpy(joined), named
 
 

@@ -18,7 +18,7 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import least_spread
 from aegis_cli.data.demonstrations import Demonstrations
@@ -161,6 +161,7 @@ def run(
         cache=False,
     )
     _check_fit(policy, shown, meta, data)
+    _check_names(shown, meta, data, on_event)
     at = _spread(shown, chosen, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
@@ -295,6 +296,33 @@ def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], d
             "give the run's folder, whose recipe names them",
         )
     policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
+
+
+def _check_names(
+    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
+) -> None:
+    """Compare the joints' names with the policy's, where both have them; other names are warned of.
+
+    Raises:
+        AegisError: a joint of the policy that has another place here.
+    """
+    recorded = shown.recorded
+    for key, what in (("action_names", "actions"), ("proprio_names", "positions")):
+        own, found = meta.get(key), recorded.get(key)
+        if own is None or found is None or own == found:
+            continue
+        if moved := [n for n in own if n in found and found.index(n) != own.index(n)]:
+            raise AegisError(
+                f"'{moved[0]}' in another place in '{data}', with {what} {', '.join(found)}",
+                f"{', '.join(own)}, in this order, as the policy was trained on",
+                "give demonstrations in the policy's order, or train on these",
+            )
+        text = (
+            f"the {what} in '{data}' are named {', '.join(found)}, and those that the policy was "
+            f"trained on {', '.join(own)}: the errors mean something only if these are the same "
+            "joints in the same order"
+        )
+        on_event(Warned("evaluate", text))
 
 
 def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.Tensor:

@@ -32,6 +32,7 @@ TYPE, KIND = "aegis", "policy"  # LeRobot's name for the policy, and ours for it
 MODEL, CONFIG, BACKBONE = "model.safetensors", "config.json", "backbone"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
+_OBSERVED = "observation."  # what whole names of LeRobot's begin with
 CAMERA = "top"  # that of our own tasks
 # LeRobot wants a size. A policy that was exported before sizes were kept does not know its own.
 _ANY_SIZE = 224
@@ -46,6 +47,9 @@ _SAID = (
     "pictures",
     "state",
     "action",
+    "action_names",
+    "proprio_names",
+    "fps",
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 
@@ -59,7 +63,8 @@ def write(
 
     Args:
         meta: what a policy's user has to know: method, task, replan, normalization and, where they
-            are known, what actions are relative to, the cameras and the sizes of their pictures.
+            are known, what actions are relative to, the cameras and the sizes of their pictures,
+            the names of actions and positions, and the frames per second.
         cameras: other names of the pictures, in the order in which the backbone takes them.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)
@@ -127,6 +132,11 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     return policy.eval(), meta
 
 
+def picture_key(name: str) -> str:
+    """LeRobot's name of a picture; a dataset's own, such as `observation.image`, stays."""
+    return name if name.startswith(_OBSERVED) else f"{IMAGES}{name}"
+
+
 def own_tensors(policy: Policy) -> dict[str, Tensor]:
     """What a policy is made of by name; a tensor with several names goes by the first."""
     named = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
@@ -158,7 +168,7 @@ def _config(policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str]) -> 
     side = policy.backbone.image_size or _ANY_SIZE
     sizes = meta.get("pictures") or [(side, side)] * len(cameras)
     pictures = {
-        f"{IMAGES}{name}": _feature("VISUAL", 3, *size)
+        picture_key(name): _feature("VISUAL", 3, *size)
         for name, size in zip(cameras, sizes, strict=True)
     }
     return {

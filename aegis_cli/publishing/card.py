@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli import inspection, methods, recipes
+from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import InspectReport
+from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+_AS_IT_IS = "{}"  # what `probe.ask` makes of a question where it changes nothing
 
 _CARD = """---
 {front}
@@ -61,7 +64,7 @@ By sha256:
 _USE = {
     AEGIS: """```sh
 hf download {repo} --local-dir {folder}
-aegis probe {folder} --baseline {backbone} --vqa {vqa}
+{probe}
 {act}
 ```
 
@@ -72,12 +75,12 @@ from aegis_cli import load_policy
 
 policy = load_policy("{folder}")
 ```""",
-    LEROBOT: """LeRobot loads it with the package `lerobot_policy_aegis`, Aegis without LeRobot:
+    LEROBOT: """LeRobot loads it with {plugins}, Aegis without LeRobot:
 
 ```sh
-lerobot-eval --policy.path={repo}
+{lerobot}
 hf download {repo} --local-dir {folder}
-aegis probe {folder} --baseline {backbone} --vqa {vqa}
+{probe}
 {act}
 ```""",
 }
@@ -97,13 +100,16 @@ class Stored:
         return said
 
 
-def text(run: Path, at: Path, form: str, repo: str, stored: Stored) -> str:
+def text(
+    run: Path, at: Path, form: str, repo: str, stored: Stored, cameras: Sequence[str] = ()
+) -> str:
     """The card of the checkpoint `at` of a run.
 
     Args:
         form: AEGIS for a checkpoint as it is, LEROBOT for one in LeRobot's layout.
         repo: where others find the policy, ORG/NAME on the hub.
         stored: how the weights are written that the card comes with.
+        cameras: what LeRobot calls the pictures, in their order; empty for the task's own camera.
 
     Raises:
         AegisError: a run that is damaged.
@@ -132,16 +138,49 @@ def text(run: Path, at: Path, form: str, repo: str, stored: Stored) -> str:
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),
-        use=_use(form, repo, recipe, facts["task"]),
+        use=_use(form, repo, recipe, facts["task"], cameras),
     )
 
 
-def _use(form: str, repo: str, recipe: recipes.Recipe, task: str | None) -> str:
+def _use(
+    form: str, repo: str, recipe: recipes.Recipe, task: str | None, cameras: Sequence[str] = ()
+) -> str:
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
     folder = f"policies/{repo.split('/')[-1]}"
     act = f"aegis rollout {folder}" if task else f"aegis evaluate {folder} --demos DEMONSTRATIONS"
-    asked = recipe.probe.of_each_set()[0].vqa
-    return _USE[form].format(repo=repo, folder=folder, backbone=recipe.backbone, vqa=asked, act=act)
+    plugins = ["lerobot_policy_aegis", *(["lerobot_env_aegis"] if task else [])]
+    return _USE[form].format(
+        repo=repo,
+        folder=folder,
+        probe=_probe_command(folder, recipe),
+        act=act,
+        plugins=" and ".join(f"`{name}`" for name in plugins),
+        lerobot=_lerobot_command(repo, task, cameras),
+    )
+
+
+def _probe_command(folder: str, recipe: Recipe) -> str:
+    """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
+    probe = recipe.probe.of_each_set()[0]
+    words = ["aegis", "probe", folder, "--baseline", recipe.backbone, "--vqa", str(probe.vqa)]
+    if probe.ask != _AS_IT_IS:
+        words += ["--ask", probe.ask]
+    return shlex.join(words)
+
+
+def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str:
+    """LeRobot's command that lets the policy act, in our simulation or on a robot."""
+    if task is None:
+        return (
+            f"lerobot-rollout --strategy.type=base --policy.path={repo} --robot.type=ROBOT "
+            "--task=INSTRUCTION"
+        )
+    if len(cameras) > 1:
+        return f"# lerobot-eval cannot: our tasks have one camera there, the policy {len(cameras)}"
+    command = f"lerobot-eval --policy.path={repo} --env.type=aegis --env.task={task}"
+    own = sim.cameras(task)[0]
+    named = [name.removeprefix(lerobot_folder.IMAGES) for name in cameras] or [own]
+    return command if named == [own] else f"{command} --env.camera={shlex.quote(named[0])}"
 
 
 def _measured(run: Path, at: Path) -> InspectReport:

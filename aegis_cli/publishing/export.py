@@ -101,7 +101,7 @@ def run(
             else:
                 _write_checkpoint(aside, run, policy, meta)
             stored = card.Stored(meta.get("stored", FLOAT32), rounded)
-            _write_card(aside, run, form, repo or f"ORG/{out.name}", stored)
+            _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
             os.rename(aside, out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
@@ -191,16 +191,17 @@ def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: Mapping[str
 
 
 def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
-    """LeRobot's names of the pictures."""
-    prefix = lerobot_folder.IMAGES
-    return tuple(f"{prefix}{name.removeprefix(prefix)}" for name in cameras)
+    """LeRobot's names of the pictures; a dataset's own, such as `observation.image`, stay."""
+    return tuple(lerobot_folder.picture_key(name) for name in cameras)
 
 
-def _write_card(folder: Path, run: Path, form: str, repo: str, stored: card.Stored) -> None:
+def _write_card(
+    folder: Path, run: Path, form: str, repo: str, stored: card.Stored, cameras: Sequence[str]
+) -> None:
     """Write the model card of a run's policy; a policy without a run has nothing to say."""
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
     home = checkpoint.run_of(at)
     if home is not None:
-        write_text(folder / card.NAME, card.text(home, at, form, repo, stored))
+        write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))

@@ -8,7 +8,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aegis_cli.common.errors import AegisError
@@ -23,6 +23,34 @@ if TYPE_CHECKING:
 
 RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 _REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
+# What lies in `backbone/` after a push: the model's files and its card, and what transformers calls
+# the files of a processor. One of another backbone would be loaded together with the new one.
+_OF_BACKBONE = {
+    "README.md",
+    "config.json",
+    "generation_config.json",
+    "aegis.json",
+    "processor_config.json",
+    "preprocessor_config.json",
+    "video_preprocessor_config.json",
+    "audio_tokenizer_config.json",
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "special_tokens_map.json",
+    "added_tokens.json",
+    "vocab.json",
+    "vocab.txt",
+    "merges.txt",
+    "chat_template.json",
+    "chat_template.jinja",
+    "tokenizer.model",
+    "tiktoken.model",
+    "tekken.json",
+    "spiece.model",
+    "sentencepiece.model",
+    "sentencepiece.bpe.model",
+}
+_TEMPLATES = "additional_chat_templates"  # the only folder of a processor's
 _LONGEST = 96  # characters of a repository's name, by the hub's rules
 _NO_TOKEN = "hf auth login, or set HF_TOKEN to one of https://huggingface.co/settings/tokens"
 
@@ -36,7 +64,8 @@ class PushReport:
         dtype: name of the type that the backbone's weights are in.
         url: of the commit; None where nothing was sent.
         files: their paths in the repository.
-        removed: paths of a policy in the other layout that was there; not known of a dry run.
+        removed: paths of a policy of ours that was there before, which the new one lacks; not
+            known of a dry run.
         megabytes: the sizes of `files` together.
     """
 
@@ -64,8 +93,9 @@ def run(
 ) -> PushReport:
     """Send a run's policy, or that of a checkpoint in a run, to the hub in one commit.
 
-    A repository that is not there is created. Of its other files those go that a push in the other
-    layout has left, which would be loaded instead of the new policy; all others stay.
+    A repository that is not there is created. Of its other files those go that an earlier push has
+    left, in either layout or with another backbone, which would be loaded instead of the new policy
+    or with it; all others stay.
 
     Args:
         repo: ORG/NAME.
@@ -157,17 +187,17 @@ def _send(
                 "a private repository, or a new one",
                 "choose another name, or make it private in its settings",
             )
-        removed = _of_the_other_layout(api, repo, contents)
+        removed = _of_an_earlier_push(api, repo, contents)
         changes = [*added, *(CommitOperationDelete(path) for path in removed)]
         message = f"A policy of Aegis {__version__}"
         commit = api.create_commit(repo, changes, commit_message=message)
     return str(commit.commit_url), removed
 
 
-def _of_the_other_layout(api: HfApi, repo: str, contents: Mapping[str, Path]) -> tuple[str, ...]:
-    """The files that an earlier push in the other layout has left in a repository."""
+def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> tuple[str, ...]:
+    """The files that an earlier push, in either layout, has left and that this one lacks."""
     siblings = api.repo_info(repo).siblings or []
-    there = {file.rfilename for file in siblings} - set(contents)
+    there = {file.rfilename for file in siblings}
     left = set[str]()
     if {lerobot_folder.CONFIG, lerobot_folder.MODEL} <= there:
         # Other policies and models have files of these names.
@@ -176,11 +206,21 @@ def _of_the_other_layout(api: HfApi, repo: str, contents: Mapping[str, Path]) ->
             left |= {lerobot_folder.CONFIG, lerobot_folder.MODEL}
             left |= {lerobot_folder.PREPROCESSOR, lerobot_folder.POSTPROCESSOR}
     if checkpoint.EXPERT in there:
-        weights = [
-            n for n in there if PurePosixPath(n).match(f"{checkpoint.BACKBONE}/*.safetensors")
-        ]
-        left |= {checkpoint.EXPERT, RECIPE, *weights}
-    return tuple(sorted(left & there))
+        left |= {checkpoint.EXPERT, RECIPE}
+    if left:
+        left |= {path for path in there if _is_of_a_backbone(path)}
+    return tuple(sorted((left & there) - set(contents)))
+
+
+def _is_of_a_backbone(path: str) -> bool:
+    """Whether our own writing gives files this path, below the folder of a policy's backbone."""
+    folder, _, name = path.partition("/")
+    if folder != checkpoint.BACKBONE:
+        return False
+    below, _, last = name.rpartition("/")
+    if below:
+        return below == _TEMPLATES and last.endswith(".jinja")
+    return name in _OF_BACKBONE or name.endswith(".safetensors")
 
 
 @contextlib.contextmanager

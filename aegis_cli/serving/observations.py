@@ -35,7 +35,7 @@ class Reader:
     def __init__(self, policy: DeployedPolicy, prompt: str | None = None) -> None:
         self._policy, self._prompt = policy, prompt
         names = policy.cameras or ("image",)
-        self.images = {f"observation/{layout.short(name)}": name for name in names}
+        self.images = {_key(name): name for name in names}
 
     def greeting(self) -> dict[str, Any]:
         """The metadata that a client gets when it connects."""
@@ -51,6 +51,9 @@ class Reader:
             "actions": policy.actions,
             "chunk": policy.chunk,
             "replan": policy.replan,
+            "action_names": _listed(policy.action_names),
+            "state_names": _listed(policy.state_names),
+            "fps": policy.fps,
         }
 
     def read(self, message: Any) -> Observation:
@@ -62,7 +65,7 @@ class Reader:
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
         if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
-            message = {**message, next(iter(self.images)): message[IMAGE]}
+            message = {next(iter(self.images)): message[IMAGE], **message}  # its own key wins
         wanted = [*self.images, STATE, *([PROMPT] if self._prompt is None else [])]
         missing = [key for key in wanted if key not in message]
         if missing:
@@ -94,3 +97,13 @@ class Reader:
         images = ", ".join(f"'{key}': [H, W, 3] uint8" for key in self.images)
         expected = f"{{{images}, '{STATE}': [{self._policy.positions}], '{PROMPT}': text}}"
         return AegisError(found, expected, "name and shape them as the server's metadata says")
+
+
+def _key(camera: str) -> str:
+    """A camera's key in an observation; that of a dataset's `observation.image` is as openpi's."""
+    return f"observation/{layout.short(camera).removeprefix('observation.')}"
+
+
+def _listed(names: tuple[str, ...] | None) -> list[str] | None:
+    """The names as a client unpacks them."""
+    return None if names is None else list(names)

@@ -94,7 +94,8 @@ class TrainingRun:
         `task` is None for one that is not simulated; `cameras`, in their order, are there if they
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
         if it is not float32; `relative`, for each action the place of the position that it is
-        predicted relative to, or None, if any is.
+        predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
+        as the demonstrations say them.
         """
         found = {
             "method": self.method.name,
@@ -103,6 +104,7 @@ class TrainingRun:
             "normalization": self.recipe.train.normalization,
         }
         found |= recipes.selected(self.recipe)
+        found |= self.demos.recorded
         if self.policy.origins.places:
             found["relative"] = list(self.policy.origins.places)
         if self.demos.cameras:

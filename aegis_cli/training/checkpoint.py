@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -291,8 +292,10 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
     """
     if lerobot_folder.is_policy(Path(folder)):
         policy, meta = lerobot_folder.load(Path(folder))
+        sizes = len(policy.action_scale.mean), len(policy.proprio_scale.mean)
         with reading_meta(Path(folder) / lerobot_folder.MODEL):
             _check_user_meta(meta)
+            _check_recorded(meta, *sizes)
         return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
@@ -336,6 +339,7 @@ def _load_expert(
         if backbone is not None:
             check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         _check_user_meta(meta)
+        _check_recorded(meta, shape.actions, shape.proprio)
         relative_of(meta, shape.actions, shape.proprio)
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
@@ -369,6 +373,24 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
     for size in meta.get("pictures", []):
         if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
             raise ValueError(f"'pictures' has the size {size!r}")
+
+
+def _check_recorded(meta: Mapping[str, Any], actions: int, positions: int) -> None:
+    """Raise ValueError unless names and rate, where there are any, are of such a robot.
+
+    Checkpoints that were written before these were kept have none of them.
+    """
+    for key, count in (("action_names", actions), ("proprio_names", positions)):
+        names = meta.get(key)
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"'{key}' is {names!r}")
+        if len(names) != count:
+            raise ValueError(f"'{key}' has {len(names)} names for {count} numbers")
+    fps = meta.get("fps", 1.0)
+    if type(fps) not in (int, float) or not 0 < fps < math.inf:
+        raise ValueError(f"'fps' is {fps!r}")
 
 
 def sizes_of(meta: Mapping[str, Any]) -> tuple[tuple[int, int], ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,13 @@ from samples import lerobot
 from samples.training_runs import SETTINGS
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, train
@@ -299,6 +302,46 @@ def test_a_checkpoint_without_its_run_does_not_know_what_it_was_trained_on(
 def test_demonstrations_of_another_robot_are_refused(naive_run: Path, tmp_path: Path) -> None:
     record.run("point", 2, 0, tmp_path / "point.safetensors", workers=1)
     assert "2 positions and 2 actions" in refusal(naive_run, tmp_path / "point.safetensors")
+
+
+@pytest.fixture(scope="module")
+def named(naive_run: Path) -> tuple[Policy, dict[str, Any]]:
+    return checkpoint.load_policy(naive_run)
+
+
+def renamed(
+    names: Mapping[str, list[str]], named: tuple[Policy, dict[str, Any]], folder: Path
+) -> Path:
+    """The policy with other names in its meta."""
+    folder.mkdir()
+    lerobot_folder.write(folder, named[0], {**named[1], **names})
+    return folder
+
+
+def test_joints_in_another_order_are_refused(
+    named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
+) -> None:
+    actions = renamed({"action_names": ["dy", "dx"]}, named, tmp_path / "actions")
+    said = refusal(actions, demos_file)
+    assert "'dy' in another place" in said and "dy, dx, in this order" in said
+    names = named[1]["proprio_names"]
+    turned = renamed({"proprio_names": names[1:] + names[:1]}, named, tmp_path / "positions")
+    assert f"positions {', '.join(names)}" in refusal(turned, demos_file)
+
+
+def test_joints_of_other_names_are_warned_of(
+    named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
+) -> None:
+    def heard(policy: Path) -> list[str]:
+        events: list[Event] = []
+        open_loop.run(policy, demos_file, episodes=[0], frames=2, on_event=events.append)
+        return [event.text for event in events if isinstance(event, Warned)]
+
+    (text,) = heard(renamed({"action_names": ["left", "dy"]}, named, tmp_path / "other"))
+    assert "are named dx, dy" in text and "trained on left, dy" in text
+    without = {n: v for n, v in named[1].items() if n not in ("action_names", "proprio_names")}
+    assert heard(renamed({}, (named[0], without), tmp_path / "none")) == []
+    assert heard(renamed({}, named, tmp_path / "same")) == []
 
 
 @pytest.mark.parametrize("wrong", [[8], [0, 99]])

@@ -115,6 +115,30 @@ def test_the_command_says_what_lerobot_will_see(
     assert "there already" in again
 
 
+def test_a_camera_that_a_dataset_names_otherwise_keeps_its_name(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    """As `observation.image` of lerobot/pusht; the prefix is added to bare names alone."""
+    report = export.run(run_folder, tmp_path / "x", camera="observation.image")
+    assert report.pictures == ("observation.image",)
+    features = json_of(tmp_path / "x" / "config.json")["input_features"]
+    assert list(features) == ["observation.image", "observation.state"]
+    assert checkpoint.load_policy(tmp_path / "x")[1]["cameras"] == ["observation.image"]
+    assert load_policy(tmp_path / "x").cameras == ("observation.image",)
+    again = export.run(tmp_path / "x", tmp_path / "again")
+    assert again.pictures == report.pictures
+    whole = export.run(run_folder, tmp_path / "y", camera="observation.images.wrist")
+    assert whole.pictures == ("observation.images.wrist",)
+
+
+def test_the_card_names_a_picture_that_is_not_the_tasks_own(
+    run_folder: Path, exported: Path, tmp_path: Path
+) -> None:
+    export.run(run_folder, tmp_path / "x", camera="wrist")
+    assert "--env.task=reach --env.camera=wrist\n" in (tmp_path / "x" / "README.md").read_text()
+    assert "--env.task=reach\n" in (exported / "README.md").read_text()
+
+
 def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None:
     export.run(exported, tmp_path / "again")
     one, other = (folder / "model.safetensors" for folder in (exported, tmp_path / "again"))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,16 +14,31 @@ import torch
 import yaml
 from samples.command import refused
 from samples.hub import Hub
+from samples.small_run import recipe as small
 
 from aegis_cli import recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, push
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, train
 
 Aegis = Callable[..., tuple[int, str, str]]
 REPO = "somebody/reach-naive"
+# Files that other backbones' processors have, and some that only a user can have put there.
+PROCESSOR = {
+    "backbone/tokenizer.model",
+    "backbone/vocab.txt",
+    "backbone/video_preprocessor_config.json",
+    "backbone/additional_chat_templates/brief.jinja",
+}
+MINE = (
+    "notes.txt",
+    "backbone/notes.txt",
+    "backbone/notes/config.json",
+    "backbone/additional_chat_templates/notes.txt",
+    "old/backbone/config.json",
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +90,42 @@ def test_a_push_in_another_layout_takes_the_place_of_the_one_before(
     assert set(report.removed) == before - set(hub.committed)
     assert lerobot_folder.is_policy(download(hub, tmp_path / "x")) == (second == card.LEROBOT)
     checkpoint.load_policy(tmp_path / "x")
+
+
+@pytest.fixture(scope="module")
+def smolvlm_run(
+    hf_folder: Callable[[str], Path], demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A run whose backbone has files that the embedded one does not have."""
+    out = tmp_path_factory.mktemp("runs") / "smolvlm"
+    train.run(small(hf_folder("smolvlm"), steps=1), "naive", demos_file, None, out)
+    return out
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_push_with_another_backbone_leaves_no_file_of_the_one_before(
+    form: str, run_folder: Path, smolvlm_run: Path, hub: Hub, tmp_path: Path, own_cache: None
+) -> None:
+    push.run(smolvlm_run, REPO, form)
+    hub.committed |= dict.fromkeys(PROCESSOR, b"of an earlier backbone")
+    hub.committed |= dict.fromkeys(MINE, b"mine")
+    before = set(hub.committed)
+    report = push.run(run_folder, REPO, form)
+    assert set(hub.committed) == {*report.files, *MINE}
+    assert set(report.removed) == before - set(hub.committed) > PROCESSOR
+    own = checkpoint.load_policy(run_folder)[0]
+    found = checkpoint.load_policy(download(hub, tmp_path / "x"))[0]
+    assert found.backbone.fingerprint() == own.backbone.fingerprint()
+    push.run(smolvlm_run, REPO, form)
+    loaded = checkpoint.load_policy(download(hub, tmp_path / "y"))[0]
+    assert type(loaded.backbone).__name__ == "HFBackbone" and set(MINE) <= set(hub.committed)
+
+
+def test_a_backbone_that_no_policy_of_ours_was_pushed_with_stays(
+    run_folder: Path, hub: Hub, own_cache: None
+) -> None:
+    hub.committed |= dict.fromkeys(PROCESSOR, b"theirs")
+    assert push.run(run_folder, REPO).removed == ()
 
 
 @pytest.mark.parametrize("config", [b'{"type": "smolvla"}', b'{"model_type": "smolvlm"}', b"no"])
@@ -138,8 +192,57 @@ def test_a_card_says_what_a_policy_of_its_kind_can_be_used_for(
     recipe = recipes.load(run_folder / "recipe.yaml")
     for form in (card.AEGIS, card.LEROBOT):
         said = card._use(form, "somebody/x", recipe, task)
-        assert line in said and ("rollout" in said) == (task is not None)
-        assert "--vqa scenes" in said
+        assert line in said and ("aegis rollout" in said) == (task is not None)
+        assert "--vqa scenes\n" in said
+
+
+def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
+    recipe = recipes.load(run_folder / "recipe.yaml")
+    ask = "{} Answer 'yes' or \"no\", in $1 word."
+    asked = dataclasses.replace(recipe, probe=dataclasses.replace(recipe.probe, ask=ask))
+    for form in FORMS:
+        assert "--ask" not in card._use(form, "somebody/x", recipe, "reach")
+        (line,) = re.findall(
+            "^aegis probe .*$", card._use(form, "somebody/x", asked, "reach"), re.M
+        )
+        words = shlex.split(line)
+        assert (
+            words[words.index("--ask") + 1] == ask and words[words.index("--vqa") + 1] == "scenes"
+        )
+
+
+@pytest.mark.parametrize(
+    ("task", "cameras", "command"),
+    [
+        ("reach", (), "lerobot-eval {} --env.type=aegis --env.task=reach"),
+        ("reach", ("top",), "lerobot-eval {} --env.type=aegis --env.task=reach"),
+        (
+            "reach",
+            ("wrist",),
+            "lerobot-eval {} --env.type=aegis --env.task=reach --env.camera=wrist",
+        ),
+        (
+            "metaworld/mt4",
+            ("observation.images.corner2",),
+            "lerobot-eval {} --env.type=aegis --env.task=metaworld/mt4",
+        ),
+        ("metaworld/mt4", ("corner", "gripperPOV"), "# lerobot-eval cannot: .* the policy 2"),
+        (
+            None,
+            ("observation.image",),
+            "lerobot-rollout --strategy.type=base {} --robot.type=ROBOT --task=INSTRUCTION",
+        ),
+    ],
+)
+def test_a_card_for_lerobot_has_a_command_that_can_run(
+    task: str | None, cameras: tuple[str, ...], command: str, run_folder: Path
+) -> None:
+    """`lerobot-eval` stops without an environment, and ours have one camera."""
+    recipe = recipes.load(run_folder / "recipe.yaml")
+    said = card._use(card.LEROBOT, "somebody/x", recipe, task, cameras)
+    line = said.split("```sh\n")[1].splitlines()[0]
+    assert re.fullmatch(command.format("--policy.path=somebody/x"), line)
+    assert ("lerobot_env_aegis" in said) == (task is not None)
 
 
 def test_a_dry_run_needs_no_token_and_sends_nothing(

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from samples.serving import TEXT, deployed, observation
+from samples.training import make_policy
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.serving.observations import Reader
 
 CAMERAS = ("observation.images.top", "wrist")
@@ -41,6 +43,32 @@ def test_the_picture_of_a_single_camera_has_two_names(key: str) -> None:
     picture = seen.pop("observation/image")
     found = Reader(deployed(cameras=("observation.images.wrist",))).read(seen | {key: picture})
     np.testing.assert_array_equal(found.pictures, picture)
+
+
+def test_a_datasets_own_name_of_a_picture_is_openpis() -> None:
+    """As in lerobot/pusht."""
+    assert list(Reader(deployed(cameras=("observation.image",))).images) == ["observation/image"]
+
+
+@pytest.mark.parametrize("first", ["observation/image", "observation/wrist"])
+def test_the_only_cameras_own_key_goes_before_the_one_of_every_policy(first: str) -> None:
+    """A robot of two cameras sends its scene as `observation/image`, too."""
+    seen = observation()
+    scene, wrist = seen.pop("observation/image"), np.full((64, 64, 3), 7, np.uint8)
+    both = {"observation/image": scene, "observation/wrist": wrist}
+    ordered = {first: both[first]} | both
+    found = Reader(deployed(cameras=("observation.images.wrist",))).read(ordered | seen)
+    np.testing.assert_array_equal(found.pictures, wrist)
+
+
+def test_the_greeting_names_numbers_and_rate_where_they_are_known() -> None:
+    told = {"action_names": ["dx", "dy"], "proprio_names": ["x", "y", "z"], "fps": 12.5}
+    policy = DeployedPolicy(make_policy().eval(), "reach", (), replan=2, recorded=told)
+    greeting = Reader(policy).greeting()
+    assert greeting["action_names"] == ["dx", "dy"] and greeting["fps"] == 12.5
+    assert greeting["state_names"] == ["x", "y", "z"]
+    unknown = Reader(deployed()).greeting()
+    assert [unknown[key] for key in ("action_names", "state_names", "fps")] == [None] * 3
 
 
 @pytest.mark.parametrize("missing", ["observation/wrist", "observation/state", "prompt"])

@@ -146,6 +146,8 @@ def test_a_message_that_is_no_observation_gets_an_error_and_ends_nothing(
         ({"observation/state": [[1], [1, 2]]}, "no array"),
         ({"observation/image": np.zeros((3, 64, 64), np.uint8)}, "shape (3, 64, 64)"),
         ({"observation/image": np.zeros((64, 64, 3))}, "type float64"),
+        ({"observation/image": np.zeros((0, 64, 3), np.uint8)}, "shape (0, 64, 3)"),
+        ({"observation/image": np.zeros((64, 0, 3), np.uint8)}, "shape (64, 0, 3)"),
         ({"observation/image": "picture"}, "shape ()"),
         ({"prompt": 5}, "'prompt' is int"),
         ({"prompt": "go to the xylophone"}, "'xylophone'"),

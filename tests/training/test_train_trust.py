@@ -329,6 +329,10 @@ EXPERT = "expert.action_in.weight"
         (lambda t, m: m.update(replan="often"), "'replan' is 'often'"),
         (lambda t, m: m.update(task=3), "'task' is 3"),
         (lambda t, m: m.update(cameras=[1, 2]), "'cameras' is [1, 2]"),
+        (lambda t, m: m.update(action_names=["dx"]), "'action_names' has 1 names for 2 numbers"),
+        (lambda t, m: m.update(proprio_names="xy"), "'proprio_names' is 'xy'"),
+        (lambda t, m: m.update(fps=0), "'fps' is 0"),
+        (lambda t, m: m.update(fps="often"), "'fps' is 'often'"),
     ],
 )
 def test_an_expert_that_does_not_fit_is_refused(

@@ -289,6 +289,28 @@ def test_several_features_are_joined_in_their_order(folder: Path) -> None:
     assert found.proprio_names == ("dx", "dy", "x", "y", "z")
 
 
+def nameless(folder: Path, feature: str) -> None:
+    edit_info(folder, lambda info: info["features"][feature].update(names=None))
+
+
+def test_names_and_rate_are_kept_as_far_as_the_data_says_them(folder: Path) -> None:
+    """Of a feature without names, and so of what it is joined with, there are none."""
+    found = loaded(folder)
+    names = {"action_names": ["dx", "dy"], "proprio_names": ["x", "y", "z"]}
+    assert found.recorded == names | {"fps": 10.0}
+    nameless(folder, "observation.state")
+    found = loaded(folder, selection=Selection(state=("action", "observation.state")))
+    assert found.proprio_names == () and found.action_names == ("dx", "dy")
+    assert found.recorded == {"action_names": ["dx", "dy"], "fps": 10.0}
+
+
+def test_nameless_actions_are_relative_to_positions_by_their_order(folder: Path) -> None:
+    for feature in ("observation.state", "action"):
+        nameless(folder, feature)
+    found = loaded(folder, selection=Selection(state="action"))
+    assert found.relative_places(()) == (0, 1)
+
+
 def test_a_file_has_no_features_to_choose(demos_file: Path) -> None:
     with pytest.raises(AegisError, match="demos.state: joints with the file"):
         loaded(demos_file, selection=Selection(state="joints"))

@@ -26,6 +26,7 @@ from aegis_cli.training import checkpoint
 from lerobot_policy_aegis.configuration_aegis import AegisConfig
 
 TASK, IS_PAD, INDEX = "task", "action_is_pad", "index"
+OBSERVED = "observation."  # what whole names of LeRobot's begin with
 Statistics = Mapping[str, Mapping[str, Any]]
 
 
@@ -244,7 +245,7 @@ class AegisPolicy(PreTrainedPolicy):
         given = list(self.config.image_features)
         if not named:
             return given
-        keys = [f"{lerobot_folder.IMAGES}{name}" for name in named]
+        keys = [_key(name, given) for name in named]
         if set(keys) != set(given):
             raise AegisError(
                 f"pictures {', '.join(given)}", ", ".join(keys), "name them as training did"
@@ -290,7 +291,15 @@ def _texts(batch: Mapping[str, Any]) -> list[str]:
 
 
 def _short(name: str) -> str:
+    """A picture's name as it is saved; one such as `observation.image` is saved whole."""
     return name.removeprefix(lerobot_folder.IMAGES)
+
+
+def _key(name: str, given: Sequence[str]) -> str:
+    """LeRobot's name of the picture that was saved by `name`."""
+    key = f"{lerobot_folder.IMAGES}{name}"
+    # `aegis export` once put the prefix before whole names too, and such policies still load.
+    return name if name.startswith(OBSERVED) and key not in given else key
 
 
 def _new(config: AegisConfig, statistics: Statistics | None) -> Policy:

@@ -1,0 +1,167 @@
+"""The plugin's policy keeps the names of pictures, tried with a stand-in of LeRobot."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from samples.training import make_policy, policy_over
+from torch import nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.models import backbones, lerobot_folder
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import checkpoint
+
+SOURCE = Path(__file__).parents[2] / "plugins" / "lerobot_policy_aegis" / "src"
+IMAGE, WRIST = "observation.image", "observation.images.wrist"
+
+
+class FeatureType(Enum):
+    STATE, VISUAL, ENV, ACTION = range(4)
+
+
+class NormalizationMode(Enum):
+    IDENTITY = 0
+
+
+@dataclass
+class PolicyFeature:
+    type: FeatureType
+    shape: tuple[int, ...]
+
+
+@dataclass
+class Registered:
+    """What LeRobot finds by a name, and what the plugin's optimizers begin with."""
+
+    @classmethod
+    def register_subclass(cls, _: str) -> Callable[[type], type]:
+        return lambda registered: registered
+
+
+@dataclass
+class PreTrainedConfig(Registered):
+    """The features of a policy, as LeRobot tells them apart."""
+
+    input_features: dict[str, PolicyFeature] = field(default_factory=dict)
+    output_features: dict[str, PolicyFeature] = field(default_factory=dict)
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        pass
+
+    @property
+    def image_features(self) -> dict[str, PolicyFeature]:
+        found = self.input_features.items()
+        return {name: each for name, each in found if each.type is FeatureType.VISUAL}
+
+    @property
+    def robot_state_feature(self) -> PolicyFeature | None:
+        return self.input_features.get("observation.state")
+
+    @property
+    def action_feature(self) -> PolicyFeature | None:
+        return self.output_features.get("action")
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        (save_directory / "config.json").write_text('{"type": "aegis"}')
+
+
+class PreTrainedPolicy(nn.Module):
+    def __init__(self, config: PreTrainedConfig) -> None:
+        super().__init__()
+
+
+STAND_IN: dict[str, dict[str, Any]] = {
+    "lerobot": {},
+    "lerobot.configs": {
+        "FeatureType": FeatureType,
+        "NormalizationMode": NormalizationMode,
+        "PreTrainedConfig": PreTrainedConfig,
+    },
+    "lerobot.optim": {
+        "AdamWConfig": Registered,
+        "CosineDecayWithWarmupSchedulerConfig": Registered,
+        "OptimizerConfig": Registered,
+    },
+    "lerobot.policies": {"PreTrainedPolicy": PreTrainedPolicy},
+    "lerobot.utils": {},
+    "lerobot.utils.constants": {"ACTION": "action", "OBS_STATE": "observation.state"},
+}
+
+
+@pytest.fixture
+def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The plugin's module of policies, on the stand-in; both are gone afterwards."""
+    for name, content in STAND_IN.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.syspath_prepend(str(SOURCE))
+    from lerobot_policy_aegis import modeling_aegis
+
+    yield modeling_aegis
+    for name in [name for name in sys.modules if name.startswith("lerobot_policy_aegis")]:
+        del sys.modules[name]
+
+
+def config(plugin: Any, model: Policy, *pictures: str) -> Any:
+    features = {name: PolicyFeature(FeatureType.VISUAL, (3, 30, 40)) for name in pictures}
+    positions = (len(model.proprio_scale.mean),)
+    features["observation.state"] = PolicyFeature(FeatureType.STATE, positions)
+    actions = PolicyFeature(FeatureType.ACTION, (len(model.action_scale.mean),))
+    return plugin.AegisConfig(features, {"action": actions}, chunk_size=model.expert.shape.chunk)
+
+
+def saved(plugin: Any, model: Policy, folder: Path, *pictures: str) -> dict[str, Any]:
+    """What is known of a policy after LeRobot has saved it."""
+    folder.mkdir()
+    plugin.AegisPolicy(config(plugin, model, *pictures), model=model)._save_pretrained(folder)
+    return checkpoint.load_policy(folder)[1]
+
+
+@pytest.mark.parametrize(
+    ("picture", "name"), [(IMAGE, IMAGE), (WRIST, "wrist"), ("observation.images.a.b", "a.b")]
+)
+def test_a_picture_that_was_saved_is_found_again_by_its_name(
+    picture: str, name: str, plugin: Any, tmp_path: Path
+) -> None:
+    model = make_policy().eval()
+    meta = saved(plugin, model, tmp_path / "x", picture)
+    assert meta["cameras"] == [name]
+    again = plugin.AegisPolicy(config(plugin, model, picture), model=model, meta=meta)
+    assert again._cameras == [picture]
+    shown = {picture: torch.zeros(1, 3, 30, 40)}
+    assert len(again._images(shown)) == 1
+
+
+def test_pictures_are_taken_in_the_order_of_training_whatever_they_are_called(
+    plugin: Any, hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
+    model = policy_over(backbones.load(str(hf_folder("smolvlm")))).eval()
+    meta = saved(plugin, model, tmp_path / "x", WRIST, IMAGE)
+    assert meta["cameras"] == ["wrist", IMAGE]
+    again = plugin.AegisPolicy(config(plugin, model, IMAGE, WRIST), model=model, meta=meta)
+    assert again._cameras == [WRIST, IMAGE]
+
+
+def test_a_policy_that_was_exported_with_an_invented_name_still_loads(plugin: Any) -> None:
+    model, invented = make_policy().eval(), f"{lerobot_folder.IMAGES}{IMAGE}"
+    meta = {"task": None, "normalization": "mean_std", "cameras": [IMAGE]}
+    policy = plugin.AegisPolicy(config(plugin, model, invented), model=model, meta=meta)
+    assert policy._cameras == [invented]
+
+
+def test_other_pictures_are_refused_with_the_names_of_training(plugin: Any) -> None:
+    model = make_policy().eval()
+    meta = {"task": None, "normalization": "mean_std", "cameras": [IMAGE]}
+    with pytest.raises(AegisError, match=f"{WRIST}\nexpected: {IMAGE}\n"):
+        plugin.AegisPolicy(config(plugin, model, WRIST), model=model, meta=meta)
