@@ -290,6 +290,8 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
         8,
         "--max-drop",
         0.5,
+        "--seed",
+        3,
         "--json",
     )
     assert calls == [
@@ -301,6 +303,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
                 "predictions": None,
                 "skip_bad": False,
                 "ask": "{}",
+                "seed": 3,
                 "keep": True,
             },
         )
@@ -317,12 +320,14 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
         "held-out",
         "--video",
         "v.gif",
+        "--seed",
+        4,
         "--json",
     )
     assert calls == [
         (
             (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
-            {"load": load_acting, "keep": True},
+            {"load": load_acting, "seed": 4, "keep": True},
         )
     ]
     calls, drawn = stage("evaluate", Evaluated()), []
