@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,73 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
         1,
         lambda _: None,
     )
+
+
+def as_version_2(folder: Path, version: str) -> Path:
+    """Make a dataset of version v3.0 one of v2.0 or v2.1, two episodes a chunk.
+
+    Videos are taken as they are, so each must hold one episode.
+    """
+    meta, info = folder / "meta", json.loads((folder / "meta/info.json").read_text())
+    rows = parquet.read_table(meta / "episodes/chunk-000/file-000.parquet").to_pylist()
+    _move_videos(folder, info, rows)
+    _share_rows(folder, len(rows))
+    _save_lines(meta / "tasks.jsonl", parquet.read_table(meta / "tasks.parquet").to_pylist())
+    told = ("episode_index", "tasks", "length")
+    _save_lines(meta / "episodes.jsonl", [{name: row[name] for name in told} for row in rows])
+    if version == "v2.1":
+        _save_lines(meta / "episodes_stats.jsonl", [_stats_row(row) for row in rows])
+        (meta / "stats.json").unlink()
+    (meta / "tasks.parquet").unlink()
+    shutil.rmtree(meta / "episodes")
+    chunk, episode = "chunk-{episode_chunk:03d}", "episode_{episode_index:06d}"
+    info |= {
+        "codebase_version": version,
+        "chunks_size": 2,
+        "total_chunks": -(-len(rows) // 2),
+        "total_videos": len(list(folder.glob("videos/*/*/*.mp4"))),
+        "data_path": f"data/{chunk}/{episode}.parquet",
+        "video_path": f"videos/{chunk}/{{video_key}}/{episode}.mp4",
+    }
+    (meta / "info.json").write_text(json.dumps(info))
+    return folder
+
+
+def _move_videos(folder: Path, info: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+    keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    for key in keys:
+        for number, row in enumerate(rows):
+            chunk, file = (row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index"))
+            target = folder / f"videos/chunk-{number // 2:03d}/{key}/episode_{number:06d}.mp4"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (folder / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4").rename(target)
+        shutil.rmtree(folder / "videos" / key)
+
+
+def _share_rows(folder: Path, count: int) -> None:
+    """A parquet file for each episode."""
+    table = pa.concat_tables([parquet.read_table(path) for path in data_files(folder)])
+    shutil.rmtree(folder / "data")
+    of = table.column("episode_index").to_numpy()
+    for number in range(count):
+        path = folder / f"data/chunk-{number // 2:03d}/episode_{number:06d}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(table.filter(pa.array(of == number)), path)
+
+
+def _stats_row(row: dict[str, Any]) -> dict[str, Any]:
+    """An episode's figures as version 2.1 has them, which knew no quantiles."""
+    stats: dict[str, dict[str, Any]] = {}
+    for name, value in row.items():
+        if name.startswith("stats/") and not name.rpartition("/")[2].startswith("q"):
+            _, feature, figure = name.split("/")
+            stats.setdefault(feature, {})[figure] = value
+    return {"episode_index": row["episode_index"], "stats": stats}
+
+
+def _save_lines(path: Path, rows: list[dict[str, Any]]) -> None:
+    text = "".join(f"{json.dumps(row, ensure_ascii=False)}\n" for row in rows)
+    path.write_text(text, "utf-8")
 
 
 # --- taking files apart --------------------------------------------------------------------------

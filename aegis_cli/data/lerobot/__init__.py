@@ -1,1 +1,1 @@
-"""LeRobot's dataset format v3.0, read and written with pyarrow and PyAV, without torch."""
+"""LeRobot's dataset format, read (v2.0 to v3.0) and written (v3.0) without torch or lerobot."""

@@ -1,9 +1,18 @@
-"""Where LeRobot's dataset format v3.0 keeps what, and `meta/info.json`, which says so.
+"""Where LeRobot's dataset format keeps what, and `meta/info.json`, which says so.
 
-meta/info.json  meta/stats.json  meta/tasks.parquet
-meta/episodes/chunk-000/file-000.parquet    a row per episode
-data/chunk-000/file-000.parquet             a row per frame; embedded images are in it
-videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
+Version 3.0, which is also written:
+
+    meta/info.json  meta/stats.json  meta/tasks.parquet
+    meta/episodes/chunk-000/file-000.parquet    a row per episode
+    data/chunk-000/file-000.parquet             a row per frame; embedded images are in it
+    videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
+
+Versions 2.0 and 2.1, which have a file for each episode:
+
+    meta/info.json  meta/tasks.jsonl  meta/episodes.jsonl
+    meta/stats.json (2.0)  meta/episodes_stats.jsonl (2.1)
+    data/chunk-000/episode_000000.parquet
+    videos/chunk-000/<camera>/episode_000000.mp4
 """
 
 from __future__ import annotations
@@ -14,17 +23,18 @@ import json
 import math
 import re
 import string
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
-VERSION = "v3.0"
-INFO, STATS, TASKS = Path("meta/info.json"), Path("meta/stats.json"), Path("meta/tasks.parquet")
+VERSION = "v3.0"  # of what is written
+READ = "version 2.0, 2.1 or 3.0"
+INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
 EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -41,10 +51,9 @@ INDEX_FEATURES = {
 _NUMBER = re.compile(r"(0?[1-9])?d?")  # how a path's number may be formatted
 AGAIN = "get the dataset again, or another one"  # the cure for one that is not whole
 
-_CONVERTER = (
-    "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name} "
-    "--root={folder} --push-to-hub=false"
-)
+Place = Mapping[str, int]  # the numbers that a template of paths has fields for
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -61,20 +70,29 @@ class Feature:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The names of its numbers, or of a picture's channels; empty texts where it has none."""
+        """The names of its numbers, or of a picture's channels.
+
+        They are empty texts where it has none, or another number of them: openpi's datasets call
+        eight positions `["state"]`.
+        """
         if self.dtype in ("image", "video"):
             return ("red", "green", "blue")
         names = self.names
         if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
             names = next((list(value) for value in names.values() if isinstance(value, list)), None)
-        if isinstance(names, list):
+        count = math.prod(self.shape)
+        if isinstance(names, list) and len(names) == count:
             return tuple(map(str, names))
-        return ("",) * math.prod(self.shape)
+        return ("",) * count
 
 
 @dataclass(frozen=True)
 class Info:
-    """What `meta/info.json` says, as far as Aegis reads it."""
+    """What `meta/info.json` says, as far as Aegis reads it.
+
+    Attributes:
+        chunk_episodes: how many episodes a folder of files holds in versions 2.0 and 2.1.
+    """
 
     version: str
     fps: float
@@ -85,6 +103,7 @@ class Info:
     data_path: str
     video_path: str | None
     splits: Mapping[str, str] = field(default_factory=dict)
+    chunk_episodes: int = 1000
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -94,10 +113,43 @@ class Info:
         )
 
     @property
+    def videos(self) -> tuple[str, ...]:
+        """The features that are video, those of depth among them."""
+        return tuple(name for name, feature in self.features.items() if feature.dtype == "video")
+
+    @property
+    def has_episode_files(self) -> bool:
+        """Whether each episode has files of its own, as before version 3.0."""
+        return _numbers_of(self.version)[0] < 3
+
+    @property
     def task(self) -> str | None:
         """The simulated task that `aegis demos` recorded; None for any other dataset."""
         kind = self.robot_type or ""
         return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The video file that an episode is in, and where it begins there, in seconds."""
+
+    file: Path
+    start_s: float
+
+
+@dataclass(frozen=True)
+class EpisodeIndex:
+    """Where an episode is; paths are relative to the dataset's folder.
+
+    Attributes:
+        length: number of its frames.
+        data: the parquet file with its rows, as far as the meta folder knows (see `source`).
+        clips: its clip for each video feature.
+    """
+
+    length: int
+    data: Path
+    clips: Mapping[str, Clip]
 
 
 def short(camera: str) -> str:
@@ -129,7 +181,7 @@ def read_info(folder: Path) -> Info:
     if not is_dataset(folder):
         raise AegisError(
             f"'{folder}' is no dataset folder: it has no {INFO}",
-            f"a LeRobot dataset {VERSION}",
+            f"a LeRobot dataset of {READ}",
             "give the folder that holds meta/ and data/",
         )
     raw = files.load_json(folder / INFO)
@@ -139,25 +191,23 @@ def read_info(folder: Path) -> Info:
 
 
 def _check_version(folder: Path, version: str) -> None:
+    major, minor = _numbers_of(version)
+    if 2 <= major <= 3:
+        return
+    fix = "upgrade aegis: git pull && pip install -e ."
+    if (major, minor) < (2, 0):
+        fix = "convert it to version 2.0 with a release of LeRobot that reads it"
+    raise AegisError(f"'{folder}' is a LeRobot dataset {version}", READ, fix)
+
+
+def _numbers_of(version: str) -> tuple[int, int]:
+    """The first two numbers of a version.
+
+    Raises:
+        ValueError: it is none.
+    """
     major, minor = (int(part) for part in f"{version.lstrip('v')}.0".split(".")[:2])
-    if (major, minor) < (2, 1):
-        fix = (
-            "convert it to v2.1 with a release of LeRobot that reads it, then to v3.0 with a "
-            "later one"
-        )
-        raise AegisError(f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", fix)
-    if major < 3:
-        fix = _CONVERTER.format(name=folder.resolve().name, folder=folder)
-        raise AegisError(
-            f"'{folder}' is a LeRobot dataset {version}",
-            f"version {VERSION}",
-            f"convert it with LeRobot: {fix}",
-        )
-    if major > 3:
-        upgrade = "upgrade aegis: git pull && pip install -e ."
-        raise AegisError(
-            f"'{folder}' is a LeRobot dataset {version}", f"version {VERSION}", upgrade
-        )
+    return major, minor
 
 
 def _parse(raw: Mapping[str, Any]) -> Info:
@@ -172,15 +222,18 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         str(raw["data_path"]),
         raw.get("video_path"),
         _splits(raw.get("splits")),
+        int(raw.get("chunks_size", 1000)),
     )
     if not 0 < info.fps < math.inf:
         raise ValueError(f"fps is {info.fps:g}")
     if not isinstance(info.robot_type, str | None):
         raise ValueError(f"robot_type is {info.robot_type}")
-    data_file(info, 0, 0)
-    for name, feature in features.items():
-        if feature.dtype == "video":
-            video_file(info, name, 0, 0)
+    if info.chunk_episodes < 1:
+        raise ValueError(f"chunks_size is {info.chunk_episodes}")
+    first = episode_place(info, 0) if info.has_episode_files else file_place(0, 0)
+    data_file(info, first)
+    for name in info.videos:
+        video_file(info, name, first)
     return info
 
 
@@ -194,13 +247,24 @@ def _splits(raw: Any) -> dict[str, str]:
     return {str(name): said for name, said in raw.items() if isinstance(said, str)}
 
 
-def data_file(info: Info, chunk: int, file: int) -> Path:
+def file_place(chunk: int, file: int) -> Place:
+    """The numbers of a file of version 3.0."""
+    return {"chunk_index": chunk, "file_index": file}
+
+
+def episode_place(info: Info, number: int) -> Place:
+    """The numbers of an episode's own file, before version 3.0."""
+    return {"episode_chunk": number // info.chunk_episodes, "episode_index": number}
+
+
+def data_file(info: Info, place: Place) -> Path:
     """The parquet file with these numbers, from the dataset's folder.
 
     Raises:
-        ValueError: the dataset's template is none, or leads out of the folder.
+        KeyError: the dataset's template has a field that is none of them.
+        ValueError: it is no template, or leads out of the folder.
     """
-    return _filled(info.data_path, {"chunk_index": chunk, "file_index": file})
+    return _filled(info.data_path, place)
 
 
 def data_files(info: Info, folder: Path) -> list[Path]:
@@ -214,15 +278,14 @@ def data_files(info: Info, folder: Path) -> list[Path]:
     return [path for path in found if fits.fullmatch(path.relative_to(folder).as_posix())]
 
 
-def video_file(info: Info, camera: str, chunk: int, file: int) -> Path:
+def video_file(info: Info, camera: str, place: Place) -> Path:
     """The video file of a camera with these numbers, from the dataset's folder.
 
     Raises:
-        ValueError: the dataset's template is none, or it or the camera's name leads out of the
-            folder.
+        KeyError: the dataset's template has a field that is none of them.
+        ValueError: it is no template, or it or the camera's name leads out of the folder.
     """
-    values = {"video_key": camera, "chunk_index": chunk, "file_index": file}
-    return _filled(str(info.video_path), values)
+    return _filled(str(info.video_path), {"video_key": camera, **place})
 
 
 def _filled(template: str, values: Mapping[str, str | int]) -> Path:
@@ -263,6 +326,49 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
         return {str(name): dict(figures) for name, figures in stats.items()}
 
 
+def by_number(entries: Iterable[tuple[Any, _T]]) -> dict[int, _T]:
+    """What a file says of episodes or tasks, by their rising numbers.
+
+    Raises:
+        ValueError: a number is none, or stands there twice.
+    """
+    found: dict[int, _T] = {}
+    for said, entry in entries:
+        number = int(said)
+        if number in found:
+            raise ValueError(f"number {number} is there twice")
+        found[number] = entry
+    return dict(sorted(found.items()))
+
+
+def texts_of(tasks: Mapping[int, Any]) -> tuple[str, ...]:
+    """The tasks' texts by their numbers.
+
+    Raises:
+        ValueError: they are no texts, or a number is missing.
+    """
+    if list(tasks) != list(range(len(tasks))):
+        raise ValueError("the tasks are not numbered from 0")
+    if not all(isinstance(text, str) for text in tasks.values()):
+        raise ValueError("a task is no text")
+    return tuple(tasks.values())
+
+
+def check_episodes(where: Path, info: Info, episodes: Mapping[int, EpisodeIndex]) -> None:
+    """Raise AegisError unless these are all episodes and frames of which `info.json` speaks."""
+    numbers = list(episodes)
+    if len(numbers) != info.episodes or numbers != list(range(len(numbers))):
+        # Among one more than there are rows, a number is always missing.
+        missing = sorted(set(range(min(info.episodes, len(numbers) + 1))) - set(numbers))
+        which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
+        raise AegisError(
+            f"'{where}': {which}", f"a row for each of {info.episodes} episodes", AGAIN
+        )
+    frames = sum(episode.length for episode in episodes.values())
+    if frames != info.frames:
+        raise AegisError(f"'{where}': {frames} frames", f"{info.frames}, as {INFO} says", AGAIN)
+
+
 @contextlib.contextmanager
 def damaged(path: Path) -> Iterator[None]:
     """Turn exceptions of wrong types, missing keys or wrong values into an error about a file."""
@@ -271,7 +377,7 @@ def damaged(path: Path) -> Iterator[None]:
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(
-            f"'{path}' is damaged: {what}", f"a file of LeRobot's format {VERSION}", AGAIN
+            f"'{path}' is damaged: {what}", "a file of LeRobot's dataset format", AGAIN
         ) from error
 
 

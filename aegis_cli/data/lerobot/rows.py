@@ -41,7 +41,8 @@ def read_index(source: Source) -> Index:
         )
         _check_order(source, file, frame)
         if ((task < 0) | (task >= texts)).any():
-            found = f"'{file.path}' has a task_index outside {layout.TASKS}"
+            tasks, *_ = source.dataset.table_files
+            found = f"'{file.path}' has a task_index that '{tasks}' lacks"
             raise AegisError(found, f"0 to {texts - 1}", layout.AGAIN)
         _put(index.timestamp, file, time)
         _put(index.task, file, task.astype(np.int64))

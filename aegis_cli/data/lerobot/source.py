@@ -1,9 +1,9 @@
 """What is read of a dataset: which of its episodes, the files that hold them, and their digest.
 
-The meta folder names the file of each episode's rows, too. It is not asked: LeRobot's converter
-from v2.1 named the file before it for the first episode of every file, as long as it was older than
-0.5.0, and many datasets on the hub were converted by it. A file's own rows say which episodes it
-holds, and LeRobot itself reads all the files there are.
+The meta folder of v3.0 names the file of each episode's rows, too. It is not asked: LeRobot's
+converter from v2.1 named the file before it for the first episode of every file, as long as it was
+older than 0.5.0, and many datasets on the hub were converted by it. A file's own rows say which
+episodes it holds, and LeRobot itself reads all the files there are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import numpy as np
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import dataset as datasets
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.dataset import Dataset
 
@@ -209,8 +208,8 @@ def digests(source: Source, cameras: Sequence[str]) -> list[str]:
     """A digest per camera: sha256 over its name and every file that training on it reads."""
     dataset = source.dataset
     read = [dataset.episodes[number] for number in source.episodes]
-    shared = {layout.INFO, layout.TASKS}
-    for path in [*datasets.episode_files(dataset.folder), *(file.path for file in source.data)]:
+    shared = {layout.INFO}
+    for path in [*dataset.table_files, *(file.path for file in source.data)]:
         shared.add(path.relative_to(dataset.folder))
     hashes = {path: _sha256(dataset.folder / path) for path in shared}
     found = []

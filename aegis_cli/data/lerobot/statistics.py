@@ -61,6 +61,8 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     most = np.stack([part["max"] for part in parts]).max(0)
     merged = {"min": least, "max": most, "mean": mean, "std": np.sqrt(variance), "count": count}
     for name, share in QUANTILES.items():
+        if not all(name in part for part in parts):
+            continue  # version 2.1 has none
         values = np.stack([part[name] for part in parts])
         merged[name] = values.min(0) if share <= 0.5 else values.max(0)
     return merged

@@ -13,7 +13,7 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.media import Mp4Writer
-from aegis_cli.data.lerobot import layout, pictures, statistics, tables
+from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
 
 _MB = 1024**2
@@ -280,7 +280,7 @@ class _Writer:
         self._rows = []
 
     def _save_meta(self) -> None:
-        tables.save_tasks(self._folder / layout.TASKS, list(self._tasks))
+        tables.save_tasks(self._folder / version_3.TASKS, list(self._tasks))
         stats = {
             name: {figure: x.tolist() for figure, x in own.items()}
             for name, own in self._stats.items()

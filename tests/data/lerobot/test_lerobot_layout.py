@@ -24,7 +24,7 @@ from samples.lerobot import (
 )
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.lerobot import dataset, layout, rows, source, write
+from aegis_cli.data.lerobot import dataset, layout, rows, source, version_3, write
 from aegis_cli.data.lerobot.write import Limits
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -302,10 +302,10 @@ def test_what_other_writers_do_differently(tmp_path: Path) -> None:
     table = parquet.read_table(path)
     loose = pa.array(table.column("action").to_pylist(), pa.list_(pa.float64()))
     parquet.write_table(table.set_column(1, "action", loose), path, row_group_size=7)
-    tasks = parquet.read_table(folder / layout.TASKS).rename_columns(
+    tasks = parquet.read_table(folder / version_3.TASKS).rename_columns(
         ["task_index", "__index_level_0__"]
     )
-    parquet.write_table(tasks, folder / layout.TASKS)
+    parquet.write_table(tasks, folder / version_3.TASKS)
     first = folder / "meta/episodes/chunk-000/file-000.parquet"
     listed = parquet.read_table(first)
     parquet.write_table(listed.slice(4), first.with_name("file-001.parquet"))

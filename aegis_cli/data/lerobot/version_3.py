@@ -1,0 +1,86 @@
+"""The meta folder of format v3.0: parquet tables of tasks and of episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot.layout import Clip, EpisodeIndex, Info
+
+TASKS = Path("meta/tasks.parquet")
+_EPISODES = Path("meta/episodes")
+
+
+def table_files(folder: Path) -> list[Path]:
+    """The meta folder's files of tasks and episodes."""
+    return [folder / TASKS, *_episode_files(folder)]
+
+
+def read_tasks(folder: Path) -> tuple[str, ...]:
+    """The texts of the tasks, by their numbers.
+
+    pandas writes a text as the table's index: under `task`, or unnamed in older files.
+    """
+    path = folder / TASKS
+    with layout.reading_parquet(path):
+        columns = layout.open_parquet(path).read().to_pydict()
+    with layout.damaged(path):
+        texts = columns["task"] if "task" in columns else columns["__index_level_0__"]
+        return layout.texts_of(layout.by_number(zip(columns["task_index"], texts, strict=True)))
+
+
+def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
+    """Where each episode is, by its number.
+
+    Raises:
+        AegisError: a file that is missing or damaged, counts that do not agree, or an episode that
+            does not begin where the one before ends.
+    """
+    where, paths = folder / _EPISODES, _episode_files(folder)
+    if not paths:
+        raise AegisError(f"no parquet file in '{where}'", "a row per episode there", layout.AGAIN)
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        with layout.reading_parquet(path):
+            file = layout.open_parquet(path)
+            names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+            rows += file.read(columns=names).to_pylist()
+    with layout.damaged(where):
+        rows.sort(key=lambda row: int(row["episode_index"]))
+        episodes = layout.by_number((row["episode_index"], _episode(row, info)) for row in rows)
+        starts = [int(row["dataset_from_index"]) for row in rows]
+    layout.check_episodes(where, info, episodes)
+    frames = 0
+    for (number, episode), start in zip(episodes.items(), starts, strict=True):
+        if start != frames:
+            found = f"'{where}': episode {number} begins at frame {start}"
+            raise AegisError(found, f"frame {frames}, where the one before ends", layout.AGAIN)
+        frames += episode.length
+    return tuple(episodes.values())
+
+
+def _episode_files(folder: Path) -> list[Path]:
+    return sorted((folder / _EPISODES).glob("*/*.parquet"))
+
+
+def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
+    length = int(row["length"])
+    if length < 1 or int(row["dataset_to_index"]) - int(row["dataset_from_index"]) != length:
+        span = f"{row['dataset_from_index']} to {row['dataset_to_index']}"
+        raise ValueError(f"episode {row['episode_index']} has {length} frames from {span}")
+    place = layout.file_place(int(row["data/chunk_index"]), int(row["data/file_index"]))
+    clips = {key: _clip(row, key, info) for key in info.videos}
+    return EpisodeIndex(length, layout.data_file(info, place), clips)
+
+
+def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
+    chunk, file = (int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index"))
+    path = layout.video_file(info, key, layout.file_place(chunk, file))
+    start_s = float(row[f"videos/{key}/from_timestamp"])
+    if not math.isfinite(start_s):
+        raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
+    return Clip(path, start_s)
