@@ -314,7 +314,9 @@ def train(
     demos: Annotated[
         Path | None,
         Option(
-            metavar="PATH", help="Demonstrations: a file, or a LeRobot folder; none for a stream."
+            metavar="PATH",
+            help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
+            "none for a stream.",
         ),
     ] = None,
     method: Annotated[
@@ -363,7 +365,7 @@ def train(
         return
     if demos is None:
         fix = "record some with aegis demos, and give them as --demos"
-        expected = "demonstrations: a file, or a LeRobot folder"
+        expected = "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub"
         raise AegisError(f"no --demos for '{recipe}'", expected, fix)
     advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
@@ -787,7 +789,11 @@ def evaluate(
         ),
     ],
     demos: Annotated[
-        Path, Option(metavar="PATH", help="Demonstrations: a file, or a LeRobot folder.")
+        Path,
+        Option(
+            metavar="PATH",
+            help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub.",
+        ),
     ],
     episodes: Annotated[
         str | None,

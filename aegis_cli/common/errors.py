@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping
 
 
@@ -40,3 +41,9 @@ def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps:
     if not all(math.isfinite(value) for value in figures.values()):
         found = ", ".join(f"{name} {value:g}" for name, value in figures.items())
         raise Diverged(f"{found} {where}", "finite numbers", fix, good_steps)
+
+
+def in_short(error: Exception) -> str:
+    """The beginning of what an error says, on one line."""
+    said = " ".join(str(error).split())
+    return textwrap.shorten(said, 200, placeholder=" ...") or type(error).__name__

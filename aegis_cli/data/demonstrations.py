@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data import relative
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
-from aegis_cli.data.lerobot import dataset, layout, rows
+from aegis_cli.data.lerobot import dataset, download, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
@@ -170,6 +170,24 @@ class Demonstrations:
         return (actions - origins)[~is_pad]
 
 
+def locate(path: Path) -> Path:
+    """The file or folder of demonstrations, for a dataset on the hub the one it is downloaded to.
+
+    Raises:
+        AegisError: nothing of that name, neither here nor on the hub.
+    """
+    if Path(path).exists():
+        return Path(path)
+    name = str(path)
+    if hub.is_local(name):
+        raise AegisError(
+            f"no file or folder '{name}'",
+            "a file of aegis demos, the folder of a LeRobot dataset, or its id on the hub",
+            "check the path, or record with: aegis demos",
+        )
+    return download.fetch(name)
+
+
 def load(
     path: Path,
     validation_share: float | None,
@@ -180,7 +198,7 @@ def load(
     on_event: OnEvent = ignore,
     cache: bool = True,
 ) -> Demonstrations:
-    """Read demonstrations, a file of `aegis demos` or a LeRobot folder, and split them by episode.
+    """Read demonstrations, a file of `aegis demos` or a LeRobot dataset, and split them by episode.
 
     Nothing of a LeRobot folder's other episodes is read. All frames and episodes keep their numbers
     whatever is selected.
@@ -196,8 +214,7 @@ def load(
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
     """
-    path = Path(path)
-    _check_there(path)
+    path = locate(path)
     split = (validation_share, seed, selection.only)
     if path.is_dir():
         return _load_folder(path, split, selection, image_size, workers, cache, on_event)
@@ -207,10 +224,10 @@ def load(
 
 def digest(path: Path, selection: Selection = ALL) -> str:
     """sha256 of everything that `load` would read."""
-    _check_there(path)
-    if not Path(path).is_dir():
+    path = locate(path)
+    if not path.is_dir():
         return artifacts.sha256_file(path)
-    found = dataset.load(Path(path))
+    found = dataset.load(path)
     cameras = found.cameras(selection.camera)
     return sources.joined_digest(sources.digests(_source(found, selection.only), cameras))
 
@@ -224,7 +241,7 @@ def _source(found: dataset.Dataset, only: str | None) -> Source:
 
 def is_same(path: Path, selection: Selection, sha256: str) -> bool:
     """Whether these are the demonstrations of that digest, of which `selection` was read."""
-    folder = Path(path)
+    folder = locate(path)
     if folder.is_dir() and selection.only is not None:
         info = layout.read_info(folder)
         if not episodes_of.are_there(selection.only, info.episodes, info.splits):
@@ -234,9 +251,9 @@ def is_same(path: Path, selection: Selection, sha256: str) -> bool:
 
 def count_episodes(path: Path) -> int:
     """How many episodes there are in a file of `aegis demos` or a LeRobot folder."""
-    _check_there(path)
-    if Path(path).is_dir():
-        return layout.read_info(Path(path)).episodes
+    path = locate(path)
+    if path.is_dir():
+        return layout.read_info(path).episodes
     return len(artifacts.load(path, "demos").tensors["episode_starts"]) - 1
 
 
@@ -245,28 +262,14 @@ def playable_task(path: Path, camera: str | tuple[str, ...] | None) -> str | Non
 
     It is None where another robot was recorded, or by cameras that the task does not have.
     """
-    _check_there(path)
-    if not Path(path).is_dir():
+    path = locate(path)
+    if not path.is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
-    found = dataset.load(Path(path))
+    found = dataset.load(path)
     task, names = found.info.task, found.cameras(camera)
     if task is None or len(names) == 1:
         return task
     return task if {layout.short(name) for name in names} <= {*sim.cameras(task)} else None
-
-
-def _check_there(path: Path) -> None:
-    """Raise AegisError for a path that is missing.
-
-    The name of a dataset on the hub is no path: frames are read in place, not downloaded.
-    """
-    if not Path(path).exists():
-        raise AegisError(
-            f"no file or folder '{path}'",
-            "a file of aegis demos, or the local folder of a LeRobot dataset",
-            "record with: aegis demos, or for a hub dataset: hf download --repo-type dataset "
-            "ORG/NAME --local-dir FOLDER",
-        )
 
 
 def _load_file(path: Path, split: Split) -> Demonstrations:
@@ -384,8 +387,9 @@ def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
     Raises:
         AegisError: episodes that are not there.
     """
-    folder = only is not None and Path(path).is_dir()
-    return _chosen(path, count, only, layout.read_info(Path(path)).splits if folder else {})
+    path = locate(path)
+    folder = only is not None and path.is_dir()
+    return _chosen(path, count, only, layout.read_info(path).splits if folder else {})
 
 
 def _chosen(path: Path, count: int, only: str | None, splits: Mapping[str, str]) -> np.ndarray:

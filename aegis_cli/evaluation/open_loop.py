@@ -221,7 +221,8 @@ class _Source:
         if self.recipe is not None:
             known = recipes.selected(self.recipe)
         known = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
-        return Selection(self._camera(meta, data) if data.is_dir() else None, **known)
+        at = demonstrations.locate(data)
+        return Selection(self._camera(meta, at) if at.is_dir() else None, **known)
 
     def _camera(self, meta: Mapping[str, Any], data: Path) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""

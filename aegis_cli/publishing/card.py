@@ -6,7 +6,6 @@ Every figure is one that `aegis probe`, `aegis rollout` or `aegis run` has writt
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, methods, recipes, sim
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, hub
 from aegis_cli.common.version import __version__
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import InspectReport
@@ -24,7 +23,6 @@ from aegis_cli.training import checkpoint
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
-_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _AS_IT_IS = "{}"  # what `probe.ask` makes of a question where it changes nothing
 
 _CARD = """---
@@ -198,8 +196,11 @@ def _front_matter(recipe: Recipe, form: str) -> str:
         "pipeline_tag: robotics",
         "tags: [robotics, vision-language-action, aegis]",
     ]
-    if _HUB_ID.fullmatch(recipe.backbone) and not Path(recipe.backbone).exists():
+    if hub.is_id(recipe.backbone) and not Path(recipe.backbone).exists():
         lines.append(f"base_model: {recipe.backbone}")
+    demos = recipe.demos.path
+    if demos is not None and hub.is_id(demos) and not Path(demos).exists():
+        lines.append(f"datasets: [{demos}]")
     return "\n".join(lines)
 
 

@@ -101,8 +101,8 @@ class Demos:
     path: str | None = key(
         NOT_EMPTY,
         None,
-        doc="Demonstrations to use instead of recording: a file, or the folder of a LeRobot "
-        "dataset.",
+        doc="Demonstrations to use instead of recording: a file, the folder of a LeRobot dataset, "
+        "or its id on the hub.",
     )
     camera: str | tuple[str, ...] | None = key(
         NOT_EMPTY,

@@ -79,26 +79,6 @@ def test_missing_files(command: tuple[str, ...], missing: str, bad: Callable[...
     bad(*command, says=(missing,))
 
 
-def test_a_data_set_of_the_hub_is_downloaded_first(bad: Callable[..., str]) -> None:
-    says = (
-        "no file or folder 'lerobot/pusht'",
-        "local folder of a LeRobot dataset",
-        "hf download --repo-type dataset",
-    )
-    bad(*training(demos="lerobot/pusht"), says=says)
-    bad(
-        "run",
-        "small.yaml",
-        "--set",
-        "methods=[naive]",
-        "--set",
-        "demos.path=lerobot/pusht",
-        "--out",
-        "r",
-        says=says,
-    )
-
-
 def test_a_method_that_needs_an_anchor(bad: Callable[..., str]) -> None:
     without = [word for word in TRAIN if word not in ("--anchor", "anchor.safetensors")]
     bad(*without, says=("'aegis'", "--anchor"))

@@ -59,7 +59,10 @@ def test_weights_that_a_repository_has_twice_are_fetched_once(
     """As Mistral's have them, for transformers and for its own programs."""
     there = ["config.json", "model-00001-of-2.safetensors", "consolidated.safetensors", "a.bin"]
 
-    def download(_: str, allow_patterns: list[str], ignore_patterns: list[str]) -> str:
+    def download(
+        _: str, repo_type: str, allow_patterns: list[str], ignore_patterns: list[str]
+    ) -> str:
+        assert repo_type == "model"
         for name in filter_repo_objects(
             there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
         ):

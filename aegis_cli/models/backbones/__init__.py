@@ -6,7 +6,7 @@ import hashlib
 import importlib.util
 from pathlib import Path
 
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, files, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import shipped
 from aegis_cli.models.backbones import model_folder, shapes
@@ -42,7 +42,7 @@ def locate(name: str) -> Path:
             return folder / "model.safetensors"
     if path.is_file():
         return path
-    if not model_folder.is_local(name) and _has_transformers():
+    if not hub.is_local(name) and _has_transformers():
         return model_folder.fetch(name)
     raise _no_backbone(name)
 
@@ -148,9 +148,9 @@ def _no_backbone(name: str) -> AegisError:
         "checkpoint's, a backbone's folder or file, or a hub id"
     )
     fix = f"check the path, and give it as {model_folder.GIVE}"
-    if model_folder.is_hub_id(name) and not _has_transformers():
+    if hub.is_id(name) and not _has_transformers():
         fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
-    elif model_folder.is_hub_id(name) and not name.startswith("runs/"):
+    elif hub.is_id(name) and not name.startswith("runs/"):
         fix += f"; of a model on the hub: hf download {name} --local-dir MODEL"
     return AegisError(found, expected, fix)
 

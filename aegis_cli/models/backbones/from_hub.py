@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from torch import nn
 from transformers.utils import logging
 
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models.backbones import model_folder
 
 T = TypeVar("T", bound=nn.Module)
@@ -48,7 +48,7 @@ def loading(folder: Path, what: str) -> Iterator[None]:
                 "pip install torchvision",
             ) from error
         raise AegisError(
-            f"the {what} in '{folder}' does not load: {model_folder.in_short(error)}",
+            f"the {what} in '{folder}' does not load: {in_short(error)}",
             f"a complete {what} folder of the Hugging Face hub",
             "download or export the model again",
         ) from error

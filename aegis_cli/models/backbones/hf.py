@@ -22,7 +22,7 @@ from transformers.utils import is_torchvision_available
 
 from aegis_cli.common import prefetch
 from aegis_cli.common.devices import send
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Asked, Images
 from aegis_cli.models.backbones import model_folder
@@ -128,7 +128,7 @@ class HFBackbone(Backbone):
             AttributeError,
             TemplateError,
         ) as error:
-            raise model_folder.misfit(model_folder.in_short(error)) from error
+            raise model_folder.misfit(in_short(error)) from error
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
             found = "no image token among the processor's, or a layer that keeps no keys"
             raise model_folder.misfit(found)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import textwrap
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,8 @@ from typing import Any
 from safetensors import safe_open
 from torch import nn
 
-from aegis_cli.common import files
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common import files, hub
+from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models.backbones.base import FLOAT32
 from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 
@@ -23,22 +21,10 @@ _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
 _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
 _STORED = {"BF16": "bfloat16", "F16": "float16"}  # safetensors' names
-_HUB_ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 GIVE = (
     "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's "
     "encoder, encoder=MODEL), or as it is (probe)"
 )
-
-
-def is_hub_id(name: str) -> bool:
-    """Whether a model's name has the form of one on the hub, which a path may have too."""
-    return bool(_HUB_ID.fullmatch(name))
-
-
-def is_local(name: str) -> bool:
-    """Whether a name can only be a path: the hub is never asked for a typo in one."""
-    first = name.partition("/")[0]
-    return not is_hub_id(name) or first == "runs" or Path(first).is_dir()
 
 
 def fetch(name: str) -> Path:
@@ -47,16 +33,10 @@ def fetch(name: str) -> Path:
     Raises:
         AegisError: neither in the cache nor to be had.
     """
-    import huggingface_hub
-
+    wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
     try:
-        wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
         # Mistral's repositories have their weights twice.
-        unwanted = ["consolidated*"]
-        found = huggingface_hub.snapshot_download(
-            name, allow_patterns=wanted, ignore_patterns=unwanted
-        )
-        return Path(found)
+        return hub.snapshot(name, "model", wanted, unwanted=["consolidated*"])
     except (OSError, ValueError) as error:
         raise AegisError(
             f"no folder '{name}', and no model of that name from the Hugging Face hub: "
@@ -270,9 +250,3 @@ def misfit(problem: str) -> AegisError:
         "the processor that the model was trained with",
         "copy the processor's files of the same repository beside the model",
     )
-
-
-def in_short(error: Exception) -> str:
-    """The beginning of what an error says, on one line."""
-    said = " ".join(str(error).split())
-    return textwrap.shorten(said, 200, placeholder=" ...") or type(error).__name__

@@ -1,0 +1,126 @@
+"""A dataset of the hub goes by its id wherever a path would do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from huggingface_hub.utils import filter_repo_objects
+from samples.lerobot import edit_info, episodes, save
+from samples.user_folder import training
+
+from aegis_cli.common import hub
+from aegis_cli.data import demonstrations
+from aegis_cli.data.lerobot import download
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
+
+Bad = Callable[..., str]
+NAME = "someone/arm"
+
+
+class Hub:
+    """A hub of one dataset, which counts what is asked of it."""
+
+    def __init__(self, repository: Path, local: Path) -> None:
+        self.repository, self.local = repository, local
+        self.asked: list[list[str]] = []
+
+    def __call__(
+        self, name: str, repo_type: str, allow_patterns: list[str], ignore_patterns: list[str]
+    ) -> str:
+        assert repo_type == "dataset"
+        self.asked.append(allow_patterns)
+        if name != NAME:
+            raise FileNotFoundError(f"no repository {name}")
+        inside = (p for p in self.repository.rglob("*") if p.is_file())
+        there = [str(path.relative_to(self.repository)) for path in inside]
+        for found in filter_repo_objects(
+            there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
+        ):
+            (self.local / found).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(self.repository / found, self.local / found)
+        self.local.mkdir(exist_ok=True)
+        return str(self.local)
+
+
+@pytest.fixture
+def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
+    made = [replace(e, instruction="go to the red pad") for e in episodes(8)]
+    repository = save(tmp_path / "repository", made)
+    (repository / "README.md").write_text("a card")
+    (repository / "weights.bin").write_text("what nobody asked for")
+    found = Hub(repository, tmp_path / "cache" / "snapshot")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", found)
+    download.fetch.cache_clear()
+    return found
+
+
+def test_it_is_read_as_the_folder_is(hosted: Hub) -> None:
+    one, other = (demonstrations.load(Path(p), 0.3, 0) for p in (NAME, hosted.repository))
+    assert one.sha256 == other.sha256 and torch.equal(one.frames[0], other.frames[0])
+    assert demonstrations.digest(Path(NAME)) == one.sha256
+    assert demonstrations.count_episodes(Path(NAME)) == 8
+    # The meta folder comes first, and the hub is asked once in a process.
+    assert hosted.asked == [["meta/*"], ["meta/*", "data/*", "videos/*"]]
+    assert not (hosted.local / "weights.bin").exists()
+
+
+def test_a_training_and_an_evaluation_take_its_id(aegis: Any, hosted: Hub, place: Path) -> None:
+    code, _, err = aegis(*training(demos=NAME, out="runs/x"))
+    assert code == 0, err
+    code, out, _ = aegis("evaluate", "runs/x", "--demos", NAME, "--json")
+    report = json.loads(out)
+    assert code == 0 and report["data"] == NAME
+    # They are known to be those that the run was trained on.
+    assert report["split"] == "validation" and 0 < len(report["episodes"]) < 8
+
+
+def test_a_folder_of_that_name_comes_first(hosted: Hub, place: Path) -> None:
+    (place / NAME).parent.mkdir()
+    save(place / NAME, episodes(3))
+    assert demonstrations.count_episodes(Path(NAME)) == 3 and hosted.asked == []
+
+
+@pytest.mark.parametrize("name", ["none", "../x/y", "/no/x", "a/b/c", "runs/x", "data/x"])
+def test_what_can_only_be_a_path_is_never_asked_of_the_hub(
+    name: str, hosted: Hub, bad: Bad, place: Path
+) -> None:
+    (place / "data").mkdir()
+    bad(*training(demos=name), says=("no file or folder", "id on the hub", "check the path"))
+    assert hosted.asked == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        training(demos="someone/else"),
+        ("run", "small.yaml", "--set", "methods=[naive]", "--set", "demos.path=someone/else"),
+        ("anchor", "--demos", "someone/else", "--out", "a.safetensors"),
+    ],
+)
+def test_a_dataset_that_the_hub_lacks(command: tuple[str, ...], hosted: Hub, bad: Bad) -> None:
+    says = ("someone/else", "Hugging Face hub", "hf download --repo-type dataset someone/else")
+    bad(*command, says=says)
+
+
+def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: Hub, bad: Bad) -> None:
+    edit_info(hosted.repository, lambda info: info.update(codebase_version="v1.6"))
+    bad(*training(demos=NAME), says=("v1.6", "version 2.0"))
+    (hosted.repository / "meta/info.json").rename(hosted.repository / "meta/other.json")
+    shutil.rmtree(hosted.local)
+    bad(*training(demos=NAME), says=(f"'{NAME}' of the hub has no meta/info.json", "--include"))
+    assert hosted.asked == [["meta/*"]] * 2 and not (hosted.local / "data").exists()
+
+
+def test_the_package_that_asks_the_hub_is_missing(
+    hosted: Hub, bad: Bad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hub, "is_installed", lambda: False)
+    bad(*training(demos=NAME), says=(NAME, "huggingface_hub", "aegis-vla[hub]"))
