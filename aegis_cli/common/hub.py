@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+Kind = Literal["model", "dataset"]
+
 _ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
@@ -27,9 +29,20 @@ def is_installed() -> bool:
     return importlib.util.find_spec("huggingface_hub") is not None
 
 
+def list_files(name: str, kind: Kind) -> list[str]:
+    """The paths of a repository's files.
+
+    Raises:
+        OSError, ValueError: the hub has none of that name, or cannot be asked.
+    """
+    import huggingface_hub
+
+    return huggingface_hub.list_repo_files(name, repo_type=kind)
+
+
 def snapshot(
     name: str,
-    kind: Literal["model", "dataset"],
+    kind: Kind,
     wanted: Sequence[str],
     unwanted: Sequence[str] = (),
 ) -> Path:

@@ -163,8 +163,8 @@ class Anchor:
     vqa: str = key(
         NOT_EMPTY,
         "scenes",
-        doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file or folder of questions, "
-        "of whose images anchors get a share.",
+        doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file, folder or hub id of "
+        "questions, of whose images anchors get a share.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."

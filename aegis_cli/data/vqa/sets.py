@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, sha256_file
-from aegis_cli.data.vqa import easy, hub, jsonl, official
+from aegis_cli.data.vqa import download, easy, jsonl, official, saved
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Pictures, decode
@@ -235,7 +236,7 @@ def read(
     if vqa == SCENES:
         return Scenes(ask=ask)
     path = Path(vqa)
-    source = easy.reader() if vqa == easy.NAME else _reader(path)
+    source = easy.reader() if vqa == easy.NAME else _reader(*_located(vqa))
     entries: list[Entry] = []
     skipped: list[AegisError] = []
     for entry in unique(source.read()):
@@ -253,14 +254,31 @@ def read(
             "one or more",
             "correct the file, or give another --vqa",
         )
-    kind = EasyVqa if vqa == easy.NAME else Listed
-    return kind(path.name, source.files, tuple(entries), skip_bad, len(skipped), ask)
+    kind, name = EasyVqa if vqa == easy.NAME else Listed, path.name.replace("#", "-")
+    return kind(name, source.files, tuple(entries), skip_bad, len(skipped), ask)
 
 
-def _reader(path: Path) -> Reader:
+def _located(vqa: str) -> tuple[Path, str | None]:
+    """The path of a set, for one on the hub that of its copy here, and the split after a #."""
+    if os.path.exists(vqa):
+        return Path(vqa), None
+    name, _, named = vqa.partition("#")
+    split = named or None
+    if os.path.exists(name):
+        return Path(name), split
+    if hub.is_local(name):
+        raise _unknown(f"question set '{name}', which does not exist")
+    return download.fetch(name, split), split
+
+
+def _reader(path: Path, split: str | None) -> Reader:
     """The reader of the path's format."""
-    if not os.path.exists(path):
-        raise _unknown(f"question set '{path}', which does not exist")
+    if split is not None and not saved.is_dataset(path):
+        raise AegisError(
+            f"the split '{split}' of '{path}', which is no Hugging Face data set",
+            "a set without splits by its path alone",
+            f"--vqa '{path}'",
+        )
     pairs = sorted(path.glob(f"*{official.SUFFIX}")) if path.is_dir() else []
     if len(pairs) > 1:
         names = ", ".join(p.name for p in pairs)
@@ -271,8 +289,8 @@ def _reader(path: Path) -> Reader:
         return jsonl.reader(path)
     if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
         return official.reader(pairs[0] if pairs else path)
-    if hub.is_dataset(path):
-        return hub.reader(path)
+    if saved.is_dataset(path):
+        return saved.reader(path, split)
     if path.is_file() and path.suffix == ".json":
         raise official.misnamed(path)
     raise _unknown(f"question set '{path}'")
@@ -280,8 +298,8 @@ def _reader(path: Path) -> Reader:
 
 def _unknown(found: str) -> AegisError:
     expected = (
-        "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, or a folder "
-        "of a Hugging Face data set"
+        "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, a folder of a "
+        "Hugging Face data set, or its id on the hub"
     )
     return AegisError(found, expected, "check the path, or use --vqa scenes")
 

@@ -198,8 +198,9 @@ def test_several_splits_are_refused_with_the_way_to_one(tmp_path: Path) -> None:
     datasets.DatasetDict({"train": rows, "validation": rows}).save_to_disk(str(tmp_path / "saved"))
     with pytest.raises(AegisError, match="2 splits.*train, validation") as caught:
         sets.read(str(tmp_path / "saved"))
-    assert caught.value.fix == f"--vqa {tmp_path / 'saved' / 'validation'}"
-    assert len(sets.read(caught.value.fix.removeprefix("--vqa ")).entries) == 6
+    one = f"{tmp_path / 'saved'}#validation"
+    assert caught.value.fix == f"name it after a #: --vqa '{one}'"
+    assert len(sets.read(one).entries) == 6 and sets.read(one).name == "saved-validation"
     datasets.DatasetDict({"train": rows}).save_to_disk(str(tmp_path / "alone"))
     assert len(sets.read(str(tmp_path / "alone")).entries) == 6
 
@@ -232,6 +233,41 @@ def test_parquet_files_tell_their_split_by_their_names(
         return
     with pytest.raises(AegisError, match=f"2 splits in .*: {', '.join(splits)}"):
         sets.read(str(tmp_path))
+    for split in splits:
+        assert len(sets.read(f"{tmp_path}#{split}").entries) == 6
+
+
+@pytest.mark.parametrize(
+    ("form", "split", "says"),
+    [
+        ("saved", "none", "no split 'none' in '.*set'"),
+        ("alone", "train", "'.*set' is one split without a name, and no 'train'"),
+        ("parquet", "val", "no split 'val' in '.*set'"),
+        ("jsonl", "train", "the split 'train' of '.*set.jsonl', which is no Hugging Face data set"),
+    ],
+)
+def test_a_split_that_is_not_there(
+    form: str, split: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    rows, path = datasets.Dataset.from_dict(hub_rows(3)), tmp_path / "set"
+    if form == "saved":
+        datasets.DatasetDict({"train": rows, "validation": rows}).save_to_disk(str(path))
+    elif form == "alone":
+        rows.save_to_disk(str(path))
+    elif form == "parquet":
+        path.mkdir()
+        rows.to_parquet(str(path / "validation-00000-of-00001.parquet"))
+    else:
+        path = write_jsonl(tmp_path, name="set.jsonl")
+    with pytest.raises(AegisError, match=says):
+        sets.read(f"{path}#{split}")
+
+
+def test_a_path_may_have_a_number_sign(tmp_path: Path) -> None:
+    path = tmp_path / "set#1"
+    datasets.Dataset.from_dict(hub_rows(3)).save_to_disk(str(path))
+    assert len(sets.read(str(path)).entries) == 6
 
 
 @pytest.mark.parametrize("name", ["data-00000-of-00001.arrow", "dataset_info.json"])

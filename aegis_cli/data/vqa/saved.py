@@ -1,4 +1,4 @@
-"""`--vqa FOLDER`: a Hugging Face dataset on this disk, as `save_to_disk` wrote it or as parquet.
+"""`--vqa FOLDER[#SPLIT]`: a Hugging Face dataset as `save_to_disk` wrote it, or as parquet.
 
 Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer`
 or `multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type`
@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import refuse_special, sha256_file
@@ -23,6 +23,8 @@ _ANSWERS = ("answers", "answer", "multiple_choice_answer")
 _NAMES = ("question_id", "id")
 # Files that save_to_disk writes for one split, and for several.
 _SAVED, _SPLITS = "state.json", "dataset_dict.json"
+Stem = TypeVar("Stem", bound=PurePath)
+
 # What follows a split's name in the names of its parquet files; older ones have a hash.
 _PART = re.compile(r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$")
 
@@ -32,36 +34,58 @@ def is_dataset(path: Path) -> bool:
     return any((path / name).is_file() for name in (_SAVED, _SPLITS)) or bool(_parquet(path))
 
 
-def reader(path: Path) -> Reader:
+def reader(path: Path, split: str | None = None) -> Reader:
     """The questions of one split.
 
+    Args:
+        split: its name; None: there is only one.
+
     Raises:
-        AegisError: several splits, a pipe in place of a file, or no package that reads them.
+        AegisError: several splits, none of that name, a pipe in place of a file, or no package that
+            reads them.
     """
     _check_package()
     if (path / _SPLITS).is_file():
-        path = _one_split(path)
-    files = sorted(path.glob("*.arrow")) if (path / _SAVED).is_file() else _parquet(path)
+        path = _folder_of_split(path, split)
+        split = None
+    if (path / _SAVED).is_file():
+        files = sorted(path.glob("*.arrow"))
+        if split is not None:
+            raise _no_split(path, split, [])
+    else:
+        files = list(of_split(str(path), _parquet(path), split))
     for file in (*files, *path.glob("*.json")):
         refuse_special(file)
-    _check_splits(path, [_split(file) for file in files if file.suffix == ".parquet"])
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
 
 
-def _one_split(path: Path) -> Path:
-    """The folder of the only split that save_to_disk wrote."""
-    folders = [saved.parent for saved in path.glob(f"*/{_SAVED}")]
+def _folder_of_split(path: Path, split: str | None) -> Path:
+    """The folder that save_to_disk wrote of a split, or of the only one for None."""
+    folders = {saved.parent.name: saved.parent for saved in path.glob(f"*/{_SAVED}")}
     if not folders:
         raise AegisError(
             f"no split in '{path}', which is to hold some",
             "the folder of one split",
             "download it again",
         )
-    _check_splits(path, [folder.name for folder in folders])
-    return folders[0]
+    return folders[_chosen(str(path), [*folders], split)]
 
 
-def _split(file: Path) -> str:
+def of_split(where: str, files: Sequence[Stem], split: str | None) -> list[Stem]:
+    """The parquet files of a split, or of the only one for None.
+
+    Args:
+        where: the set's path or name.
+
+    Raises:
+        AegisError: several splits, or none of that name.
+    """
+    of = [_split(file) for file in files]
+    chosen = _chosen(where, of, split)
+    return [file for file, own in zip(files, of, strict=True) if own == chosen]
+
+
+def _split(file: PurePath) -> str:
     """The split of a parquet file, by its name; files that are only numbered are of one split."""
     return _PART.sub("", file.stem) or "numbered files"
 
@@ -83,15 +107,25 @@ def _check_package() -> None:
         ) from None
 
 
-def _check_splits(path: Path, names: list[str]) -> None:
-    """Raise AegisError where the names are of more than one split."""
+def _chosen(where: str, names: Sequence[str], split: str | None) -> str:
+    """The split that was asked for, or the only one for None."""
     splits = sorted(set(names))
-    if len(splits) < 2:
-        return
-    one = splits[-1]
-    own_folder = f"put the files of one ({one}*.parquet) into a folder of their own"
-    fix = f"--vqa {path / one}" if (path / one).is_dir() else own_folder
-    raise AegisError(f"{len(splits)} splits in '{path}': {', '.join(splits)}", "one split", fix)
+    if split is not None:
+        if split not in splits:
+            raise _no_split(where, split, splits)
+        return split
+    if len(splits) > 1:
+        found = f"{len(splits)} splits in '{where}': {', '.join(splits)}"
+        raise AegisError(found, "one split", f"name it after a #: --vqa '{where}#{splits[-1]}'")
+    return splits[0]
+
+
+def _no_split(where: str | Path, split: str, splits: Sequence[str]) -> AegisError:
+    if not splits:
+        found = f"'{where}' is one split without a name, and no '{split}'"
+        return AegisError(found, "a split's name where there are several", f"--vqa '{where}'")
+    found = f"no split '{split}' in '{where}'"
+    return AegisError(found, f"one of {', '.join(splits)}", f"--vqa '{where}#{splits[-1]}'")
 
 
 def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
