@@ -19,7 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
-from aegis_cli.data import demonstrations
+from aegis_cli.data import demonstrations, joints
 from aegis_cli.data.batch import least_spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
@@ -307,21 +307,18 @@ def _check_names(
     Raises:
         AegisError: a joint of the policy that has another place here.
     """
-    recorded = shown.recorded
-    for key, what in (("action_names", "actions"), ("proprio_names", "positions")):
-        own, found = meta.get(key), recorded.get(key)
-        if own is None or found is None or own == found:
-            continue
-        if moved := [n for n in own if n in found and found.index(n) != own.index(n)]:
+    for other in joints.differences(meta, shown.recorded):
+        known, found = ", ".join(other.known), ", ".join(other.found)
+        if other.moved is not None:
             raise AegisError(
-                f"'{moved[0]}' in another place in '{data}', with {what} {', '.join(found)}",
-                f"{', '.join(own)}, in this order, as the policy was trained on",
+                f"'{other.moved}' in another place in '{data}', with {other.what} {found}",
+                f"{known}, in this order, as the policy was trained on",
                 "give demonstrations in the policy's order, or train on these",
             )
         text = (
-            f"the {what} in '{data}' are named {', '.join(found)}, and those that the policy was "
-            f"trained on {', '.join(own)}: the errors mean something only if these are the same "
-            "joints in the same order"
+            f"the {other.what} in '{data}' are named {found}, and those that the policy was "
+            f"trained on {known}: the errors mean something only if these are the same joints in "
+            "the same order"
         )
         on_event(Warned("evaluate", text))
 

@@ -21,7 +21,7 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.data import demonstrations
+from aegis_cli.data import demonstrations, joints
 from aegis_cli.data.batch import Share
 from aegis_cli.data.relative import Places
 from aegis_cli.data.vqa import sets
@@ -496,13 +496,28 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrat
     expert = ActionExpert(shape)
     expert.recomputes = train.gradient_checkpointing
     if recipe.expert.start is not None:
-        expert.load_state_dict(_begun_expert(recipe.expert.start, shape, relative).state_dict())
+        begun = _begun_expert(recipe.expert.start, shape, relative, demos.recorded)
+        expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
 
 
-def _begun_expert(start: str, shape: ExpertShape, relative: Places) -> ActionExpert:
-    """The expert of another run, which has to be of the shape that this one needs."""
+def _begun_expert(
+    start: str, shape: ExpertShape, relative: Places, recorded: Mapping[str, Any]
+) -> ActionExpert:
+    """The expert of another run, which has to be of the shape that this one needs.
+
+    Args:
+        recorded: what the demonstrations say of the robot, as in `Demonstrations.recorded`.
+    """
     found, meta = checkpoint.load_expert(start)
+    for other in joints.differences(meta, recorded):
+        if other.moved is not None:
+            raise AegisError(
+                f"'{other.moved}' in another place than the expert of '{start}' has it, with "
+                f"{other.what} {', '.join(other.found)}",
+                f"{', '.join(other.known)}, in this order, as that expert was trained on",
+                "give demonstrations in that order, or delete expert.start",
+            )
     if tuple(meta.get("relative", ())) != tuple(relative):
         raise AegisError(
             f"the expert of '{start}' predicts {_told(meta.get('relative', ()))}, this training "

@@ -15,6 +15,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Warned
+from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint
 from aegis_cli.training.schedule import rate_factor
@@ -157,6 +158,24 @@ def test_an_expert_of_another_shape_is_refused(
     other = beginning_with(recipe, naive_run, **changes)
     with pytest.raises(AegisError, match=found):
         start("naive", tmp_path / "new", recipe=other, anchor=None)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "found"),
+    [("action_names", "dy, dx, in this order"), ("proprio_names", "in this order")],
+)
+def test_an_expert_of_joints_in_another_order_is_refused(
+    key: str, found: str, recipe: Recipe, start: Start, naive_run: Path, tmp_path: Path
+) -> None:
+    policy, meta = checkpoint.load_policy(naive_run)
+    (tmp_path / "turned").mkdir()
+    names = meta[key]
+    lerobot_folder.write(tmp_path / "turned", policy, {**meta, key: names[1:] + names[:1]})
+    other = replace(recipe, expert=replace(recipe.expert, start=str(tmp_path / "turned")))
+    with pytest.raises(AegisError, match="in another place than the expert") as raised:
+        start("naive", tmp_path / "new", recipe=other, anchor=None)
+    assert found in str(raised.value)
     assert not (tmp_path / "new").exists()
 
 
