@@ -162,6 +162,7 @@ def run(
     )
     _check_fit(policy, shown, meta, data)
     _check_names(shown, meta, data, on_event)
+    _check_rate(shown, meta, data, on_event)
     at = _spread(shown, chosen, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
@@ -319,6 +320,19 @@ def _check_names(
             f"the {other.what} in '{data}' are named {found}, and those that the policy was "
             f"trained on {known}: the errors mean something only if these are the same joints in "
             "the same order"
+        )
+        on_event(Warned("evaluate", text))
+
+
+def _check_rate(
+    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
+) -> None:
+    """Warn of another control rate than the policy's, whose steps have another length."""
+    own = meta.get("fps")
+    if own is not None and shown.fps is not None and own != shown.fps:
+        text = (
+            f"'{data}' has {shown.fps:g} frames a second, and the policy was trained on {own:g}: "
+            "its actions are meant for steps of another length"
         )
         on_event(Warned("evaluate", text))
 

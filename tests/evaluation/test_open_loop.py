@@ -329,19 +329,30 @@ def test_joints_in_another_order_are_refused(
     assert f"positions {', '.join(names)}" in refusal(turned, demos_file)
 
 
+def warnings_of(policy: Path, data: Path) -> list[str]:
+    events: list[Event] = []
+    open_loop.run(policy, data, episodes=[0], frames=2, on_event=events.append)
+    return [event.text for event in events if isinstance(event, Warned)]
+
+
 def test_joints_of_other_names_are_warned_of(
     named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
 ) -> None:
-    def heard(policy: Path) -> list[str]:
-        events: list[Event] = []
-        open_loop.run(policy, demos_file, episodes=[0], frames=2, on_event=events.append)
-        return [event.text for event in events if isinstance(event, Warned)]
-
-    (text,) = heard(renamed({"action_names": ["left", "dy"]}, named, tmp_path / "other"))
+    other = renamed({"action_names": ["left", "dy"]}, named, tmp_path / "other")
+    (text,) = warnings_of(other, demos_file)
     assert "are named dx, dy" in text and "trained on left, dy" in text
     without = {n: v for n, v in named[1].items() if n not in ("action_names", "proprio_names")}
-    assert heard(renamed({}, (named[0], without), tmp_path / "none")) == []
-    assert heard(renamed({}, named, tmp_path / "same")) == []
+    assert warnings_of(renamed({}, (named[0], without), tmp_path / "none"), demos_file) == []
+    assert warnings_of(renamed({}, named, tmp_path / "same"), demos_file) == []
+
+
+def test_another_rate_is_warned_of(
+    named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
+) -> None:
+    (text,) = warnings_of(renamed({"fps": 7.5}, named, tmp_path / "other"), demos_file)
+    assert f"{named[1]['fps']:g} frames a second" in text and "trained on 7.5" in text
+    without = {name: value for name, value in named[1].items() if name != "fps"}
+    assert warnings_of(renamed({}, (named[0], without), tmp_path / "none"), demos_file) == []
 
 
 @pytest.mark.parametrize("wrong", [[8], [0, 99]])
