@@ -45,6 +45,7 @@ from aegis_cli.cli.options import (
     Vqa,
     Wide,
     above_zero,
+    demonstrations_path,
     episode_numbers,
     given,
     listed_episodes,
@@ -188,6 +189,7 @@ def anchor(
     demos: Annotated[
         Path | None,
         Option(
+            parser=demonstrations_path,
             metavar="PATH",
             help="Measure moments on the frames of these demonstrations instead of on questions.",
         ),
@@ -314,6 +316,7 @@ def train(
     demos: Annotated[
         Path | None,
         Option(
+            parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
             "none for a stream.",
@@ -427,6 +430,7 @@ def merge(
     demos: Annotated[
         Path | None,
         Option(
+            parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations of the run; default: its recipe's, or a file beside it.",
         ),
@@ -646,7 +650,7 @@ def inspect(
         Argument(
             metavar="PATH",
             help="A recipe, artifact, model (also 'embedded'), or the folder of a run, checkpoint, "
-            "study or LeRobot dataset.",
+            "study or LeRobot dataset, or such a dataset's id on the hub.",
         ),
     ],
     plot: Annotated[
@@ -791,6 +795,7 @@ def evaluate(
     demos: Annotated[
         Path,
         Option(
+            parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub.",
         ),

@@ -150,8 +150,10 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
     if isinstance(report, inspection.StreamInspection):
         render.routing_plot(report, plot)
     elif report.kind == "dataset":
-        from aegis_cli.data.lerobot import summary
+        from aegis_cli.data.lerobot import download, summary
 
-        summary.save_sheet(path, plot)
+        of_hub = not path.exists()
+        cameras = tuple(report.facts["cameras"])
+        summary.save_sheet(download.fetch(str(path), cameras) if of_hub else path, plot)
     else:
         render.energy_plot(report, plot)

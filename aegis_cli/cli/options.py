@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import episodes
 from aegis_cli.recipes import shipped
@@ -115,6 +116,16 @@ def with_place(param: typer.CallbackParam, value: str | None) -> str | None:
         example = "'{} Answer with a single word or phrase.'"
         raise _refused(param, f"'{value}'", WITH_PLACE.expected, example)
     return value
+
+
+def demonstrations_path(text: str) -> Path:
+    """A path or a hub id; `./a/b` has to be there, for as a Path it would look like an id."""
+    path = Path(text)
+    if hub.is_id(text) or not hub.is_id(str(path)):
+        return path
+    from aegis_cli.data import demonstrations
+
+    return demonstrations.at(text)
 
 
 def port_number(param: typer.CallbackParam, value: int) -> int:

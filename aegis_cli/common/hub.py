@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
 Kind = Literal["model", "dataset"]
 
+_FILES = (".json", ".jsonl", ".parquet", ".safetensors", ".yaml", ".yml")
 _ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
@@ -20,8 +22,22 @@ def is_id(name: str) -> bool:
 
 def is_local(name: str) -> bool:
     """Whether a name can only be a path: the hub is never asked for a typo in one."""
-    first = name.partition("/")[0]
-    return not is_id(name) or first == "runs" or Path(first).is_dir()
+    is_file = Path(name).suffix in _FILES
+    return not is_id(name) or is_file or _first(name) == "runs" or Path(_first(name)).is_dir()
+
+
+def not_asked(name: str) -> str:
+    """What to add to the advice for a missing path which a folder alone keeps from being an id."""
+    if not is_id(name) or not Path(_first(name)).is_dir():
+        return ""
+    return (
+        f"; the hub is not asked for '{name}', because a folder '{_first(name)}' is here: to have "
+        "it asked, go on in another folder"
+    )
+
+
+def _first(name: str) -> str:
+    return name.partition("/")[0]
 
 
 def is_installed() -> bool:
@@ -37,7 +53,8 @@ def list_files(name: str, kind: Kind) -> list[str]:
     """
     import huggingface_hub
 
-    return huggingface_hub.list_repo_files(name, repo_type=kind)
+    with _as_os_error():
+        return huggingface_hub.list_repo_files(name, repo_type=kind)
 
 
 def snapshot(
@@ -45,18 +62,38 @@ def snapshot(
     kind: Kind,
     wanted: Sequence[str],
     unwanted: Sequence[str] = (),
+    cached: bool = False,
 ) -> Path:
     """The local folder of a repository's newest files, downloaded if they are not there.
 
     Args:
         wanted, unwanted: patterns of the files' paths.
+        cached: whether only the hub's cache is looked at.
 
     Raises:
-        OSError, ValueError: neither in the hub's cache nor to be had.
+        OSError, ValueError: neither in the cache nor to be had.
     """
     import huggingface_hub
 
-    found = huggingface_hub.snapshot_download(
-        name, repo_type=kind, allow_patterns=list(wanted), ignore_patterns=list(unwanted)
-    )
+    with _as_os_error():
+        found = huggingface_hub.snapshot_download(
+            name,
+            repo_type=kind,
+            allow_patterns=list(wanted),
+            ignore_patterns=list(unwanted),
+            local_files_only=cached,
+        )
     return Path(found)
+
+
+@contextlib.contextmanager
+def _as_os_error() -> Iterator[None]:
+    """Raise OSError for what goes wrong with the connection, which is any error of httpx's."""
+    from huggingface_hub.errors import HTTPError
+
+    try:
+        yield
+    except HTTPError as error:
+        if isinstance(error, OSError):
+            raise
+        raise OSError(f"{type(error).__name__}: {error}") from error

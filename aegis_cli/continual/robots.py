@@ -456,7 +456,7 @@ def _demos(
 def _demos_path(recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent) -> Path:
     """Where a task's demonstrations lie; they are recorded if the recipe names no file."""
     if recipe.demos.paths is not None:
-        return Path(recipe.demos.paths[number])
+        return demonstrations.at(recipe.demos.paths[number])
     home = out.parent / "demos"
     make_folder(home)
     return record(recipe, number, StageRecords(home, on_event)).path

@@ -170,22 +170,41 @@ class Demonstrations:
         return (actions - origins)[~is_pad]
 
 
-def locate(path: Path) -> Path:
-    """The file or folder of demonstrations, for a dataset on the hub the one it is downloaded to.
+def at(path: str | Path) -> Path:
+    """A path of demonstrations as somebody wrote it, or the id of a dataset on the hub.
 
     Raises:
-        AegisError: nothing of that name, neither here nor on the hub.
+        AegisError: nothing is there, and it can be no id; './a/b' is none.
     """
-    if Path(path).exists():
-        return Path(path)
-    name = str(path)
-    if hub.is_local(name):
+    if not Path(path).exists() and hub.is_local(str(path)):
         raise AegisError(
-            f"no file or folder '{name}'",
+            f"no file or folder '{path}'",
             "a file of aegis demos, the folder of a LeRobot dataset, or its id on the hub",
-            "check the path, or record with: aegis demos",
+            f"check the path, or record with: aegis demos{hub.not_asked(str(path))}",
         )
-    return download.fetch(name)
+    return Path(path)
+
+
+def locate(path: Path, selection: Selection | None = None) -> Path:
+    """The file or folder of demonstrations; for a dataset on the hub, that of its copy here.
+
+    Args:
+        selection: what is to be read of such a dataset, which is downloaded; None: the meta folder
+            alone.
+
+    Raises:
+        AegisError: nothing of that name, neither here nor on the hub, or no such features.
+    """
+    if at(path).exists():
+        return Path(path)
+    folder = download.meta(str(path))
+    if selection is None:
+        return folder
+    # What cannot be learned from is found before anything large is downloaded.
+    found = dataset.load(folder)
+    for feature in selection.vectors:
+        found.size(feature)
+    return download.fetch(str(path), found.cameras(selection.camera))
 
 
 def load(
@@ -214,7 +233,7 @@ def load(
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
     """
-    path = locate(path)
+    path = locate(path, selection)
     split = (validation_share, seed, selection.only)
     if path.is_dir():
         return _load_folder(path, split, selection, image_size, workers, cache, on_event)
@@ -224,7 +243,7 @@ def load(
 
 def digest(path: Path, selection: Selection = ALL) -> str:
     """sha256 of everything that `load` would read."""
-    path = locate(path)
+    path = locate(path, selection)
     if not path.is_dir():
         return artifacts.sha256_file(path)
     found = dataset.load(path)
@@ -241,12 +260,12 @@ def _source(found: dataset.Dataset, only: str | None) -> Source:
 
 def is_same(path: Path, selection: Selection, sha256: str) -> bool:
     """Whether these are the demonstrations of that digest, of which `selection` was read."""
-    folder = locate(path)
-    if folder.is_dir() and selection.only is not None:
-        info = layout.read_info(folder)
+    here = locate(path)
+    if here.is_dir() and selection.only is not None:
+        info = layout.read_info(here)
         if not episodes_of.are_there(selection.only, info.episodes, info.splits):
             return False
-    return digest(folder, selection) == sha256
+    return digest(path, selection) == sha256
 
 
 def count_episodes(path: Path) -> int:

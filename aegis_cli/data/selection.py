@@ -25,6 +25,14 @@ class Selection:
     state: str | tuple[str, ...] = STATE
     action: str | tuple[str, ...] = ACTION
 
+    @property
+    def vectors(self) -> tuple[str, ...]:
+        """All features that are proprioception or actions."""
+        state, action = (
+            (chosen,) if isinstance(chosen, str) else chosen for chosen in (self.state, self.action)
+        )
+        return (*state, *action)
+
     def check_file(self, path: Path) -> None:
         """Raise AegisError where something is chosen that a file of `aegis demos` does not have."""
         for name, what in (("camera", "a camera"), ("state", "features"), ("action", "features")):

@@ -5,9 +5,11 @@ What needs torch is imported when it is needed, for a header's bytes are read in
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 
+from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.inspection import file
@@ -42,6 +44,8 @@ __all__ = [
 def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspection:
     """Recognise `path`: an embedded model's name, an artifact file, a run or a dataset.
 
+    Of a dataset on the hub, which goes by its id, only the meta folder is downloaded.
+
     Only an artifact's header is read, unless figures need the tensors. It is done at once, so
     `on_event` (there as in every stage) is never called.
 
@@ -50,6 +54,11 @@ def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspect
             that is not learned to its end.
     """
     path = _located(path)
+    if not path.exists() and not hub.is_local(str(path)):
+        from aegis_cli.data.lerobot import download
+        from aegis_cli.inspection import folders
+
+        return dataclasses.replace(folders.inspect(download.meta(str(path))), path=str(path))
     if not path.is_dir():
         return file.inspect(path)
     from aegis_cli.inspection import folders

@@ -17,6 +17,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -180,7 +181,7 @@ class PolicyRun:
     def _find_demos(self, wanted: str) -> Path:
         """The recipe's demonstrations, or a file beside the run, where `aegis run` puts it."""
         if self._recipe.demos.path is not None:
-            return Path(self._recipe.demos.path)
+            return demonstrations.at(self._recipe.demos.path)
         for path in sorted(self._run.resolve().parent.glob("*.safetensors")):
             if files.sha256_file(path) == wanted:
                 return path

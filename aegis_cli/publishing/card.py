@@ -199,7 +199,7 @@ def _front_matter(recipe: Recipe, form: str) -> str:
     if hub.is_id(recipe.backbone) and not Path(recipe.backbone).exists():
         lines.append(f"base_model: {recipe.backbone}")
     demos = recipe.demos.path
-    if demos is not None and hub.is_id(demos) and not Path(demos).exists():
+    if demos is not None and not Path(demos).exists() and not hub.is_local(demos):
         lines.append(f"datasets: [{demos}]")
     return "\n".join(lines)
 

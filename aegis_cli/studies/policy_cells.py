@@ -220,7 +220,7 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
 def _check_playable(trials: Sequence[Recipe]) -> None:
     named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
     for path, camera in dict.fromkeys(named):
-        if demonstrations.playable_task(Path(path), camera) is None:
+        if demonstrations.playable_task(demonstrations.at(path), camera) is None:
             raise AegisError(
                 f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out "
                 "here",
@@ -319,7 +319,8 @@ class PolicyRunner:
     def _given_demos(self, path: str, selection: Selection) -> Made:
         name = (path, selection)
         if name not in self._given:
-            self._given[name] = Made(Path(path), demonstrations.digest(Path(path), selection))
+            at = demonstrations.at(path)
+            self._given[name] = Made(at, demonstrations.digest(at, selection))
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:

@@ -150,7 +150,7 @@ class RobotStreamRunner(StreamRuns):
     def _digest(self, path: str) -> str:
         """What changes when given demonstrations do."""
         if path not in self._digests:
-            self._digests[path] = demonstrations.digest(Path(path))
+            self._digests[path] = demonstrations.digest(demonstrations.at(path))
         return self._digests[path]
 
     def learned(self, cell: Cell) -> RobotStreamRecipe:

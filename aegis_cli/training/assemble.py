@@ -296,7 +296,7 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
     if recipe.expert.start is not None:
         checkpoint.load_expert(recipe.expert.start)
     if recipe.demos.path is not None:
-        backbone, path = backbones.load(recipe.backbone), Path(recipe.demos.path)
+        backbone, path = backbones.load(recipe.backbone), demonstrations.at(recipe.demos.path)
         load_demonstrations(recipe, backbone, path, on_event)
         return
     for name, of in (("camera", "a LeRobot folder"), ("only", "demonstrations")):

@@ -60,9 +60,13 @@ def test_weights_that_a_repository_has_twice_are_fetched_once(
     there = ["config.json", "model-00001-of-2.safetensors", "consolidated.safetensors", "a.bin"]
 
     def download(
-        _: str, repo_type: str, allow_patterns: list[str], ignore_patterns: list[str]
+        _: str,
+        repo_type: str,
+        allow_patterns: list[str],
+        ignore_patterns: list[str],
+        local_files_only: bool,
     ) -> str:
-        assert repo_type == "model"
+        assert repo_type == "model" and not local_files_only
         for name in filter_repo_objects(
             there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
         ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,22 @@ class Dataset:
     Attributes:
         tasks: texts, in the order of their `task_index`.
         episodes: in the order of their frames, which are numbered through from 0.
-        stats: by feature and statistic a (nested) list of numbers; None where the dataset has
-            no statistics.
     """
 
     folder: Path
     info: Info
     tasks: tuple[str, ...]
     episodes: tuple[EpisodeIndex, ...]
-    stats: Mapping[str, Mapping[str, Any]] | None
+
+    @cached_property
+    def stats(self) -> Mapping[str, Mapping[str, Any]] | None:
+        """By feature and statistic a (nested) list of numbers; None where the dataset has none.
+
+        Nothing that is learned depends on them, and version 2.1 has those of each episode.
+        """
+        if self.info.has_episode_files:
+            return version_2.read_stats(self.folder)
+        return layout.read_stats(self.folder)
 
     @property
     def table_files(self) -> list[Path]:
@@ -118,5 +126,4 @@ def load(folder: Path) -> Dataset:
     layout.require_pyarrow()
     reader = version_2 if info.has_episode_files else version_3
     tasks, episodes = reader.read_tasks(folder), reader.read_episodes(folder, info)
-    stats = version_2.read_stats(folder) if info.has_episode_files else layout.read_stats(folder)
-    return Dataset(folder, info, tasks, episodes, stats)
+    return Dataset(folder, info, tasks, episodes)

@@ -89,7 +89,7 @@ def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
     starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)])
     asked, seen = set(wanted), dict[int, Path]()
     found = []
-    for path in layout.data_files(dataset.info, dataset.folder):
+    for path in _data_files(dataset, episodes):
         file = _file(dataset, path, asked, starts)
         for number in file.episodes:
             if number in seen:
@@ -106,6 +106,14 @@ def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
             raise _missing(dataset, number)
     found.sort(key=lambda file: file.rows[0].first_frame)
     return Source(dataset, tuple(wanted), tuple(found))
+
+
+def _data_files(dataset: Dataset, episodes: Sequence[int] | None) -> list[Path]:
+    """The files that may hold these episodes; of an episode's own file, its name says it."""
+    if episodes is None or not dataset.info.has_episode_files:
+        return layout.data_files(dataset.info, dataset.folder)
+    own = {dataset.folder / dataset.episodes[number].data for number in episodes}
+    return sorted(path for path in own if path.exists())
 
 
 def _file(dataset: Dataset, path: Path, asked: set[int], starts: np.ndarray) -> DataFile:

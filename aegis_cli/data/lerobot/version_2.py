@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ def read_tasks(folder: Path) -> tuple[str, ...]:
     Raises:
         AegisError: a file that is missing or damaged.
     """
-    rows = _lines(folder / TASKS)
     with layout.damaged(folder / TASKS):
-        return layout.texts_of(layout.by_number((row["task_index"], row["task"]) for row in rows))
+        rows = ((row["task_index"], row["task"]) for row in _lines(folder / TASKS))
+        return layout.texts_of(layout.by_number(rows))
 
 
 def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
@@ -38,9 +38,9 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     Raises:
         AegisError: a file that is missing or damaged, or counts that do not agree.
     """
-    rows = _lines(folder / EPISODES)
     with layout.damaged(folder / EPISODES):
-        episodes = layout.by_number((row["episode_index"], _episode(row, info)) for row in rows)
+        rows = ((row["episode_index"], _episode(row, info)) for row in _lines(folder / EPISODES))
+        episodes = layout.by_number(rows)
     layout.check_episodes(folder / EPISODES, info, episodes)
     return tuple(episodes.values())
 
@@ -53,14 +53,14 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
     """
     if not (folder / _STATS).is_file():
         return layout.read_stats(folder)
-    rows = _lines(folder / _STATS)
+    joined: dict[str, statistics.Statistics] = {}
     with layout.damaged(folder / _STATS):
-        parts: dict[str, list[statistics.Statistics]] = {}
-        for row in rows:
+        for row in _lines(folder / _STATS):
             for feature, figures in row["stats"].items():
-                arrays = {name: np.asarray(value, np.float64) for name, value in figures.items()}
-                parts.setdefault(feature, []).append(arrays)
-        return {feature: dict(statistics.merge(found)) for feature, found in parts.items()}
+                own = {name: np.asarray(value, np.float64) for name, value in figures.items()}
+                known = [joined[feature], own] if feature in joined else [own]
+                joined[feature] = statistics.merge(known)
+    return dict(joined)
 
 
 def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
@@ -72,14 +72,15 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     return EpisodeIndex(length, layout.data_file(info, place), clips)
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a file that has one a line.
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects of a file that has one a line, one after the other.
 
     Raises:
-        AegisError: a file that is missing, or a line that is no JSON.
+        AegisError: a file that is missing.
+        ValueError: a line is no JSON.
     """
-    with files.reading(path, layout.AGAIN):
-        content = path.read_bytes()
-    with layout.damaged(path):
-        text = content.decode()
-        return [files.parse_json(line) for line in text.splitlines() if line.strip()]
+    # Only what JSON takes for the end of a line ends one: an instruction may hold others.
+    with files.reading(path, layout.AGAIN), open(path, "rb") as file:
+        for line in file:
+            if line.strip():
+                yield files.parse_json(line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 
@@ -27,35 +28,53 @@ def fetch(name: str, split: str | None) -> Path:
             "check the path, or pip install 'aegis-vla[hf]'",
         )
     try:
-        return hub.snapshot(name, "dataset", _wanted(name, split))
-    except (OSError, ValueError) as error:
-        raise AegisError(
-            f"no question set '{name}', and no data set of that name from the Hugging Face hub: "
-            f"{in_short(error)}",
-            "a local set, or a hub id with a network (and, for a gated data set, a token)",
-            "check the path; or where there is a network: hf download --repo-type dataset "
-            f"{name} --local-dir FOLDER; then give FOLDER",
-        ) from error
-
-
-def _wanted(name: str, split: str | None) -> list[str]:
-    """The parquet files of a split, or of the only one; all of them where the hub cannot be asked.
-
-    Then they are in the cache already, or `snapshot` says that they are not.
-    """
-    try:
         there = hub.list_files(name, "dataset")
+    except (OSError, ValueError) as error:
+        return _cached(name, split, error)
+    wanted = [str(path) for path in _of_split(name, there, split)]
+    try:
+        return hub.snapshot(name, "dataset", wanted)
+    except (OSError, ValueError) as error:
+        raise _missing(name, error) from error
+
+
+def _cached(name: str, split: str | None, why: Exception) -> Path:
+    """The folder of a split that was downloaded before, where the hub cannot be asked."""
+    names = ["*.parquet"]
+    if split is not None:
+        names = [f"{split}.parquet", f"{split}-[0-9]*.parquet", f"{split}_[0-9]*.parquet"]
+        names += [f"data/{own}" for own in names]
+    try:
+        return hub.snapshot(name, "dataset", names, cached=True)
     except (OSError, ValueError):
-        return ["*.parquet"]
+        raise _missing(name, why) from why
+
+
+def _missing(name: str, error: Exception) -> AegisError:
+    return AegisError(
+        f"no question set '{name}', and no data set of that name from the Hugging Face hub: "
+        f"{in_short(error)}",
+        "a local set, or a hub id with a network (and, for a gated data set, a token)",
+        "check the path; or where there is a network: hf download --repo-type dataset "
+        f"{name} --local-dir FOLDER; then give FOLDER",
+    )
+
+
+def _of_split(name: str, there: Sequence[str], split: str | None) -> list[PurePosixPath]:
+    """The parquet files of a split, or of the only one."""
     parquet = [PurePosixPath(path) for path in there if path.endswith(".parquet")]
     for folder in (PurePosixPath("."), PurePosixPath("data")):
         if files := [path for path in parquet if path.parent == folder]:
-            return [str(path) for path in saved.of_split(name, files, split)]
+            return saved.of_split(name, files, split)
+    found = f"no parquet file at the top of '{name}' on the hub, nor in its data/"
+    expected = "a data set of images, questions and answers as parquet"
+    get = f"hf download --repo-type dataset {name} --local-dir FOLDER"
     elsewhere = sorted({str(path.parent) for path in parquet})
+    if not elsewhere:
+        raise AegisError(found, expected, f"{get}; then give FOLDER")
+    folder = elsewhere[0]
     raise AegisError(
-        f"no parquet file at the top of '{name}' on the hub, nor in its data/"
-        + (f", but in {', '.join(elsewhere[:5])}" if elsewhere else ""),
-        "a data set of images, questions and answers as parquet",
-        f"hf download --repo-type dataset {name} --include 'PATH/*' --local-dir FOLDER; then give "
-        "FOLDER/PATH",
+        f"{found}, but in {', '.join(elsewhere[:5])}",
+        expected,
+        f"{get} --include '{folder}/*'; then give FOLDER/{folder}",
     )

@@ -262,12 +262,14 @@ def _located(vqa: str) -> tuple[Path, str | None]:
     """The path of a set, for one on the hub that of its copy here, and the split after a #."""
     if os.path.exists(vqa):
         return Path(vqa), None
-    name, _, named = vqa.partition("#")
-    split = named or None
+    name, _, split = vqa.rpartition("#") if "#" in vqa else (vqa, "", None)
+    if name in (SCENES, easy.NAME):
+        raise AegisError(f"the split '{split}' of '{name}'", "no split", f"--vqa {name}")
     if os.path.exists(name):
         return Path(name), split
     if hub.is_local(name):
-        raise _unknown(f"question set '{name}', which does not exist")
+        missing = f"question set '{name}', which does not exist"
+        raise _unknown(missing, f"check the path, or use --vqa scenes{hub.not_asked(name)}")
     return download.fetch(name, split), split
 
 
@@ -296,12 +298,12 @@ def _reader(path: Path, split: str | None) -> Reader:
     raise _unknown(f"question set '{path}'")
 
 
-def _unknown(found: str) -> AegisError:
+def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> AegisError:
     expected = (
         "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, a folder of a "
         "Hugging Face data set, or its id on the hub"
     )
-    return AegisError(found, expected, "check the path, or use --vqa scenes")
+    return AegisError(found, expected, fix)
 
 
 def share(key: str) -> int:

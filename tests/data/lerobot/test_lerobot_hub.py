@@ -11,13 +11,15 @@ from typing import Any
 
 import pytest
 import torch
+from huggingface_hub.errors import HTTPError
 from huggingface_hub.utils import filter_repo_objects
-from samples.lerobot import edit_info, episodes, save
+from samples.lerobot import as_version_2, edit_info, episodes, save
 from samples.user_folder import training
 
 from aegis_cli.common import hub
 from aegis_cli.data import demonstrations
-from aegis_cli.data.lerobot import download
+from aegis_cli.data.lerobot import download, write
+from aegis_cli.data.selection import Selection
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -31,14 +33,20 @@ class Hub:
     def __init__(self, repository: Path, local: Path) -> None:
         self.repository, self.local = repository, local
         self.asked: list[list[str]] = []
+        self.lacks: Exception = FileNotFoundError("no repository of that name")
 
     def __call__(
-        self, name: str, repo_type: str, allow_patterns: list[str], ignore_patterns: list[str]
+        self,
+        name: str,
+        repo_type: str,
+        allow_patterns: list[str],
+        ignore_patterns: list[str],
+        local_files_only: bool,
     ) -> str:
-        assert repo_type == "dataset"
+        assert repo_type == "dataset" and not local_files_only
         self.asked.append(allow_patterns)
         if name != NAME:
-            raise FileNotFoundError(f"no repository {name}")
+            raise self.lacks
         inside = (p for p in self.repository.rglob("*") if p.is_file())
         there = [str(path.relative_to(self.repository)) for path in inside]
         for found in filter_repo_objects(
@@ -58,6 +66,7 @@ def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
     (repository / "weights.bin").write_text("what nobody asked for")
     found = Hub(repository, tmp_path / "cache" / "snapshot")
     monkeypatch.setattr("huggingface_hub.snapshot_download", found)
+    download.meta.cache_clear()
     download.fetch.cache_clear()
     return found
 
@@ -68,7 +77,8 @@ def test_it_is_read_as_the_folder_is(hosted: Hub) -> None:
     assert demonstrations.digest(Path(NAME)) == one.sha256
     assert demonstrations.count_episodes(Path(NAME)) == 8
     # The meta folder comes first, and the hub is asked once in a process.
-    assert hosted.asked == [["meta/*"], ["meta/*", "data/*", "videos/*"]]
+    top = [f"videos/{chunk}observation.images.top/*" for chunk in ("", "*/")]
+    assert hosted.asked == [["meta/*"], ["meta/*", "data/*", *top]]
     assert not (hosted.local / "weights.bin").exists()
 
 
@@ -88,12 +98,19 @@ def test_a_folder_of_that_name_comes_first(hosted: Hub, place: Path) -> None:
     assert demonstrations.count_episodes(Path(NAME)) == 3 and hosted.asked == []
 
 
-@pytest.mark.parametrize("name", ["none", "../x/y", "/no/x", "a/b/c", "runs/x", "data/x"])
+@pytest.mark.parametrize(
+    "name", ["none", "./x/y", "../x/y", "/no/x", "a/b/c", "runs/x", "data/x", "a/b.safetensors"]
+)
 def test_what_can_only_be_a_path_is_never_asked_of_the_hub(
     name: str, hosted: Hub, bad: Bad, place: Path
 ) -> None:
     (place / "data").mkdir()
-    bad(*training(demos=name), says=("no file or folder", "id on the hub", "check the path"))
+    says = [f"no file or folder '{name}'", "id on the hub", "check the path"]
+    if name == "data/x":
+        says.append("the hub is not asked for 'data/x', because a folder 'data' is here")
+    bad(*training(demos=name), says=tuple(says))
+    given = ("--set", "methods=[naive]", "--set", f"demos.path={name}")
+    bad("run", "small.yaml", *given, says=tuple(says))
     assert hosted.asked == []
 
 
@@ -115,12 +132,59 @@ def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: Hub, bad: Ba
     bad(*training(demos=NAME), says=("v1.6", "version 2.0"))
     (hosted.repository / "meta/info.json").rename(hosted.repository / "meta/other.json")
     shutil.rmtree(hosted.local)
+    download.meta.cache_clear()
     bad(*training(demos=NAME), says=(f"'{NAME}' of the hub has no meta/info.json", "--include"))
     assert hosted.asked == [["meta/*"]] * 2 and not (hosted.local / "data").exists()
+
+
+def test_a_connection_that_breaks_is_one_error(hosted: Hub, bad: Bad) -> None:
+    """httpx's own errors are neither OSErrors nor ValueErrors."""
+    for kind in (HTTPError, type("ReadTimeout", (HTTPError,), {})):
+        hosted.lacks = kind("timed out")
+        download.meta.cache_clear()
+        bad(*training(demos="someone/else"), says=(kind.__name__, "timed out", "hf download"))
+
+
+def test_what_the_meta_folder_refuses_is_not_downloaded(hosted: Hub, bad: Bad) -> None:
+    for key, says in (
+        ("camera=side", "no camera 'side'"),
+        ("state=joints", "no feature 'joints'"),
+        ("action=joints", "no feature 'joints'"),
+    ):
+        bad(*training(demos=NAME), "--set", f"demos.{key}", says=(says,))
+    assert hosted.asked == [["meta/*"]]
+
+
+def test_videos_of_other_cameras_stay_where_they_are(
+    hosted: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write, "_MB", 0)
+    for older in (False, True):
+        made = episodes(4, ("top", "wrist"), (64, 64), smooth=True)
+        hosted.repository = save(tmp_path / f"film {older}", made, as_video=True)
+        if older:
+            as_version_2(hosted.repository, "v2.1")
+        hosted.local = tmp_path / f"snapshot {older}"
+        download.meta.cache_clear()
+        download.fetch.cache_clear()
+        found = demonstrations.load(Path(NAME), None, 0, Selection("wrist"))
+        assert len(found.frames) == 1
+        videos = {str(path.relative_to(hosted.local)) for path in hosted.local.rglob("*.mp4")}
+        assert len(videos) == 4 and all("observation.images.wrist" in path for path in videos)
+
+
+def test_inspect_needs_the_meta_folder_alone(aegis: Any, hosted: Hub, tmp_path: Path) -> None:
+    code, out, err = aegis("inspect", NAME, "--json")
+    assert code == 0, err
+    report = json.loads(out)
+    here = json.loads(aegis("inspect", hosted.repository, "--json")[1])
+    assert report == {**here, "path": NAME} and hosted.asked == [["meta/*"]]
+    assert aegis("inspect", NAME, "--plot", tmp_path / "sheet.png")[0] == 0
+    assert (tmp_path / "sheet.png").is_file()
 
 
 def test_the_package_that_asks_the_hub_is_missing(
     hosted: Hub, bad: Bad, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hub, "is_installed", lambda: False)
-    bad(*training(demos=NAME), says=(NAME, "huggingface_hub", "aegis-vla[hub]"))
+    bad(*training(demos=NAME), says=(NAME, "huggingface_hub", "aegis-vla[hub,lerobot]"))

@@ -18,7 +18,7 @@ from samples.user_folder import training
 
 from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
-from aegis_cli.data.lerobot import dataset, source, write
+from aegis_cli.data.lerobot import dataset, layout, source, write
 from aegis_cli.data.selection import Selection
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -182,8 +182,6 @@ BAD: list[tuple[str, Callable[[Path], object], str]] = [
     (EPISODES, lines(lambda rows: rows[1].update(length=0)), "episode 1 has 0 frames"),
     (EPISODES, lines(lambda rows: rows[1].update(length=99)), "frames"),
     (EPISODES, lines(lambda rows: rows[1].pop("length")), "no 'length'"),
-    (STATS, cut, "is damaged"),
-    (STATS, lines(lambda rows: rows[1]["stats"]["action"].pop("mean")), "no 'mean'"),
     (DATA, Path.unlink, "no file"),
     (DATA, cut, "is damaged"),
 ]
@@ -196,6 +194,46 @@ def test_a_bad_file_is_one_error(
     folder = as_version_2(save(place / "d", episodes(COUNT)), "v2.1")
     spoil(folder / name)
     bad(*training(demos="d"), says=(f"d/{name}", says))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (cut, "is damaged"),
+        (lines(lambda rows: rows[1]["stats"]["action"].pop("mean")), "no 'mean'"),
+    ],
+)
+def test_statistics_are_read_by_those_who_show_them(
+    spoil: Callable[[Path], object], says: str, bad: Bad, place: Path
+) -> None:
+    folder = as_version_2(save(place / "d", episodes(COUNT)), "v2.1")
+    before = demonstrations.load(folder, None, 0)
+    spoil(folder / STATS)
+    bad("inspect", "d", says=(STATS, says))
+    assert demonstrations.load(folder, None, 0).sha256 == before.sha256
+
+
+@pytest.mark.parametrize("mark", ["\u2028", "\u2029", "\x85"])
+def test_an_instruction_may_hold_what_ends_lines_elsewhere(mark: str, tmp_path: Path) -> None:
+    folder = as_version_2(save(tmp_path / "d", episodes(COUNT)), "v2.1")
+    text = (folder / TASKS).read_text("utf-8").replace("red pad", f"red{mark}pad")
+    (folder / TASKS).write_text(text, "utf-8")
+    assert f"go to the red{mark}pad" in dataset.load(folder).tasks
+
+
+def test_only_the_files_of_chosen_episodes_are_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = as_version_2(save(tmp_path / "d", episodes(COUNT)), "v2.1")
+    opened, open_parquet = list[str](), layout.open_parquet
+
+    def watched(path: Path) -> Any:
+        opened.append(path.stem)
+        return open_parquet(path)
+
+    monkeypatch.setattr(layout, "open_parquet", watched)
+    demonstrations.load(folder, None, 0, Selection(only="1,3"))
+    assert set(opened) == {"episode_000001", "episode_000003"}
 
 
 def test_a_task_without_a_text(bad: Bad, place: Path) -> None:

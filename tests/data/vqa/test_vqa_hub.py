@@ -10,10 +10,12 @@ from typing import Any
 
 import datasets
 import pytest
+from huggingface_hub.errors import HTTPError, IncompleteSnapshotError, OfflineModeIsEnabled
 from huggingface_hub.utils import filter_repo_objects
 from samples.vqa_files import hub_rows
 
 from aegis_cli.common import hub
+from aegis_cli.common.errors import AegisError
 from aegis_cli.data.vqa import download, sets
 
 Bad = Callable[..., str]
@@ -22,30 +24,43 @@ SPLITS = {"train": 2, "validation": 3}
 
 
 class Hub:
-    """A hub of one data set; `is_there` says whether it answers."""
+    """A hub of one data set.
+
+    Attributes:
+        fails: what is raised where it is asked; None: it answers.
+    """
 
     def __init__(self, repository: Path, local: Path) -> None:
-        self.repository, self.local, self.is_there = repository, local, True
+        self.repository, self.local = repository, local
+        self.fails: Exception | None = None
 
     def files(self, name: str, repo_type: str) -> list[str]:
         assert repo_type == "dataset"
-        if not self.is_there or name != NAME:
+        if self.fails is not None:
+            raise self.fails
+        if name != NAME:
             raise FileNotFoundError(f"no repository {name}")
         found = (path for path in self.repository.rglob("*") if path.is_file())
         return [str(path.relative_to(self.repository)) for path in found]
 
     def snapshot(
-        self, name: str, repo_type: str, allow_patterns: list[str], ignore_patterns: list[str]
+        self,
+        name: str,
+        repo_type: str,
+        allow_patterns: list[str],
+        ignore_patterns: list[str],
+        local_files_only: bool,
     ) -> str:
-        if not self.is_there:
-            if self.local.exists():
-                return str(self.local)
-            raise FileNotFoundError("no connection")
+        """As the hub's own, which knows all files of a repository once it has seen them."""
+        assert repo_type == "dataset"
+        if name != NAME:
+            raise FileNotFoundError(f"no repository {name}")
+        there = [str(p.relative_to(self.repository)) for p in self.repository.rglob("*.parquet")]
         for found in filter_repo_objects(
-            self.files(name, repo_type),
-            allow_patterns=allow_patterns,
-            ignore_patterns=ignore_patterns,
+            there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
         ):
+            if local_files_only and not (self.local / found).exists():
+                raise IncompleteSnapshotError(f"{found} is missing", str(self.local))
             (self.local / found).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(self.repository / found, self.local / found)
         return str(self.local)
@@ -87,10 +102,16 @@ def test_a_split_is_read_and_nothing_else_is_downloaded(split: str, hosted: Hub)
     assert isinstance(here, sets.Listed) and here.sha256 == found.sha256
 
 
-def test_what_is_in_the_cache_needs_no_network(hosted: Hub) -> None:
+@pytest.mark.parametrize("kind", [HTTPError, OfflineModeIsEnabled, FileNotFoundError])
+def test_what_is_in_the_cache_needs_no_network(kind: type[Exception], hosted: Hub) -> None:
+    """And nothing else is downloaded where the hub fails to say what it has."""
     before = reread(f"{NAME}#train")
-    hosted.is_there = False
+    hosted.fails = kind("no connection")
     assert reread(f"{NAME}#train").state == before.state
+    for other in (f"{NAME}#validation", NAME):
+        with pytest.raises(AegisError, match="no connection"):
+            reread(other)
+    assert hosted.downloaded == {"train-00000-of-00001.parquet"}
 
 
 def test_a_probe_takes_its_id(aegis: Any, hosted: Hub, place: Path) -> None:
@@ -109,12 +130,14 @@ def test_several_splits_are_refused_before_any_is_downloaded(hosted: Hub, bad: B
 
 def test_a_repository_of_another_form(hosted: Hub, bad: Bad) -> None:
     (hosted.repository / "data").rename(hosted.repository / "default")
-    says = (f"no parquet file at the top of '{NAME}'", "in default", "--include")
+    says = (f"no parquet file at the top of '{NAME}'", "in default", "--include 'default/*'")
+    bad("anchor", "--vqa", f"{NAME}#train", "--out", "a.safetensors", says=says)
+    shutil.rmtree(hosted.repository / "default")
+    says = (f"no parquet file at the top of '{NAME}'", "then give FOLDER")
     bad("anchor", "--vqa", f"{NAME}#train", "--out", "a.safetensors", says=says)
 
 
 def test_a_set_that_the_hub_lacks(hosted: Hub, bad: Bad) -> None:
-    hosted.is_there = False
     says = ("someone/else", "Hugging Face hub", "hf download --repo-type dataset someone/else")
     bad("anchor", "--vqa", "someone/else#train", "--out", "a.safetensors", says=says)
 

@@ -265,9 +265,17 @@ def test_a_split_that_is_not_there(
 
 
 def test_a_path_may_have_a_number_sign(tmp_path: Path) -> None:
-    path = tmp_path / "set#1"
-    datasets.Dataset.from_dict(hub_rows(3)).save_to_disk(str(path))
+    path, rows = tmp_path / "set#1", datasets.Dataset.from_dict(hub_rows(3))
+    rows.save_to_disk(str(path))
     assert len(sets.read(str(path)).entries) == 6
+    datasets.DatasetDict({"train": rows, "test": rows}).save_to_disk(str(tmp_path / "set#2"))
+    assert len(sets.read(f"{tmp_path / 'set#2'}#test").entries) == 6
+
+
+@pytest.mark.parametrize("name", ["scenes", "easy-vqa"])
+def test_the_sets_that_ship_have_no_splits(name: str) -> None:
+    with pytest.raises(AegisError, match=f"the split 'train' of '{name}'"):
+        sets.read(f"{name}#train")
 
 
 @pytest.mark.parametrize("name", ["data-00000-of-00001.arrow", "dataset_info.json"])
