@@ -416,6 +416,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("merges", 34, 34),
         ("plateau", 12, 12),
         ("rivals", 139, 139),
+        ("metaworld-study", 24, 24),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(

@@ -90,6 +90,14 @@ def chosen_task(report: Any) -> Any:
     )
 
 
+def _has_colors(report: Any) -> bool:
+    """Whether the frontier's task has held-out colours, or else a return; MetaWorld's have none."""
+    task = chosen_task(report)
+    known = task.results if task is not None else []
+    acted = [found for found in known if found.success_seen is not None]
+    return not acted or any(found.success_held_out is not None for found in acted)
+
+
 def _acting(result: Any) -> str:
     """Which figure says how well it acts: success on seen colours, or the share of a return."""
     return "success_seen" if result.return_share is None else "return_share"
@@ -196,7 +204,7 @@ def _scale(axis: Any, report: Any) -> None:
     margin = max(2.0, 0.08 * (max(across) - min(across)))
     acting = next(map(_acting, compared), "success_seen")
     axis.set(
-        xlabel=_COLUMNS[acting].axis,
+        xlabel=_COLUMNS[acting].axis if _has_colors(report) else "success (%)",
         ylabel=_COLUMNS[_LOST].axis,
         xlim=(min(across) - margin, max(across) + margin),
     )
