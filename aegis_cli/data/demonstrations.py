@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ class Demonstrations:
         action_names, proprio_names: of their A and P numbers; empty where the data names none.
         fps: frames per second, which is the rate at which the robot was controlled; None where the
             data does not say.
+        dataset: its id on the hub, where that is what was asked for.
     """
 
     task: str | None
@@ -72,6 +73,7 @@ class Demonstrations:
     action_names: tuple[str, ...] = ()
     proprio_names: tuple[str, ...] = ()
     fps: float | None = None
+    dataset: str | None = None
 
     @property
     def recorded(self) -> dict[str, Any]:
@@ -233,12 +235,13 @@ def load(
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
     """
-    path = locate(path, selection)
+    here = locate(path, selection)
     split = (validation_share, seed, selection.only)
-    if path.is_dir():
-        return _load_folder(path, split, selection, image_size, workers, cache, on_event)
-    selection.check_file(path)
-    return _load_file(path, split)
+    if here.is_dir():
+        found = _load_folder(here, split, selection, image_size, workers, cache, on_event)
+        return found if here == path else replace(found, dataset=str(path))
+    selection.check_file(here)
+    return _load_file(here, split)
 
 
 def digest(path: Path, selection: Selection = ALL) -> str:

@@ -115,6 +115,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["merge"] = merged
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
+    if dataset_id := header.meta.get("dataset"):
+        facts["dataset"] = dataset_id
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
     energies = figures.of_ledger(rows, until)
     if at is not None:

@@ -119,7 +119,7 @@ def text(
     options = json.dumps(recipes.options(recipe), sort_keys=True)
     merge = facts.get("merge")
     return _CARD.format(
-        front=_front_matter(recipe, form),
+        front=_front_matter(recipe, form, facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {recipe.train.method}",
         backbone=recipe.backbone,
         version=__version__,
@@ -163,6 +163,8 @@ def _probe_command(folder: str, recipe: Recipe) -> str:
     words = ["aegis", "probe", folder, "--baseline", recipe.backbone, "--vqa", str(probe.vqa)]
     if probe.ask != _AS_IT_IS:
         words += ["--ask", probe.ask]
+    if probe.skip_bad:
+        words.append("--skip-bad")
     return shlex.join(words)
 
 
@@ -189,8 +191,8 @@ def _measured(run: Path, at: Path) -> InspectReport:
     return found
 
 
-def _front_matter(recipe: Recipe, form: str) -> str:
-    """The lines that the hub reads."""
+def _front_matter(recipe: Recipe, form: str, dataset: str | None) -> str:
+    """The lines that the hub reads; `dataset` is the demonstrations' id there."""
     lines = [
         f"library_name: {'lerobot' if form == LEROBOT else 'aegis-vla'}",
         "pipeline_tag: robotics",
@@ -198,9 +200,8 @@ def _front_matter(recipe: Recipe, form: str) -> str:
     ]
     if hub.is_id(recipe.backbone) and not Path(recipe.backbone).exists():
         lines.append(f"base_model: {recipe.backbone}")
-    demos = recipe.demos.path
-    if demos is not None and not Path(demos).exists() and not hub.is_local(demos):
-        lines.append(f"datasets: [{demos}]")
+    if dataset is not None:
+        lines.append(f"datasets: [{dataset}]")
     return "\n".join(lines)
 
 

@@ -95,7 +95,7 @@ class TrainingRun:
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
         if it is not float32; `relative`, for each action the place of the position that it is
         predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
-        as the demonstrations say them.
+        as the demonstrations say them; `dataset`, their id, if they come from the hub.
         """
         found = {
             "method": self.method.name,
@@ -107,6 +107,8 @@ class TrainingRun:
         found |= self.demos.recorded
         if self.policy.origins.places:
             found["relative"] = list(self.policy.origins.places)
+        if self.demos.dataset is not None:
+            found["dataset"] = self.demos.dataset
         if self.demos.cameras:
             found["cameras"] = list(self.demos.cameras)
         if self.policy.backbone.image_size is None:

@@ -98,6 +98,16 @@ def test_a_frontier_without_tuning_shows_the_means() -> None:
     assert set(texts(figure)) == {"a", "x", "better"}
 
 
+def test_success_of_a_task_without_held_out_colours_is_of_no_colours() -> None:
+    report = found(("a", "x"))
+    (task,) = report.tasks
+    bare = [dataclasses.replace(r, success_held_out=None) for r in task.results]
+    without = dataclasses.replace(report, tasks=[dataclasses.replace(task, results=bare)])
+    assert frontier.acting_axis(report) == "success on seen colours (%)"
+    assert frontier.acting_axis(without) == "success (%)"
+    assert frontier._figure(without).axes[0].get_xlabel() == "success (%)"
+
+
 # --- labels ---------------------------------------------------------------------------------------
 
 

@@ -160,13 +160,20 @@ def _most_successful(rows: Sequence[At]) -> list[Child]:
     best = max(acting, key=lambda row: row[name].value)
     what = "succeeds most often" if name == "success_seen" else "returns most"
     said: list[Child] = [element("strong", best["method"]), f" {what}: ", share(best[name]), " %"]
-    return [*said, " on seen colours." if name == "success_seen" else " of the highest."]
+    if name == "return_share":
+        return [*said, " of the highest."]
+    return [*said, " on seen colours." if _has_colors(rows) else "."]
 
 
 def _acting(rows: Sequence[At]) -> str:
     """The figure of acting that the rows have."""
     by_return = any(row["return_share"].value is not None for row in rows)
     return "return_share" if by_return else "success_seen"
+
+
+def _has_colors(rows: Sequence[At]) -> bool:
+    """Whether any was rolled out on held-out colours, which MetaWorld's tasks do not have."""
+    return any(row["success_held_out"].value is not None for row in rows)
 
 
 _COLUMNS = (
@@ -203,14 +210,21 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
     spots = _spots(rows, own)
     if spots:
-        acts = "return (% of the highest)" if _acting(rows) == "return_share" else _SEEN
-        chart = charts.frontier(spots, [], acts, _LOST, "VQA accuracy lost over success")
+        chart = charts.frontier(
+            spots, [], _acting_axis(rows), _LOST, "VQA accuracy lost over success"
+        )
         said = "Better is to the upper right. Bars are 95 % intervals of one training."
         parts.append(figure(chart, said, wide=True))
     return section("Methods compared", *parts)
 
 
-_SEEN, _LOST = "success on seen colours (%)", "VQA accuracy lost (points)"
+_LOST = "VQA accuracy lost (points)"
+
+
+def _acting_axis(rows: Sequence[At]) -> str:
+    if _acting(rows) == "return_share":
+        return "return (% of the highest)"
+    return "success on seen colours (%)" if _has_colors(rows) else "success (%)"
 
 
 def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:

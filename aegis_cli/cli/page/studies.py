@@ -11,7 +11,7 @@ from aegis_cli.cli.page.cursor import At, between, decimal, farthest, share, sho
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.runs import figure, note, section
 from aegis_cli.cli.page.tables import table, verdict
-from aegis_cli.cli.render.frontier import chosen_task, coloured_methods
+from aegis_cli.cli.render.frontier import acting_axis, chosen_task, coloured_methods
 from aegis_cli.cli.render.studies import knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns
@@ -33,12 +33,11 @@ def frontier(compared: At, report: Any) -> Markup | None:
     tried, curves = _tried(compared, number)
     if not spots and not tried:
         return None
-    acts = _RETURN if chosen is not None and chosen.results[0].return_share else _SEEN
     where = report.tuning_task if report.tuning else chosen.task
     chart = charts.frontier(
         [*tried, *spots],
         curves,
-        _DECLARED[acts].axis or "",
+        acting_axis(report),
         _DECLARED[_LOST].axis or "",
         "VQA accuracy lost over success",
     )

@@ -90,6 +90,12 @@ def chosen_task(report: Any) -> Any:
     )
 
 
+def acting_axis(report: Any) -> str:
+    """What the frontier's axis of success says; of a task without held-out colours, no colours."""
+    acting = next(map(_acting, _compared(report)), "success_seen")
+    return str(_COLUMNS[acting].axis) if _has_colors(report) else "success (%)"
+
+
 def _has_colors(report: Any) -> bool:
     """Whether the frontier's task has held-out colours, or else a return; MetaWorld's have none."""
     task = chosen_task(report)
@@ -202,9 +208,8 @@ def _scale(axis: Any, report: Any) -> None:
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
     across, lost = [x for x, _ in spots], [y for _, y in spots]
     margin = max(2.0, 0.08 * (max(across) - min(across)))
-    acting = next(map(_acting, compared), "success_seen")
     axis.set(
-        xlabel=_COLUMNS[acting].axis if _has_colors(report) else "success (%)",
+        xlabel=acting_axis(report),
         ylabel=_COLUMNS[_LOST].axis,
         xlim=(min(across) - margin, max(across) + margin),
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from huggingface_hub.errors import HTTPError
 from huggingface_hub.utils import filter_repo_objects
 from samples.lerobot import as_version_2, edit_info, episodes, save
@@ -20,6 +21,8 @@ from aegis_cli.common import hub
 from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import download, write
 from aegis_cli.data.selection import Selection
+from aegis_cli.publishing import card
+from aegis_cli.training import checkpoint
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -90,6 +93,13 @@ def test_a_training_and_an_evaluation_take_its_id(aegis: Any, hosted: Hub, place
     assert code == 0 and report["data"] == NAME
     # They are known to be those that the run was trained on.
     assert report["split"] == "validation" and 0 < len(report["episodes"]) < 8
+    code, out, _ = aegis("inspect", "runs/x", "--json")
+    assert code == 0 and json.loads(out)["facts"]["dataset"] == NAME
+    run = Path("runs/x")
+    stored = card.Stored("float32", rounded=False)
+    said = card.text(run, checkpoint.last(run), card.LEROBOT, "lab/arm", stored)
+    _, front, _ = said.split("---\n", 2)
+    assert yaml.safe_load(front)["datasets"] == [NAME]
 
 
 def test_a_folder_of_that_name_comes_first(hosted: Hub, place: Path) -> None:
