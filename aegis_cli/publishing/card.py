@@ -25,6 +25,8 @@ NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
 _AS_IT_IS = "{}"  # what `probe.ask` makes of a question where it changes nothing
 
+_AVERAGED = " The weights are an exponential moving average of the training's, of decay {:g}."
+
 _CARD = """---
 {front}
 ---
@@ -46,7 +48,7 @@ fine-tuned by Aegis {version} with the method `{method}`:
 ## Training
 
 {steps:,} steps of {batch} frames, seed {seed}; learning rate {backbone_lr:g} for the backbone and
-{expert_lr:g} for the expert. Options of the method: `{options}`.{merged}
+{expert_lr:g} for the expert. Options of the method: `{options}`.{averaged}{merged}
 
 {stored}
 
@@ -117,7 +119,7 @@ def text(
     facts = found.facts
     # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
     options = json.dumps(recipes.options(recipe), sort_keys=True)
-    merge = facts.get("merge")
+    merge, decay = facts.get("merge"), recipe.train.ema_decay
     return _CARD.format(
         front=_front_matter(recipe, form, facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {recipe.train.method}",
@@ -133,6 +135,7 @@ def text(
         backbone_lr=recipe.train.backbone_lr,
         expert_lr=recipe.train.expert_lr,
         options=options,
+        averaged="" if decay is None else _AVERAGED.format(decay),
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),

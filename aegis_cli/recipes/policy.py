@@ -291,6 +291,13 @@ class Train:
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
     )
+    ema_decay: float | None = key(
+        SHARE,
+        None,
+        later=True,
+        doc="Decay of an exponential moving average of the weights, such as 0.99: checkpoints hold "
+        "the average, and training goes on from the weights themselves. Null keeps none.",
+    )
     backbone_until: float = key(
         SHARE_OR_ONE,
         1.0,

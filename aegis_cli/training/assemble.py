@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, Train
 from aegis_cli.training import card, checkpoint, eight_bit, optimizers, parallel
+from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.unread import Unread
@@ -76,6 +78,7 @@ class TrainingRun:
     reused: Mapping[str, Tensor] | None = None
     unread: Unread = field(default_factory=Unread)
     masters: Masters = NONE
+    average: Average = field(default_factory=Average)
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -130,11 +133,12 @@ class TrainingRun:
         self.watched.check()
         # The first step of an interval takes a gradient of its own.
         reused = (self.reused or {}) if self.parts.reuses(steps) else {}
-        state, policy = checkpoint.state_of(self.policy, self.optimizers, reused), self.policy
+        self.average.follow(steps)
+        state = checkpoint.state_of(self.policy, self.optimizers, reused, self.average.weights)
         if parallel.is_sharded(self.policy):
             state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
         if self.ranks.first:
-            self._write(steps, state, policy, going_on)
+            self._write(steps, state, going_on)
         # A GPU's own connections would give up on a process that writes for ten minutes.
         self.ranks.wait()
 
@@ -142,12 +146,13 @@ class TrainingRun:
         self,
         steps: int,
         state: checkpoint.State,
-        policy: Policy,
         going_on: Mapping[str, Any] | None,
     ) -> None:
         """Write a checkpoint, as the first of the processes."""
+        policy, averaged = self.policy, self.average.in_place
         if self.plain is not None:
-            policy = parallel.filled(self.plain, state.tensors)
+            policy = parallel.filled(self.plain, checkpoint.policy_of(state))
+            averaged = nullcontext
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -172,6 +177,7 @@ class TrainingRun:
             readme,
             going_on,
             wide=self.recipe.train.weights == BF16_MASTER,
+            averaged=averaged,
         )
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -250,7 +256,16 @@ def build(
         watched,
         unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
+        average=_average(recipe.train, policy),
     )
+
+
+def _average(settings: Train, policy: Policy) -> Average:
+    """The average of what learns, which begins here; of nothing, if none is asked for."""
+    if settings.ema_decay is None:
+        return Average()
+    learning = {name: p for name, p in policy.named_parameters() if p.requires_grad}
+    return Average(learning, settings.ema_decay)
 
 
 def _trained_on(method: Method, options: Mapping[str, Any], on_event: OnEvent) -> Questions | None:

@@ -16,7 +16,8 @@ import copy
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import optimizer_state
+from aegis_cli.training.average import Average
 
 LAST = "last"
 STATE = Path("training_state") / "state.safetensors"
@@ -46,6 +48,7 @@ EXPERT = "expert.safetensors"
 BACKBONE = "backbone"
 PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 _REUSED = "anchor_gradient."
+_AVERAGE = "average."
 
 
 class State(NamedTuple):
@@ -59,17 +62,25 @@ def state_of(
     policy: Policy,
     optimizers: Sequence[torch.optim.Optimizer],
     reused: Mapping[str, Tensor] | None = None,
+    average: Mapping[str, Tensor] | None = None,
 ) -> State:
     """The state of a run.
 
     Args:
         reused: the anchor gradient that the next step shares with those before, by the backbone's
             parameter names.
+        average: of the weights, by the policy's parameter names.
     """
     parameters = dict(policy.named_parameters())
     tensors = optimizer_state.to_tensors(parameters, optimizers)
     tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
+    tensors |= {_AVERAGE + name: mean for name, mean in (average or {}).items()}
     return State(tensors, optimizer_state.stateless(parameters, optimizers))
+
+
+def policy_of(state: State) -> dict[str, Tensor]:
+    """The weights that others are to use, by the policy's parameter names: averages, where kept."""
+    return _named(optimizer_state.WEIGHT, state.tensors) | _named(_AVERAGE, state.tensors)
 
 
 def save(
@@ -84,6 +95,7 @@ def save(
     card: str = "",
     going_on: Mapping[str, Any] | None = None,
     wide: bool = False,
+    averaged: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
@@ -91,10 +103,11 @@ def save(
     none.
 
     Args:
-        policy: its weights are those of `state`.
+        policy: its weights are those of `state`, or of its average.
         card: written beside a model of the Hugging Face Hub.
         going_on: written into the header of the training state.
         wide: as of `plain_backbone`.
+        averaged: inside its block the policy has the weights that others are to use.
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -109,8 +122,9 @@ def save(
             for left in (aside, *aside.parent.glob(".*.tmp")):
                 shutil.rmtree(left, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
-            plain = plain_backbone(policy.backbone, method, wide)
-            write_policy(aside, plain, policy, meta, inputs, seed, card)
+            with averaged():
+                plain = plain_backbone(policy.backbone, method, wide)
+                write_policy(aside, plain, policy, meta, inputs, seed, card)
             artifacts.save(
                 aside / STATE,
                 "training-state",
@@ -423,9 +437,12 @@ def cameras_of(meta: Mapping[str, Any], task: str | None) -> tuple[str, ...]:
 
 
 def restore(
-    folder: Path, policy: Policy, optimizers: Sequence[torch.optim.Optimizer]
+    folder: Path,
+    policy: Policy,
+    optimizers: Sequence[torch.optim.Optimizer],
+    average: Average,
 ) -> tuple[int, Mapping[str, Any], dict[str, Tensor]]:
-    """Put the last checkpoint's training state back.
+    """Put the last checkpoint's training state back, and the average that a run may keep.
 
     Returns:
         How many steps it has behind it, the meta of its header, and the anchor gradient that the
@@ -442,10 +459,17 @@ def restore(
             raise ValueError(f"a state after {step} steps")
         bare = optimizer_state.said_stateless(saved.header.meta)
     reused = _reused(path, saved.tensors, policy.backbone)
+    average.check(_named(_AVERAGE, saved.tensors), f"the average in '{path}'")
     parameters = dict(policy.named_parameters())
-    own = {name: t for name, t in saved.tensors.items() if not name.startswith(_REUSED)}
+    own = {n: t for n, t in saved.tensors.items() if not n.startswith((_REUSED, _AVERAGE))}
     optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)
+    average.put_back(step, _named(_AVERAGE, saved.tensors))
     return step, saved.header.meta, reused
+
+
+def _named(kind: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a kind, without the prefix that says so."""
+    return {name.removeprefix(kind): t for name, t in tensors.items() if name.startswith(kind)}
 
 
 def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> dict[str, Tensor]:
@@ -454,9 +478,7 @@ def _reused(path: Path, tensors: Mapping[str, Tensor], backbone: Backbone) -> di
     Raises:
         AegisError: it is not of this backbone.
     """
-    found = {
-        name.removeprefix(_REUSED): t for name, t in tensors.items() if name.startswith(_REUSED)
-    }
+    found = _named(_REUSED, tensors)
     wanted = {name: p for name, p in backbone.named_parameters() if name in found}
     check_state(f"the anchor gradient in '{path}'", found, wanted)
     return {

@@ -356,7 +356,8 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
         *(frames for frames in training.demos.frames if isinstance(frames, Tensor)),
         *(v for v in vars(training.demos).values() if isinstance(v, Tensor)),
     ]
-    known = [*training.policy.parameters(), *training.policy.buffers(), *demos, *_plain(training)]
+    weights = [*training.policy.parameters(), *training.policy.buffers()]
+    known = [*weights, *training.average.weights.values(), *demos, *_plain(training)]
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
     alive = _alive(training.policy.backbone.device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in others)
@@ -376,6 +377,7 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
         "weights": _bytes_here(training.policy.parameters()) + rounded + beside,
         "gradients": _bytes_here(learning) + (rounded if several else -rounded),
         "optimizer": optimizers.state_bytes(training.optimizers, here=True),
+        "average": _bytes_here(training.average.weights.values()),
         "method": held,
     }
     in_a_step = {
@@ -490,8 +492,9 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
 
 def _state_bytes(training: TrainingRun) -> int:
-    """Bytes of all weights and of what the optimizers keep of them, wherever their rows are."""
-    return _bytes(training.policy.parameters()) + optimizers.state_bytes(training.optimizers)
+    """Bytes of all weights, their average and what the optimizers keep, wherever the rows are."""
+    weights = [*training.policy.parameters(), *training.average.weights.values()]
+    return _bytes(weights) + optimizers.state_bytes(training.optimizers)
 
 
 def _plain_bytes(training: TrainingRun) -> int:

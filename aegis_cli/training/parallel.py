@@ -29,7 +29,6 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.structure import outermost_lists
 from aegis_cli.recipes import Recipe, Train
-from aegis_cli.training import optimizer_state
 
 if TYPE_CHECKING:
     from torch.distributed.fsdp import MixedPrecisionPolicy
@@ -169,10 +168,10 @@ def gathered(tensors: Mapping[str, Tensor], ranks: Ranks) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def filled(plain: Policy, tensors: Mapping[str, Tensor]) -> Policy:
-    """A whole policy with the weights of a training's state."""
+def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
+    """A whole policy with these weights, which have its parameters' names."""
     for name, parameter in plain.named_parameters():
-        parameter.copy_(tensors[optimizer_state.WEIGHT + name])
+        parameter.copy_(weights[name])
     return plain
 
 

@@ -149,7 +149,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, *_LOGGED)
-    done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers)
+    done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers, run.average)
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -450,11 +450,13 @@ def update(
     run.unread.stop(run.optimizers)
     if still:
         _move(run, factor, still=True)
-        return
-    move = partial(_move, run, factor)
-    run.stepper.step(index + 1, move, result.anchor, rate_left(index, settings))
-    if settle or index + 1 == moving:
-        run.stepper.settle()
+    else:
+        move = partial(_move, run, factor)
+        run.stepper.step(index + 1, move, result.anchor, rate_left(index, settings))
+        if settle or index + 1 == moving:
+            run.stepper.settle()
+    if not run.stepper.pending:
+        run.average.follow(index + 1)
 
 
 def read(run: TrainingRun, window: Window) -> None:
@@ -500,7 +502,7 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         noise = validation_noise(run.recipe.seed)
-        with run.masters.rounded():
+        with run.average.in_place(), run.masters.rounded():
             loss = validation_loss(run.policy, run.demos, run.recipe.train, noise, run.ranks)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss

@@ -94,10 +94,14 @@ def shared_runs(
         {(way, name): make(name, out / way / name, parallel=way) for way, name in each}
         for each in (OF_THREE, OF_TWO)
     )
-    begun = make("aegis", out / "begun", parallel="fsdp", accumulate=2)
-    ended = make("aegis", out / "begun", parallel="ddp", accumulate=2)
+    changes = {"accumulate": 2, "ema_decay": 0.6}
+    begun = make("aegis", out / "begun", parallel="fsdp", **changes)
+    ended = make("aegis", out / "begun", parallel="ddp", **changes)
     # Its expert reads the last layer's keys and values past that layer's output.
     two["fsdp", "hf"] = hugging_face
+    two["fsdp", "nullspace", "average"] = make(
+        "nullspace", out / "average", parallel="fsdp", ema_decay=0.6
+    )
     for way, name in OF_TWO_IN_BF16:
         two[way, name, "bf16"] = make(
             name, out / way / f"{name}-bf16", parallel=way, precision="bf16"
@@ -175,10 +179,23 @@ def test_what_three_began_two_finish(shared_runs: dict[object, Any], tmp_path: P
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
     assert_same_training(job.out, alone.out)
-    policy, _ = checkpoint.load_policy(job.out)
-    plain, _ = checkpoint.load_policy(alone.out)
+    assert_same_policy(job.out, alone.out)
+
+
+def assert_same_policy(one: Path, other: Path) -> None:
+    policy, plain = (checkpoint.load_policy(out)[0] for out in (one, other))
     for parameter, its in zip(policy.parameters(), plain.parameters(), strict=True):
         torch.testing.assert_close(parameter, its, rtol=1e-3, atol=1e-4)
+
+
+def test_the_average_of_sharded_weights_is_written_whole(
+    shared_runs: dict[object, Any], tmp_path: Path
+) -> None:
+    job = shared_runs[2, "fsdp", "nullspace", "average"]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    assert_same_training(job.out, alone.out)
+    assert_same_policy(job.out, alone.out)
 
 
 def test_two_processes_measure_what_one_measures(
