@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 from huggingface_hub.errors import HTTPError
-from huggingface_hub.utils import filter_repo_objects
+from samples.dataset_hub import DatasetHub
 from samples.lerobot import as_version_2, edit_info, episodes, save
 from samples.user_folder import training
 
@@ -30,51 +30,20 @@ Bad = Callable[..., str]
 NAME = "someone/arm"
 
 
-class Hub:
-    """A hub of one dataset, which counts what is asked of it."""
-
-    def __init__(self, repository: Path, local: Path) -> None:
-        self.repository, self.local = repository, local
-        self.asked: list[list[str]] = []
-        self.lacks: Exception = FileNotFoundError("no repository of that name")
-
-    def __call__(
-        self,
-        name: str,
-        repo_type: str,
-        allow_patterns: list[str],
-        ignore_patterns: list[str],
-        local_files_only: bool,
-    ) -> str:
-        assert repo_type == "dataset" and not local_files_only
-        self.asked.append(allow_patterns)
-        if name != NAME:
-            raise self.lacks
-        inside = (p for p in self.repository.rglob("*") if p.is_file())
-        there = [str(path.relative_to(self.repository)) for path in inside]
-        for found in filter_repo_objects(
-            there, allow_patterns=allow_patterns, ignore_patterns=ignore_patterns
-        ):
-            (self.local / found).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(self.repository / found, self.local / found)
-        self.local.mkdir(exist_ok=True)
-        return str(self.local)
-
-
 @pytest.fixture
-def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
+def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DatasetHub:
     made = [replace(e, instruction="go to the red pad") for e in episodes(8)]
     repository = save(tmp_path / "repository", made)
     (repository / "README.md").write_text("a card")
     (repository / "weights.bin").write_text("what nobody asked for")
-    found = Hub(repository, tmp_path / "cache" / "snapshot")
-    monkeypatch.setattr("huggingface_hub.snapshot_download", found)
+    found = DatasetHub(NAME, repository, tmp_path / "cache" / "snapshot")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", found.snapshot)
     download.meta.cache_clear()
     download.fetch.cache_clear()
     return found
 
 
-def test_it_is_read_as_the_folder_is(hosted: Hub) -> None:
+def test_it_is_read_as_the_folder_is(hosted: DatasetHub) -> None:
     one, other = (demonstrations.load(Path(p), 0.3, 0) for p in (NAME, hosted.repository))
     assert one.sha256 == other.sha256 and torch.equal(one.frames[0], other.frames[0])
     assert demonstrations.digest(Path(NAME)) == one.sha256
@@ -85,7 +54,9 @@ def test_it_is_read_as_the_folder_is(hosted: Hub) -> None:
     assert not (hosted.local / "weights.bin").exists()
 
 
-def test_a_training_and_an_evaluation_take_its_id(aegis: Any, hosted: Hub, place: Path) -> None:
+def test_a_training_and_an_evaluation_take_its_id(
+    aegis: Any, hosted: DatasetHub, place: Path
+) -> None:
     code, _, err = aegis(*training(demos=NAME, out="runs/x"))
     assert code == 0, err
     code, out, _ = aegis("evaluate", "runs/x", "--demos", NAME, "--json")
@@ -102,7 +73,7 @@ def test_a_training_and_an_evaluation_take_its_id(aegis: Any, hosted: Hub, place
     assert yaml.safe_load(front)["datasets"] == [NAME]
 
 
-def test_a_folder_of_that_name_comes_first(hosted: Hub, place: Path) -> None:
+def test_a_folder_of_that_name_comes_first(hosted: DatasetHub, place: Path) -> None:
     (place / NAME).parent.mkdir()
     save(place / NAME, episodes(3))
     assert demonstrations.count_episodes(Path(NAME)) == 3 and hosted.asked == []
@@ -112,7 +83,7 @@ def test_a_folder_of_that_name_comes_first(hosted: Hub, place: Path) -> None:
     "name", ["none", "./x/y", "../x/y", "/no/x", "a/b/c", "runs/x", "data/x", "a/b.safetensors"]
 )
 def test_what_can_only_be_a_path_is_never_asked_of_the_hub(
-    name: str, hosted: Hub, bad: Bad, place: Path
+    name: str, hosted: DatasetHub, bad: Bad, place: Path
 ) -> None:
     (place / "data").mkdir()
     says = [f"no file or folder '{name}'", "id on the hub", "check the path"]
@@ -132,12 +103,14 @@ def test_what_can_only_be_a_path_is_never_asked_of_the_hub(
         ("anchor", "--demos", "someone/else", "--out", "a.safetensors"),
     ],
 )
-def test_a_dataset_that_the_hub_lacks(command: tuple[str, ...], hosted: Hub, bad: Bad) -> None:
+def test_a_dataset_that_the_hub_lacks(
+    command: tuple[str, ...], hosted: DatasetHub, bad: Bad
+) -> None:
     says = ("someone/else", "Hugging Face hub", "hf download --repo-type dataset someone/else")
     bad(*command, says=says)
 
 
-def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: Hub, bad: Bad) -> None:
+def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: DatasetHub, bad: Bad) -> None:
     edit_info(hosted.repository, lambda info: info.update(codebase_version="v1.6"))
     bad(*training(demos=NAME), says=("v1.6", "version 2.0"))
     (hosted.repository / "meta/info.json").rename(hosted.repository / "meta/other.json")
@@ -147,7 +120,7 @@ def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: Hub, bad: Ba
     assert hosted.asked == [["meta/*"]] * 2 and not (hosted.local / "data").exists()
 
 
-def test_a_connection_that_breaks_is_one_error(hosted: Hub, bad: Bad) -> None:
+def test_a_connection_that_breaks_is_one_error(hosted: DatasetHub, bad: Bad) -> None:
     """httpx's own errors are neither OSErrors nor ValueErrors."""
     for kind in (HTTPError, type("ReadTimeout", (HTTPError,), {})):
         hosted.lacks = kind("timed out")
@@ -155,7 +128,7 @@ def test_a_connection_that_breaks_is_one_error(hosted: Hub, bad: Bad) -> None:
         bad(*training(demos="someone/else"), says=(kind.__name__, "timed out", "hf download"))
 
 
-def test_what_the_meta_folder_refuses_is_not_downloaded(hosted: Hub, bad: Bad) -> None:
+def test_what_the_meta_folder_refuses_is_not_downloaded(hosted: DatasetHub, bad: Bad) -> None:
     for key, says in (
         ("camera=side", "no camera 'side'"),
         ("state=joints", "no feature 'joints'"),
@@ -166,7 +139,7 @@ def test_what_the_meta_folder_refuses_is_not_downloaded(hosted: Hub, bad: Bad) -
 
 
 def test_videos_of_other_cameras_stay_where_they_are(
-    hosted: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hosted: DatasetHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(write, "_MB", 0)
     for older in (False, True):
@@ -183,7 +156,9 @@ def test_videos_of_other_cameras_stay_where_they_are(
         assert len(videos) == 4 and all("observation.images.wrist" in path for path in videos)
 
 
-def test_inspect_needs_the_meta_folder_alone(aegis: Any, hosted: Hub, tmp_path: Path) -> None:
+def test_inspect_needs_the_meta_folder_alone(
+    aegis: Any, hosted: DatasetHub, tmp_path: Path
+) -> None:
     code, out, err = aegis("inspect", NAME, "--json")
     assert code == 0, err
     report = json.loads(out)
@@ -194,7 +169,7 @@ def test_inspect_needs_the_meta_folder_alone(aegis: Any, hosted: Hub, tmp_path: 
 
 
 def test_the_package_that_asks_the_hub_is_missing(
-    hosted: Hub, bad: Bad, monkeypatch: pytest.MonkeyPatch
+    hosted: DatasetHub, bad: Bad, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hub, "is_installed", lambda: False)
     bad(*training(demos=NAME), says=(NAME, "huggingface_hub", "aegis-vla[hub,lerobot]"))
