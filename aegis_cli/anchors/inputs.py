@@ -293,6 +293,10 @@ class InputRecorder:
         if self._mask is None or structure.under(self._plain(name), self._vision):
             return None
         batch, length = self._mask.shape
+        if x.ndim > 3 and x.shape[:2] == self._mask.shape:  # several rows a token, as of heads
+            self._covered[name] = self._covered.get(name, 0) + length
+            per_token = x.shape[2:-1].numel()
+            return self._mask.flatten().repeat_interleave(per_token).to(x.device)
         # A map that is called again after all T tokens begins with the first of them again.
         begun, rows = self._covered.get(name, 0) % length, x.shape[:-1].numel()
         tokens = rows // batch

@@ -15,7 +15,7 @@ copies would part.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +35,8 @@ class Accumulation:
         anchor: mean anchor gradient of each parameter by its id.
         w2: mean W2^2 of each layer [L].
         weights: of the anchor gradient in each group's `.grad`.
+        idle: ids of the parameters whose `.grad` is that anchor gradient alone.
+        empty: whether that projection was of zeros.
         marks: each parameter's `.grad`, and how often it had been written to, when the last
             projection was done.
     """
@@ -44,6 +46,8 @@ class Accumulation:
     w2: Tensor
     weights: list[float]
     marks: dict[int, tuple[Tensor | None, int]]
+    idle: set[int] = field(default_factory=set)
+    empty: bool = False
 
 
 def started(anchor: Mapping[int, Tensor | None], w2: Tensor) -> Accumulation:
@@ -68,7 +72,7 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
 
 def mark(total: Accumulation, groups: Groups, weights: list[float]) -> None:
     """Remember the state of every `.grad`, which now holds the sum projected with these weights."""
-    total.weights, total.marks = weights, {}
+    total.weights, total.marks, total.empty = weights, {}, cleared(groups)
     for group in groups:
         for p in group:
             # PyTorch counts in `_version` how often a tensor was written to.
@@ -94,12 +98,23 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
         AegisError: neither: it was scaled, clipped or added to, so that its projection cannot be
             taken back.
     """
-    if total is None:
+    # Zeros that were written past PyTorch's count, as by `p.grad.data.zero_()`, are seen first.
+    if total is None or (not total.empty and cleared(groups)):
         return False
-    if all(_untouched(p, total.marks.get(id(p))) for group in groups for p in group):
+    parameters = [p for group in groups for p in group]
+    if all(_untouched(p, total.marks.get(id(p))) for p in parameters):
         return True
     if cleared(groups):
         return False
+    kept = sum(not cleared([[p]]) for p in parameters)
+    if kept < len(parameters) and _only_cleared(total, parameters):
+        raise AegisError(
+            f"gradients of which {len(parameters) - kept} were cleared since the last "
+            f"guard.backward and {kept} were not",
+            "all of them cleared, or none",
+            "model.zero_grad() clears those that the optimizer does not have, too; or freeze what "
+            "it does not have before the guard is made",
+        )
     raise AegisError(
         "gradients that changed since the last guard.backward",
         "what it left, or zero_grad() before the next step's first",
@@ -107,6 +122,11 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
         "gradients after a step's last guard.backward, or add the losses: "
         "guard.backward(loss + other)",
     )
+
+
+def _only_cleared(total: Accumulation, parameters: Sequence[nn.Parameter]) -> bool:
+    """Whether every gradient is what the last projection left, or gone."""
+    return all(_untouched(p, total.marks.get(id(p))) or cleared([[p]]) for p in parameters)
 
 
 def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None) -> bool:
@@ -129,11 +149,19 @@ def put_back(total: Accumulation, groups: Groups) -> None:
 
 @torch.no_grad()
 def _shift(total: Accumulation, groups: Groups, times: int) -> None:
-    """Add the anchor gradient to `.grad` so many times, with each group's weight."""
+    """Add the anchor gradient to `.grad` so many times, with each group's weight.
+
+    Where the task left no gradient, there is none without the anchor's: the optimizer leaves such a
+    parameter as it is, and would let one of zeros decay.
+    """
     for group, weight in zip(groups, total.weights, strict=True):
         for parameter in group:
             a = total.anchor[id(parameter)]
-            if weight != 0 and a is not None and parameter.grad is not None:
+            if weight == 0 or a is None:
+                continue
+            if id(parameter) in total.idle:
+                parameter.grad = None if times < 0 else a * weight
+            elif parameter.grad is not None:
                 parameter.grad.add_(a, alpha=times * weight)
 
 

@@ -198,6 +198,7 @@ class DualBackward:
         else:
             accumulation.grow(total, taken, w2)
         over_rows = self._owners.total if self._owners.several else None
+        total.idle = {id(p) for group in groups for p in group if p.grad is None}
         gram, weights = backward.bend(groups, total.anchor, self._parts.combine, over_rows)
         # A further micro-batch of the same step replaces the step's row.
         self._ledger.truncate(self._step - 1)
@@ -239,7 +240,7 @@ def diverged(steps: int) -> Diverged:
     return Diverged(
         "a loss or gradient that is not finite",
         "finite numbers",
-        "lower the learning rate, or give guard.backward the GradScaler; "
+        "lower the learning rate, or give guard.backward, or guard.automatic, the GradScaler; "
         "optimizer.zero_grad() goes on without this batch",
         steps,
     )

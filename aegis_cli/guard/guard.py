@@ -129,7 +129,9 @@ class Guard(Removable):
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
         self._hooks, self._seen = LayerHooks(found), None
-        self._stepper = GuardedStepper(model, self._parts, may_shard=self._owners.several)
+        # Whoever names the kinds to protect has decided about the rest too.
+        averaging = {} if dual or "protect" in options else structure.averaging(model)
+        self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
         self._dual: DualBackward | None = None
         if dual:
             self._dual = DualBackward(
@@ -167,6 +169,7 @@ class Guard(Removable):
                 pass still unused, parameters that the guard does not know.
         """
         self._check_ready()
+        _check_mask(mask)
         self._stepper.check()
         if self._dual is None:
             yield
@@ -195,8 +198,9 @@ class Guard(Removable):
         """Give the hidden states after a layer by hand, where nobody calls the layer itself.
 
         So do loops that run two models side by side, as pi0's: they call the parts of both models'
-        layers, and attend over the tokens of both. Outside a watched pass this does nothing, and
-        neither does it for `nullspace` and `kfac`, which compare no hidden states.
+        layers, and attend over the tokens of both. Outside a watched pass this does nothing, so
+        that it can stay in the policy; neither does it after `remove`, nor for `nullspace` and
+        `kfac`, which compare no hidden states.
 
         Args:
             layer: one of the guard's layers, or its number.
@@ -205,8 +209,8 @@ class Guard(Removable):
         Raises:
             AegisError: none of the layers, or one that is called too.
         """
-        self._check_ready()
-        self._hooks.note(layer, hidden)
+        if not self._removed:
+            self._hooks.note(layer, hidden)
 
     def automatic(
         self,
@@ -237,6 +241,10 @@ class Guard(Removable):
         """
         self._check_ready()
         self._refuse_automatic("guard.automatic", "nothing more")
+        if around is not None and not isinstance(around, nn.Module):
+            raise AegisError(
+                f"around={around!r}", "the module whose call is a pass", "around=policy"
+            )
         if self._owners.several and self._dual is not None:
             raise AegisError(
                 "guard.automatic with sharded weights and a second backward pass",
@@ -417,6 +425,14 @@ class Guard(Removable):
                 f"{instead}, which it sees by itself",
                 f"call {instead}, or leave guard.automatic() out",
             )
+
+
+def _check_mask(mask: object) -> None:
+    """Raise AegisError for a mask that is no tensor."""
+    if mask is not None and not isinstance(mask, Tensor):
+        raise AegisError(
+            f"a mask that is a {type(mask).__name__}", "a tensor [B, T]", "torch.as_tensor(mask)"
+        )
 
 
 def _refuse_sparse(model: nn.Module) -> None:

@@ -34,15 +34,31 @@ class GuardedStepper:
     before it.
     """
 
-    def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
+    def __init__(
+        self,
+        model: nn.Module,
+        parts: Parts,
+        may_shard: bool = False,
+        averaging: Mapping[str, nn.Module] | None = None,
+    ) -> None:
+        """Begin without a step.
+
+        Args:
+            may_shard: as of `Stepper`.
+            averaging: modules that may not average what they read while the method works, by name.
+        """
         self._model, self._parts = model, parts
+        self._averaging = averaging or {}
         self._learning = structure.learning(model)
         self._device = next(iter(self._learning.values())).device
-        self._stepper = Stepper(model, parts, may_shard)
+        self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
         self._stepping, self._count = False, 0
         self._counted: int | None = None  # the optimizer whose step was counted since the last pass
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
         self._slowed: SlowedStep | None = None  # of a step of the loop's own
+        # Steps inside each other: of an optimizer that calls its base class's, or another one's.
+        self._depth, self._in_closure = 0, False
+        self._moved = False  # whether an optimizer has stepped in `step`
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
         self._stepped: set[int] | None = None
@@ -70,6 +86,14 @@ class GuardedStepper:
         if structure.learning(self._model).keys() - self._learning.keys():
             self._refuse_other_parameters()
         self._refuse_another_device()
+        if at_work := [name for name, module in self._averaging.items() if module.training]:
+            raise AegisError(
+                f"'{at_work[0]}' first of {len(at_work)} modules in training mode, whose running "
+                "statistics every pass changes and no method holds",
+                "batch normalisations in evaluation mode",
+                "module.eval() for each of them after model.train(); or name what is protected: "
+                "protect=(...)",
+            )
 
     def passed(self) -> None:
         """Note a guarded backward pass, which every optimizer may follow with one step.
@@ -77,8 +101,25 @@ class GuardedStepper:
         Raises:
             AegisError: it left no gradient in the model.
         """
-        check_reached(self._learning.values())
+        if not self._sums_late:
+            check_reached(self._learning.values())
         self._stepped, self._counted = set(), None
+        if not self._in_closure:
+            self._depth = 0  # a step that raised an exception has left it as it was
+
+    @property
+    def _sums_late(self) -> bool:
+        """Whether gradients may arrive in the last pass of a step alone.
+
+        Several passes over sharded weights may leave their sum to the last of them. A method that
+        reads the gradient needs that of each pass.
+        """
+        return self._may_shard and self._parts.penalty is None
+
+    def _refuse_unreached(self) -> None:
+        """Raise AegisError where the passes of a step have left no gradient in the model."""
+        if self._sums_late and self._stepped is not None:
+            check_reached(self._learning.values())
 
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
         """Whether every gradient of what learns is finite, in all processes."""
@@ -113,14 +154,25 @@ class GuardedStepper:
         self._refuse_another_device()
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
-        self._stepping = True
+        self._refuse_unreached()
+        self._stepper.begin(self._by_name(anchor))
+        versions = self._versions()
+        self._stepping, self._moved = True, False
         try:
-            self._stepper.step(
-                self._count + 1, partial(self._move, optimizer, scaler), self._by_name(anchor)
-            )
+            take_slowed(self._parts, partial(_take, optimizer, scaler))
         finally:
             self._stepping = False
+        # A scaler leaves a step out that overflowed, and a trainer's optimizer those in between.
+        hooked = isinstance(optimizer, Optimizer)
+        if hooked and not self._moved and versions == self._versions():
+            self._stepper.take_none()
+            return
         self._count += 1
+        self._stepper.end(self._count)
+
+    def _versions(self) -> list[int]:
+        """How often each parameter was written to, as PyTorch counts it."""
+        return [p._version for p in self._learning.values()]
 
     def _refuse_another_device(self) -> None:
         """Refuse a model that has moved away from what its updates are constrained by."""
@@ -162,10 +214,9 @@ class GuardedStepper:
 
     def settle(self) -> None:
         """Constrain the steps since the last time, whatever their turn."""
+        if self._slowed is not None:  # a step that raised an exception
+            self._end()
         self._stepper.settle()
-
-    def _move(self, optimizer: Optimizer, scaler: Scaler | None) -> None:
-        take_slowed(self._parts, partial(_take, optimizer, scaler))
 
     # --- every optimizer of the process -----------------------------------------------------------
 
@@ -189,10 +240,16 @@ class GuardedStepper:
             )
         if closure is None:
             self._begin(optimizer)
+            self._depth += 1
             return None
+        self._depth += 1
 
         def guarded() -> Any:
-            lost = closure()
+            self._in_closure = True
+            try:
+                lost = closure()
+            finally:
+                self._in_closure = False
             self._begin(optimizer)
             return lost
 
@@ -206,21 +263,29 @@ class GuardedStepper:
         if by_itself and self._parts.constrains and self._slowed is None:
             assert self._automatic is not None
             self._refuse_other_parameters()
+            self._refuse_unreached()
             self._refuse_second(optimizer)
             self._stepper.begin(self._by_name(self._automatic()))
             self._slowed = SlowedStep(self._parts)
 
     def after_step(self, optimizer: Optimizer) -> None:
-        """The weights have moved."""
+        """The weights have moved, and go on to move where this step lies inside another one."""
         if not self._guards(optimizer):
             return
+        self._moved = True
         if self._stepped is not None:
             self._stepped.add(id(optimizer))
-        if self._slowed is not None:
-            slowed, self._slowed = self._slowed, None
-            slowed.go_back()
-            self._count += 1
-            self._stepper.end(self._count)
+        self._depth = max(0, self._depth - 1)
+        if self._slowed is not None and not self._depth:
+            self._end()
+
+    def _end(self) -> None:
+        """Constrain a step of the loop's own."""
+        assert self._slowed is not None
+        slowed, self._slowed = self._slowed, None
+        slowed.go_back()
+        self._count += 1
+        self._stepper.end(self._count)
 
     def _guards(self, optimizer: Optimizer) -> bool:
         mine = {id(p) for p in self._learning.values()}

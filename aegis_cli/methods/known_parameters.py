@@ -131,7 +131,8 @@ def check_reached(parameters: Iterable[nn.Parameter]) -> None:
             "a backward pass that left no gradient in any parameter of the model",
             "a loss that the model has a part in",
             "compute the loss with the very model that the method was started on, and detach "
-            "nothing on the way",
+            "nothing on the way; of several passes over weights that FSDP2 has sharded, let each "
+            "sum its gradient: set_requires_gradient_sync(True)",
         )
 
 

@@ -86,6 +86,12 @@ class Stepper:
         if number % self._parts.every == 0:
             self.settle()
 
+    def take_none(self) -> None:
+        """Forget that a step was begun, in which nothing has moved."""
+        self.pending -= 1
+        if not self.pending:
+            self._before, self._anchor = {}, {}
+
     def settle(self) -> None:
         """Let the method constrain the pending steps now; without one, nothing happens."""
         update = Update(self._before, self._anchor, self.pending, self._rate_left)

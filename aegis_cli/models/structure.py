@@ -356,6 +356,16 @@ def frozen(model: nn.Module, site: str) -> bool:
     return not any(learns.values())
 
 
+def averaging(model: nn.Module) -> dict[str, nn.Module]:
+    """The modules by name that keep a running average of what they read, as BatchNorm does."""
+    found = {}
+    for name, module in model.named_modules():
+        kept = getattr(module, "track_running_stats", False)
+        if kept and getattr(module, "running_mean", None) is not None:
+            found[name] = module
+    return found
+
+
 def learning(model: nn.Module) -> dict[str, nn.Parameter]:
     """The trainable parameters by every name they have."""
     return {

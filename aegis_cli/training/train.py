@@ -367,7 +367,7 @@ def _good_steps_saved(run: TrainingRun) -> Iterator[None]:
         yield
     except Diverged as end:
         good = end.good_steps
-        run.save_checkpoint(good)
+        _save(run, good)
         kept = f"the {good} good steps are in {run.out}/checkpoints/last; {end.fix}"
         raise Diverged(end.found, end.expected, kept, good) from None
 

@@ -277,13 +277,50 @@ def test_restoration_does_not_grow_with_the_number_of_micro_batches(anchor: Path
         )
 
 
-@pytest.mark.parametrize("to_none", [True, False])
-def test_zero_grad_begins_a_new_row(to_none: bool, anchor: Path) -> None:
+def test_what_the_task_never_reaches_has_no_gradient_where_the_sum_has_no_conflict(
+    anchor: Path,
+) -> None:
+    """Though the sum of an earlier pass had one, and its projection moved such parameters."""
+    grads = []
+    for scales in ((1.0,), (-1.0, 2.0)):
+        model = make()
+        guard = Guard(model, anchor, LAYERS)
+        for scale in scales:
+            pixels, ids, mask = batch(3)
+            with guard.watch(mask):
+                model(pixels, ids, mask)
+            read = torch.cat([model.vision(pixels).mT, model.text.words(ids)], 1)
+            first, last = model.text.layers
+            # As an expert does that reads the last layer's keys and values alone.
+            loss = scale * last.qkv(last.norm1(first(read, ~mask))).square().mean()
+            guard.backward(loss)
+        grads.append([p.grad for p in model.parameters()])
+    for alone, summed in zip(*grads, strict=True):
+        assert (alone is None) == (summed is None)
+    assert any(gradient is None for gradient in grads[0])
+
+
+def clear_past_the_count(model: nn.Module) -> None:
+    """Write zeros in a way that PyTorch's count of writes does not see."""
+    for parameter in model.parameters():
+        if parameter.grad is not None:
+            parameter.grad.data.zero_()
+
+
+@pytest.mark.parametrize(
+    "clear",
+    [
+        lambda model: model.zero_grad(set_to_none=True),
+        lambda model: model.zero_grad(set_to_none=False),
+        clear_past_the_count,
+    ],
+)
+def test_zero_grad_begins_a_new_row(clear: Callable[[nn.Module], None], anchor: Path) -> None:
     models = make(), make()
     for model, steps in zip(models, ([3], [0, 3]), strict=True):
         guard = Guard(model, anchor, LAYERS)
         for seed in steps:
-            model.zero_grad(set_to_none=to_none)
+            clear(model)
             with guard.watch(batch(seed)[2]):
                 loss = task_loss(model, seed)
             guard.backward(loss)

@@ -246,6 +246,39 @@ def test_a_table_of_all_tokens_leaves_the_padding_out(flat: bool) -> None:
     )
 
 
+WIDTH, HEADS = 8, 2
+
+
+class Heads(nn.Module):
+    """A map that reads a row for each head of each token, as norms of queries do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.words, self.map = nn.Embedding(6, WIDTH), nn.Linear(WIDTH // HEADS, 3)
+
+    def forward(self, ids: Tensor) -> Tensor:
+        return self.map(self.words(ids).unflatten(-1, (HEADS, WIDTH // HEADS)))
+
+
+def test_padding_never_counts_where_a_token_has_several_rows() -> None:
+    ids = torch.tensor([[3, 4, 5], [3, 0, 0]])
+    with (
+        Guard.measure(Heads().eval(), parts=("inputs",), energy=1.0) as found,
+        found.watch(ids != 0),
+    ):
+        found._model(ids)
+    rows = (
+        found._model.words.weight[[3, 4, 5, 3]].unflatten(-1, (HEADS, WIDTH // HEADS)).flatten(0, 1)
+    )
+    rows = F.pad(rows, (0, 1), value=1.0).double()
+    torch.testing.assert_close(
+        second_moments(dict(found.anchor().inputs))["map"],
+        rows.mT @ rows / (4 * HEADS),
+        rtol=0,
+        atol=1e-5,
+    )
+
+
 # --- the null-space method ------------------------------------------------------------------------
 
 

@@ -143,6 +143,69 @@ def test_an_optimizer_that_calls_the_passes_itself(name: str, anchors: dict[str,
     assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
 
 
+class Decayed(torch.optim.SGD):
+    """One that moves the weights once more after its base class's step, as home-made ones do."""
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        lost = super().step(closure)
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.mul_(0.95)
+        return lost
+
+
+@every_method
+def test_an_optimizer_that_goes_on_after_its_base_classs_step(
+    name: str, anchors: dict[str, Path]
+) -> None:
+    """What comes after the inner step is constrained too, also where a step has failed before."""
+    ends = []
+    for is_automatic in (False, True):
+        model, guard = (automatic if is_automatic else guarded)(name, anchors)
+        optimizer = Decayed(model.parameters(), lr=1e-2)
+        for seed in range(4):
+            if is_automatic:
+                task_loss(model, seed).backward()
+                optimizer.step()
+            else:
+                with guard.watch(batch(seed)[2], IMAGE):
+                    loss = task_loss(model, seed)
+                guard.backward(loss)
+                guard.step(optimizer)
+            optimizer.zero_grad()
+        guard.settle()
+        ends.append(vector(model))
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)
+
+
+def test_a_step_that_raises_is_constrained_with_the_next_one(anchors: dict[str, Path]) -> None:
+    class Failing(Decayed):
+        fails = False
+
+        def step(self, closure: Any = None) -> Any:
+            lost = super().step(closure)
+            if self.fails:
+                raise RuntimeError
+            return lost
+
+    model, start = make(), make()
+    guard = Guard(model, anchors["nullspace"], method="nullspace", vision="vision", energy=1.0)
+    guard.automatic(mask="mask")
+    optimizer = Failing(model.parameters(), lr=1e-2)
+    for seed in range(5):
+        optimizer.fails = seed == 2
+        task_loss(model, seed).backward()
+        with pytest.raises(RuntimeError) if optimizer.fails else contextlib.nullcontext():
+            optimizer.step()
+        optimizer.zero_grad()
+    assert not torch.equal(vector(model), vector(start))
+    pixels, ids, mask = batch(100)  # of those that the anchor was measured on
+    with torch.no_grad():
+        before, after = (m(pixels, ids, mask)[mask] for m in (start, model))
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+
+
 def test_several_guards_each_see_their_own_model(anchors: dict[str, Path]) -> None:
     alone, guard = automatic("aegis", anchors)
     plain_steps(alone)

@@ -57,7 +57,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, P
 
 
 WAYS = [(method, way) for method in METHODS for way in ("ddp", "fsdp")]
-WAYS += [("nullspace", "automatic"), ("kfac", "automatic")]  # in a plain loop over sharded weights
+# In a plain loop over sharded weights, or with an optimizer that shards its states.
+WAYS += [(method, way) for method in ("nullspace", "kfac") for way in ("automatic", "zero")]
 
 
 @pytest.mark.parametrize(("method", "way"), WAYS)
@@ -92,6 +93,20 @@ def test_processes_that_send_only_the_last_of_a_steps_passes_do_what_one_does(
     for name in ("tt", "ta", "aa", "w2"):
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], expected[name], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("automatic", [False, True])
+@pytest.mark.parametrize("method", ["nullspace", "kfac"])
+def test_sharded_gradients_may_be_summed_by_the_last_of_a_steps_passes(
+    trained: tuple[Path, dict[str, Path]], method: str, automatic: bool
+) -> None:
+    folder, paths = trained
+    one, other = (
+        torch.load(folder / f"{method}-late-{automatic}-{rank}.pt")[0] for rank in range(WORLD)
+    )
+    alone, _ = train_alone(paths[method], PARTS, method=method, **METHODS[method])
+    assert torch.equal(one, other)
+    torch.testing.assert_close(one, alone, rtol=1e-9, atol=1e-9)
 
 
 def test_norms_of_a_familys_own_class_are_known_where_they_are_sharded(tmp_path: Path) -> None:

@@ -196,6 +196,47 @@ def watched(
 MASK = batch(0)[2]
 
 
+def test_running_statistics_may_not_move(tmp_path: Path) -> None:
+    def normalised() -> Vlm:
+        model = make()
+        model.vision.insert(1, nn.BatchNorm2d(16).double())
+        model.vision[1].requires_grad_(False)
+        return model.eval()
+
+    path = measured(normalised(), tmp_path / "anchor.safetensors")
+    options = {"method": "nullspace", "vision": "vision"}
+    model = normalised()
+    guard = Guard(model, path, **options)
+    guarded_steps(model, guard)
+    model.train()
+    refused(lambda: guarded_steps(model, guard), "'vision.1' first of 1", "running statistics")
+    guard.remove()
+    model = normalised().train()
+    guarded_steps(model, Guard(model, path, protect=("maps", "norms"), **options))
+
+
+def test_a_note_may_stay_in_the_policy_when_the_guard_is_gone(anchor: Path) -> None:
+    guard = Guard(make(), anchor, LAYERS)
+    guard.remove()
+    guard.note(0, torch.zeros(1, 2, 16))
+
+
+def test_an_optimizer_that_clears_less_than_what_learns(anchor: Path) -> None:
+    model = make()
+    guard = Guard(model, anchor, LAYERS)
+    optimizer = torch.optim.AdamW(model.text.layers.parameters())
+
+    def steps() -> None:
+        for seed in range(2):
+            with guard.watch(batch(seed)[2]):
+                loss = task_loss(model, seed)
+            guard.backward(loss)
+            optimizer.step()
+            optimizer.zero_grad()
+
+    refused(steps, "gradients of which", "were cleared", "model.zero_grad()")
+
+
 @pytest.mark.parametrize(
     ("mask", "image", "words"),
     [

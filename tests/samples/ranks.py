@@ -56,6 +56,11 @@ def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
         else:
             found = _trained(rank, name, paths[name], _sharded, automatic=True)
             torch.save(found, Path(folder) / f"{name}-automatic-{rank}.pt")
+            found = _trained(rank, name, paths[name], _copied, automatic=True, shares_states=True)
+            torch.save(found, Path(folder) / f"{name}-zero-{rank}.pt")
+            for automatic in (False, True):
+                found = _trained_late(rank, name, paths[name], automatic)
+                torch.save(found, Path(folder) / f"{name}-late-{automatic}-{rank}.pt")
     dist.barrier()  # neither leaves while the other may still talk to it
     dist.destroy_process_group()
 
@@ -66,12 +71,22 @@ def _trained(
     path: Path,
     share: Callable[[Vlm], tuple[Vlm, nn.Module]],
     automatic: bool = False,
+    shares_states: bool = False,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """All weights after some steps, and the ledger."""
+    """All weights after some steps, and the ledger.
+
+    Args:
+        shares_states: whether each process keeps the optimizer's states of some parameters alone.
+    """
     model, called = share(make())
     world = dist.group.WORLD
     guard = Guard(model, path, method=method, process_group=world, **METHODS[method])
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    optimizer: torch.optim.Optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    if shares_states:
+        # Its import warns, which is an error outside of the processes that are started for this.
+        from torch.distributed.optim import ZeroRedundancyOptimizer
+
+        optimizer = ZeroRedundancyOptimizer(model.parameters(), torch.optim.AdamW, lr=1e-2)
     if automatic:
         guard.automatic()
         for index in range(STEPS):
@@ -109,6 +124,27 @@ def _trained_in_parts(rank: int, path: Path) -> tuple[Tensor, dict[str, Tensor]]
         optimizer.zero_grad()
     guard.remove()
     return vector(model), guard.ledger.tensors()
+
+
+def _trained_late(
+    rank: int, method: str, path: Path, automatic: bool
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Steps over sharded weights in two passes, of which the last alone sums the gradients."""
+    model, _ = _sharded(make())
+    guard = Guard(model, path, method=method, process_group="world", **METHODS[method])
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    if automatic:
+        guard.automatic()
+    for index in range(STEPS):
+        for part in range(PARTS):
+            model.set_requires_gradient_sync(part == PARTS - 1)  # type: ignore[operator]
+            loss = task_loss(model, WORLD * (PARTS * index + part) + rank) / PARTS
+            loss.backward() if automatic else guard.backward(loss)
+        optimizer.step() if automatic else guard.step(optimizer)
+        optimizer.zero_grad()
+    guard.remove()
+    weights = torch.cat([whole(p.detach()).flatten() for p in model.parameters()])
+    return weights, guard.ledger.tensors()
 
 
 def _copied(model: Vlm) -> tuple[Vlm, DistributedDataParallel]:

@@ -167,19 +167,20 @@ def test_a_file_that_is_only_touched_ends_no_training(
 # --- weights --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("wrong", [3, 4])  # found by the next step's loss, or at a checkpoint
 def test_weights_that_are_not_finite_reach_no_checkpoint(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: int, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A knob of 1e300 can do that after a step whose loss and gradient are finite."""
     update = train.update
 
     def spoiled(run: TrainingRun, index: int, *args: Any, **options: Any) -> None:
         update(run, index, *args, **options)
-        if index == 3:
+        if index + 1 == wrong:
             next(run.policy.parameters()).data.view(-1)[0] = torch.nan
 
     monkeypatch.setattr(train, "update", spoiled)
-    with pytest.raises(Diverged, match="not finite after step 4") as caught:
+    with pytest.raises(Diverged, match=f"not finite after step {wrong}") as caught:
         start("naive", tmp_path)
     assert caught.value.good_steps == 2 and "2 steps" in caught.value.fix
     assert checkpoint.last(tmp_path).resolve().name == "000002"
