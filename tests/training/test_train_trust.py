@@ -167,9 +167,10 @@ def test_a_file_that_is_only_touched_ends_no_training(
 # --- weights --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrong", [3, 4])  # found by the next step's loss, or at a checkpoint
+# Found at a checkpoint, or by the next step's loss.
+@pytest.mark.parametrize(("wrong", "good"), [(4, 2), (5, 4)])
 def test_weights_that_are_not_finite_reach_no_checkpoint(
-    wrong: int, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: int, good: int, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A knob of 1e300 can do that after a step whose loss and gradient are finite."""
     update = train.update
@@ -182,8 +183,8 @@ def test_weights_that_are_not_finite_reach_no_checkpoint(
     monkeypatch.setattr(train, "update", spoiled)
     with pytest.raises(Diverged, match=f"not finite after step {wrong}") as caught:
         start("naive", tmp_path)
-    assert caught.value.good_steps == 2 and "2 steps" in caught.value.fix
-    assert checkpoint.last(tmp_path).resolve().name == "000002"
+    assert caught.value.good_steps == good and f"{good} steps" in caught.value.fix
+    assert checkpoint.last(tmp_path).resolve().name == f"{good:06d}"
 
 
 # --- files of others ------------------------------------------------------------------------------
