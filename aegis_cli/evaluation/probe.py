@@ -20,7 +20,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
 from aegis_cli.data.batch import Share
-from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
 from aegis_cli.evaluation import results, wrong_answers
@@ -160,9 +160,19 @@ def run(
         settings = {"vqa": vqa, "ask": ask, "questions": questions, "seed": seed}
         settings |= {"baseline": baseline}
         settings |= {"max_drop": max_drop, "gate": gate}
+        settings |= _path_of(vqa)
         name = f"probe-{source.name}"
-        results.keep(Path(target), name, report.to_json() | wrong, settings)
+        figures = report.to_json() | wrong
+        results.keep_if_possible(Path(target), name, figures, settings, on_event)
     return report
+
+
+def _path_of(vqa: str) -> dict[str, str]:
+    """Where a question set of files lies, or its id on the hub; nothing of sets that ship."""
+    if vqa in (sets.SCENES, easy.NAME):
+        return {}
+    is_here = Path(vqa).parent.is_dir()
+    return {"path": str(Path(vqa).absolute()) if is_here else vqa}
 
 
 def _answered(

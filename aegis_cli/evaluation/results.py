@@ -6,21 +6,27 @@ what is up to date. What `aegis probe` and `aegis rollout` measure lies apart, i
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
 from aegis_cli.common import files, locks
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import ProbeFigures, RolloutFigures
 from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
+_PATIENCE_S = 5.0  # with others who write there
 
 
 def keep(
@@ -28,18 +34,20 @@ def keep(
 ) -> Path | None:
     """Write a measurement of a run, or of one of its checkpoints, into the run's folder.
 
-    A later one of the same name replaces it.
+    A later one of the same name replaces it, if it is of the same question set: two of them may be
+    files of one name in different folders.
 
     Args:
         name: `probe-scenes`, or `rollout-seen`.
         figures: what was measured, as `--json` shows it.
-        settings: what was asked for, written beside the figures.
+        settings: what was asked for, written beside the figures; `path` is that of the question
+            set, where it is a file or a folder.
 
     Returns:
         The file; None where `target` is no run of one policy, or may not be written to.
 
     Raises:
-        AegisError: another process writes there, or the disk is full.
+        AegisError: another process writes there for longer than some seconds, or the disk is full.
     """
     found = _run_and_step(target)
     if found is None or not os.access(found[0], os.W_OK):
@@ -47,14 +55,61 @@ def keep(
     run, step = found
     # A file's name or a question set's path may hold anything.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
-    path = run / FOLDER / (f"{plain}.json" if step is None else f"{plain}-{step:06d}.json")
-    with locks.alone(path.parent):
+    of_last = step == _last_step(run)
+    with _soon_alone(run / FOLDER):
+        path = run / FOLDER / (f"{plain}.json" if of_last else f"{plain}-{step:06d}.json")
+        if _is_of_another_set(path, settings):
+            told_apart = hashlib.sha256(settings["path"].encode()).hexdigest()[:8]
+            path = path.with_name(f"{path.stem}-{told_apart}.json")
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
     recipe = recipe_of(run)
-    if recipe.train.track:
-        at = checkpoint.step_of(checkpoint.last(run)) if step is None else step
-        track.tell(recipe, run, plain, figures, at)
+    if recipe.train.track and step is not None:
+        track.tell(recipe, run, plain, figures, step)
     return path
+
+
+def keep_if_possible(
+    target: Path,
+    name: str,
+    figures: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    on_event: OnEvent,
+) -> None:
+    """The same; where it cannot be written, a warning says so, for the figures are known by now."""
+    try:
+        keep(target, name, figures, settings)
+    except AegisError as problem:
+        text = f"not kept in '{run_of(target)}': {problem.found}; {problem.fix}"
+        on_event(Warned(name.partition("-")[0], text))
+
+
+@contextlib.contextmanager
+def _soon_alone(folder: Path) -> Iterator[None]:
+    """Be the only process that writes there, after some seconds at most: others do not take long.
+
+    Raises:
+        AegisError: somebody is still at it.
+    """
+    until = time.monotonic() + _PATIENCE_S
+    with contextlib.ExitStack() as held:
+        while True:
+            try:
+                held.enter_context(locks.alone(folder))
+                break
+            except AegisError:
+                if time.monotonic() > until or not folder.is_dir():
+                    raise
+                time.sleep(0.1)
+        yield
+
+
+def _is_of_another_set(path: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a file has what was measured on a question set that lies elsewhere."""
+    if "path" not in settings or not path.is_file():
+        return False
+    found = files.load_json(path)
+    there = (found.get("settings") or {}) if isinstance(found, dict) else {}
+    return there.get("path", settings["path"]) != settings["path"]
 
 
 def run_of(target: Path) -> Path | None:
@@ -69,12 +124,21 @@ def recipe_of(run: Path) -> recipes.Recipe:
 
 
 def _run_and_step(target: Path) -> tuple[Path, int | None] | None:
-    """The run that a path belongs to, and its step if it is a checkpoint's; None of others."""
+    """The run that a path belongs to, and the step of what is measured; None of others.
+
+    The step of a run is None where it has no checkpoint.
+    """
     if (target / "recipe.yaml").is_file():
-        return None if recipes.is_stream_run(target) else (target, None)
+        return None if recipes.is_stream_run(target) else (target, _last_step(target))
     if checkpoint.is_one(target) and (run := checkpoint.run_of(target)) is not None:
         return run, checkpoint.step_of(target)
     return None
+
+
+def _last_step(run: Path) -> int | None:
+    """After how many steps the last checkpoint was written; None where a study has removed it."""
+    link = run / "checkpoints" / checkpoint.LAST
+    return checkpoint.step_of(link) if link.is_dir() else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,17 +170,30 @@ def rollouts(run: Path) -> list[Result]:
 
 
 def _read(run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures]) -> list[Result]:
-    by_recipe = sorted(run.glob(f"{kind}.json")) + sorted(run.glob(f"{kind}-*.json"))
-    found = []
-    for path in [*by_recipe, *sorted((run / FOLDER).glob(f"{kind}-*.json"))]:
+    by_recipe = []
+    for path in sorted(run.glob(f"{kind}.json")) + sorted(run.glob(f"{kind}-*.json")):
         # What a study measures on validation data chooses its knobs, and is no result.
-        if "validation" in path.stem:
-            continue
+        if not re.match(rf"{kind}-validation(-|$)", path.stem):
+            by_recipe.append(path)
+    found, last = [], _last_step(run)
+    for path in [*by_recipe, *sorted((run / FOLDER).glob(f"{kind}-*.json"))]:
         raw = kept_figures.read(path, figures)
         settings, step = raw.pop("settings", None) or {}, raw.pop("step", None)
-        if step is None:
+        # A run that was trained further has forgotten what was measured of it before. Earlier
+        # versions wrote no step for a run.
+        if step is None or step == last:
             found.append(Result(path.stem, raw, settings))
     return found
+
+
+def question_set(probed: Result, recipe: recipes.Recipe) -> str:
+    """The question set of a probe as somebody named it: its own, or one of the recipe's."""
+    if "vqa" in probed.settings:
+        return str(probed.settings["vqa"])
+    sets = recipe.probe.of_each_set()
+    number = probed.name.removeprefix("probe").lstrip("-") or "1"
+    place = int(number) - 1 if number.isdigit() else 0
+    return str(sets[place if place < len(sets) else 0].vqa)
 
 
 def gate(probed: Sequence[Result], max_drop: float | None) -> bool | None:

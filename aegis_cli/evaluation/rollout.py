@@ -170,7 +170,7 @@ def run(
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
         settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
-        results.keep(Path(run), name, report.to_json(), settings)
+        results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
     return report
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, recipes
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.evaluation import results
+from aegis_cli.inspection import InspectReport
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
@@ -24,13 +26,14 @@ class ComparedRun:
     """One run's figures; None for what was not measured of it.
 
     Shares are in [0, 1], the drop in percentage points, times in seconds, W2^2 a mean over layers.
-    The figures of VQA are those of the run's first probe.
+    The figures of VQA are those of one probe, on the question set `vqa`.
     """
 
     run: str
     method: str
     task: str | None
     steps: int | None
+    vqa: str | None
     accuracy: float | None
     baseline_accuracy: float | None
     drop_points: float | None
@@ -54,17 +57,51 @@ class Comparison:
 
     rows: list[ComparedRun]
 
+    @property
+    def question_sets(self) -> list[str]:
+        """Those that the figures of VQA are of."""
+        return list(dict.fromkeys(row.vqa for row in self.rows if row.vqa is not None))
+
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
 
 def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
-    """Read what was measured of each run; `on_event` (there as in every stage) is never called.
+    """Read what was measured of each run.
+
+    Of several question sets, the first that every run was probed on is compared. Where there is
+    none, each run's own first is shown, and a warning says so.
 
     Raises:
         AegisError: a path that is no run of a policy, and no job of such.
     """
-    return Comparison([_compared(path) for given in paths for path in _runs(Path(given))])
+    found = [(path, _inspected(path)) for given in paths for path in _runs(Path(given))]
+    probed = [_by_set(path, one) for path, one in found]
+    asked = [own for own in probed if own]
+    shared = [name for name in next(iter(asked), {}) if all(name in own for own in asked)]
+    rows = []
+    for (path, one), own in zip(found, probed, strict=True):
+        name = shared[0] if shared else next(iter(own), None)
+        rows.append(_compared(path, one, name if own else None, own))
+    made = Comparison(rows)
+    if len(made.question_sets) > 1:
+        text = f"VQA is of different questions: {', '.join(made.question_sets)}"
+        on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))
+    return made
+
+
+def _inspected(path: Path) -> InspectReport:
+    found = inspection.run(path)
+    assert isinstance(found, InspectReport)  # a stream's run is refused before
+    return found
+
+
+def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
+    """The run's probes by their question sets, the first of each."""
+    recipe, probed = results.recipe_of(path), dict[str, results.Result]()
+    for result in found.probes:
+        probed.setdefault(results.question_set(result, recipe), result)
+    return probed
 
 
 def _runs(path: Path) -> Iterator[Path]:
@@ -83,9 +120,15 @@ def _runs(path: Path) -> Iterator[Path]:
     yield path
 
 
-def _compared(path: Path) -> ComparedRun:
-    found = inspection.run(path)
-    probed = found.probes[0].figures if found.probes else {}
+def _compared(
+    path: Path, found: InspectReport, vqa: str | None, by_set: Mapping[str, results.Result]
+) -> ComparedRun:
+    """A run's row.
+
+    Args:
+        vqa: the question set to show; None where the run was probed on none.
+    """
+    probed = {} if vqa is None else by_set[vqa].figures
     played = {result.figures.get("colors"): result.figures for result in reversed(found.rollouts)}
     seen, held_out = played.get("seen", {}), played.get("held-out", {})
     # A task without colours has one rollout, by its return or its success.
@@ -98,6 +141,7 @@ def _compared(path: Path) -> ComparedRun:
         method=str(found.facts["method"]),
         task=found.facts.get("task"),
         steps=found.facts.get("steps"),
+        vqa=vqa,
         accuracy=probed.get("accuracy"),
         baseline_accuracy=probed.get("baseline_accuracy"),
         drop_points=probed.get("drop_points"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from samples.reports import probe, rollout, write_job
 
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import Result
 
@@ -37,13 +40,51 @@ def test_a_later_one_replaces_it_and_leaves_that_of_aegis_run(run: Path) -> None
     assert (run / "rollout-seen.json").read_bytes() == before
 
 
-def test_one_of_a_checkpoint_is_kept_under_its_step_and_is_no_figure_of_the_run(run: Path) -> None:
-    at = run / "checkpoints" / "000006"
-    (at / "backbone").mkdir()
+def checkpoint_at(run: Path, step: int) -> Path:
+    at = run / "checkpoints" / f"{step:06d}"
+    (at / "backbone").mkdir(parents=True)
     (at / "expert.safetensors").touch()
-    path = results.keep(at, "probe-scenes", probe("shape"), {})
-    assert path is not None and path.name == "probe-scenes-000006.json"
+    return at
+
+
+def test_one_of_an_earlier_checkpoint_is_kept_under_its_step_and_is_no_figure_of_the_run(
+    run: Path,
+) -> None:
+    path = results.keep(checkpoint_at(run, 3), "probe-scenes", probe("shape"), {})
+    assert path is not None and path.name == "probe-scenes-000003.json"
     assert [result.name for result in results.probes(run)] == ["probe"]
+
+
+def test_one_of_the_last_checkpoint_is_one_of_the_run(run: Path) -> None:
+    assert results.keep(checkpoint_at(run, 6), "probe-scenes", probe("a"), {}) == results.keep(
+        run, "probe-scenes", probe("b", 1), {}
+    )
+    assert [r.figures["accuracy"] for r in results.probes(run)] == [0.8, pytest.approx(0.7)]
+
+
+def test_a_run_that_was_trained_further_has_not_what_was_measured_before(run: Path) -> None:
+    results.keep(run, "probe-scenes", probe("shape"), {})
+    results.keep(run, "rollout-x-seen", rollout("seen", 0.25), {})
+    before = len(results.probes(run)), len(results.rollouts(run))
+    link = run / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to(checkpoint_at(run, 9).name)
+    assert (len(results.probes(run)), len(results.rollouts(run))) == (before[0] - 1, before[1] - 1)
+    results.keep(run, "probe-scenes", probe("shape"), {})
+    assert len(results.probes(run)) == before[0]
+
+
+def test_sets_of_one_name_in_two_folders_are_two_results(run: Path) -> None:
+    for place, drop in (("home", 0), ("kitchen", 1), ("home", 2)):
+        results.keep(run, "probe-q.jsonl", probe("shape", drop), {"path": f"/{place}/q.jsonl"})
+    kept = {r.settings["path"]: r.figures["drop_points"] for r in results.probes(run)[1:]}
+    assert kept == {"/home/q.jsonl": 30.0, "/kitchen/q.jsonl": 20.0}
+
+
+@pytest.mark.parametrize("name", ["probe-okvqa_validation.jsonl", "probe-questions-validation"])
+def test_a_set_may_be_called_validation(run: Path, name: str) -> None:
+    results.keep(run, name, probe("shape"), {})
+    assert len(results.probes(run)) == 2
 
 
 def test_any_name_of_questions_becomes_a_file_of_the_folder(run: Path) -> None:
@@ -65,13 +106,28 @@ def test_nothing_is_kept_in_a_folder_that_may_not_be_written_to(run: Path) -> No
     run.chmod(0o755)
 
 
-def test_two_processes_do_not_write_at_once(run: Path) -> None:
-    with locks.alone(run / "results"), pytest.raises(AegisError, match="being written to"):
-        results.keep(run, "probe-scenes", probe("shape"), {})
+def test_two_processes_do_not_write_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what could not be kept was measured all the same."""
+    monkeypatch.setattr(results, "_PATIENCE_S", 0.0)
+    told: list[Event] = []
+    with locks.alone(run / "results"):
+        with pytest.raises(AegisError, match="being written to"):
+            results.keep(run, "probe-scenes", probe("shape"), {})
+        results.keep_if_possible(run, "probe-scenes", probe("shape"), {}, told.append)
+    (warned,) = told
+    assert isinstance(warned, Warned) and "not kept" in warned.text and warned.stage == "probe"
+
+
+def test_one_waits_for_another_that_writes(run: Path) -> None:
+    with contextlib.ExitStack() as other:
+        other.enter_context(locks.alone(run / "results"))
+        threading.Timer(0.5, other.close).start()
+        assert results.keep(run, "probe-scenes", probe("shape"), {}) is not None
 
 
 def test_what_chose_a_knob_is_no_result(run: Path) -> None:
-    files.save_json(run / "probe-validation.json", probe("shape"))
+    for name in ("probe-validation", "probe-validation-2"):
+        files.save_json(run / f"{name}.json", probe("shape"))
     assert [result.name for result in results.probes(run)] == ["probe"]
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from samples.command import refused
-from samples.reports import METHODS, write_job
+from samples.reports import METHODS, probe, write_job
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event
 from aegis_cli.evaluation import results
 from aegis_cli.recipes import Probe
 from aegis_cli.reporting import compare
@@ -45,6 +46,28 @@ def test_what_was_measured_by_hand_counts_where_aegis_run_measured_nothing(job: 
     figures = {"task": "x", "colors": None, "success": None, "return_share": 0.5, "episodes": 3}
     results.keep(run, "rollout-seen", figures, {})
     assert compare.run([run]).rows[0].return_share == 0.5
+
+
+def test_the_set_that_all_runs_were_probed_on_is_compared(job: Path) -> None:
+    told: list[Event] = []
+    for name, sets in (("naive", ("a", "b")), ("aegis", ("b", "c"))):
+        (job / name / "probe.json").unlink()
+        for which in sets:
+            results.keep(job / name, f"probe-{which}", probe("x", ord(which) - 97), {"vqa": which})
+    found = compare.run([job], told.append)
+    assert [(row.vqa, row.drop_points) for row in found.rows] == [("b", 20.0)] * 2 and not told
+
+
+def test_figures_of_different_questions_are_not_compared_without_a_word(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    (job / "naive" / "probe.json").unlink()
+    results.keep(job / "naive", "probe-own", probe("x", 4), {"vqa": "own.jsonl"})
+    code, out, err = aegis("compare", "naive", "aegis")
+    assert code == 0 and "different questions: own.jsonl, scenes" in err
+    line = next(line for line in out.splitlines() if line.startswith(" naive"))
+    assert "own.jsonl" in line and "40.0" in line and "!40.0" not in line and "*40.0" not in line
 
 
 def test_the_command_shows_one_line_a_run(

@@ -156,6 +156,9 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     return plain_table(("Steps", "Energy shed, mean %"), lines)
 
 
+_OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
+
+
 def compared(report: Any) -> RenderableType:
     """A line per run; columns that no run has are left out."""
     verdict = {True: "passed", False: "failed", None: "-"}
@@ -169,8 +172,11 @@ def compared(report: Any) -> RenderableType:
         "Validation loss": ("validation_loss", False),
         "Step (s)": ("step_s", False),
     }
+    several = len(report.question_sets) > 1  # then their figures are not compared
+    better = {name: of for name, of in better.items() if not (several and name in _OF_QUESTIONS)}
     columns: dict[str, Callable[[Any], str]] = {
         "Steps": lambda r: "-" if r.steps is None else f"{r.steps:,}",
+        "Questions": lambda r: (r.vqa or "-") if several else "-",
         "VQA %": lambda r: percent(r.accuracy),
         "Before %": lambda r: percent(r.baseline_accuracy),
         "Drop (points)": lambda r: fixed(r.drop_points, 2),
