@@ -25,7 +25,7 @@ from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
 from aegis_cli.data.lerobot import layout
 from aegis_cli.evaluation.rollout import Acting, load_run
-from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.recipes import is_robot_stream_run
 from aegis_cli.training import checkpoint
 
@@ -86,6 +86,10 @@ class DeployedPolicy:
         """The side in pixels of the squares that the backbone reads; None: it reads any size."""
         return self._policy.backbone.image_size
 
+    def check_instruction(self, text: str) -> None:
+        """Raise AegisError for an instruction that the backbone cannot read."""
+        self._policy.backbone.check_prompt(text)
+
     def begin(self) -> DeployedPolicy:
         """The same policy at the beginning of an episode of its own; the weights are shared."""
         other = copy.copy(self)
@@ -132,14 +136,15 @@ class DeployedPolicy:
             positions: proprioception [P], in the demonstrations' order.
 
         Raises:
-            AegisError: other pictures or numbers than it was trained on, or words that the backbone
-                does not know.
+            AegisError: other pictures or numbers than it was trained on, words that the backbone
+                does not know, or predicted actions that are not finite.
         """
         shown, given = self._checked(pictures, instruction, positions)
         frames = [torch.from_numpy(self._fitted(p, camera)) for camera, p in enumerate(shown)]
         images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
         proprio = torch.from_numpy(given)[None]
-        return self._policy.act(images, [instruction], proprio, self._generator)[0].cpu().numpy()
+        acted = self._policy.act(images, [instruction], proprio, self._generator)[0]
+        return check_actions(acted.cpu()).numpy()
 
     def _checked(
         self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray

@@ -227,6 +227,17 @@ def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: 
         load_policy(run_folder, task="point")
 
 
+def test_actions_that_are_not_finite_are_refused() -> None:
+    """A finite position can be so far off that what is predicted of it is not finite."""
+    own = deployed()
+    for act in (own.predict_action_chunk, own.select_action):
+        with pytest.raises(AegisError, match=r"8 of 8 predicted numbers .* not finite"):
+            act(frame(), TEXT, [1e30] * 3)
+    own.reset()
+    expected = deployed().select_action(frame(), TEXT, POSITIONS)
+    np.testing.assert_array_equal(own.select_action(frame(), TEXT, POSITIONS), expected)
+
+
 # --- precision ------------------------------------------------------------------------------------
 
 

@@ -378,6 +378,27 @@ def test_verifying_where_nothing_is(aegis, tmp_path: Path) -> None:
     assert code == 2 and "no file" in err
 
 
+def test_verifying_a_folder_that_only_holds_runs_is_all_there_is_to_say(
+    aegis, tmp_path: Path
+) -> None:
+    """Runs that a link leads to are among them, and a link back up ends somewhere."""
+    save_run(tmp_path / "elsewhere")
+    folder = tmp_path / "folder"
+    save_run(folder / "runs" / "one")
+    (folder / "two").symlink_to(tmp_path / "elsewhere")
+    (folder / "runs" / "up").symlink_to(folder)
+    code, out, err = aegis("inspect", folder, "--verify", "--json")
+    assert code == 0 and "2 files agree with their digests" in err
+    expected = {"kind": "folder", "path": str(folder), "verified": 2, "without_digest": 0}
+    assert json.loads(out) == expected
+    assert aegis("inspect", folder)[0] == 2  # which asks what it is
+    data = bytearray((tmp_path / "elsewhere" / "ledger.safetensors").read_bytes())
+    data[-1] ^= 0x40
+    (tmp_path / "elsewhere" / "ledger.safetensors").write_bytes(data)
+    code, _, err = aegis("inspect", folder, "--verify")
+    assert code == 2 and "two/ledger.safetensors' is damaged" in err
+
+
 def test_verifying_follows_no_link_in_a_circle(aegis, tmp_path: Path) -> None:
     run = save_run(tmp_path / "run")
     (run / "ledger.safetensors").unlink()

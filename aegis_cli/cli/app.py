@@ -685,9 +685,8 @@ def inspect(
     Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
-    if verify:
-        inspecting.verify(path)
-    inspecting.show(path, plot, as_json, tensors, wide)
+    verified = inspecting.verify(path) if verify else None
+    inspecting.show(path, plot, as_json, tensors, wide, verified)
 
 
 @app.command(short_help="Compare runs in one table.")

@@ -37,7 +37,10 @@ class Commands(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta["aegis.args"] = list(args)
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except OSError as error:  # of --help, whose output may be a full disk
+            raise typer.Exit(_ended_by(error)) from None
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)  # in the order of the pipeline
@@ -50,12 +53,7 @@ class Commands(TyperGroup):
             _say(render.error, error)
             raise typer.Exit(2) from None
         except OSError as error:
-            if error.errno == errno.EPIPE:
-                _close_output()
-                raise typer.Exit(128 + signal.SIGPIPE) from None
-            refused = _too_large(error) if error.errno == errno.ENOMEM else _refused(error)
-            _say(render.error, refused)
-            raise typer.Exit(2) from None
+            raise typer.Exit(_ended_by(error)) from None
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             ended = "interrupted" if number == signal.SIGINT else signal.Signals(number).name
@@ -73,8 +71,18 @@ class Commands(TyperGroup):
             raise typer.Exit(3) from None
 
 
+def _ended_by(error: OSError) -> int:
+    """Tell what the system would not do; the exit code."""
+    if error.errno == errno.EPIPE:
+        _close_output()
+        return 128 + signal.SIGPIPE
+    _say(render.error, _too_large(error) if error.errno == errno.ENOMEM else _refused(error))
+    _close_output()
+    return 2
+
+
 def _close_output() -> None:
-    """Write nowhere from now on, for nobody reads the output any more.
+    """Let what cannot be written go nowhere: nobody reads it any more, or the disk is full.
 
     At its end Python would complain of what it cannot write, and change the exit code.
     """
@@ -82,7 +90,7 @@ def _close_output() -> None:
         with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
             try:
                 stream.flush()
-            except BrokenPipeError:
+            except OSError:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

@@ -33,12 +33,14 @@ def show(
     as_json: bool,
     tensors: bool = False,
     wide: bool = False,
+    verified: VerifiedReport | None = None,
 ) -> None:
     """Tell by a path's files what it is, and show that.
 
     Args:
         tensors: list each tensor of a file.
         wide: let a table's lines be wider than the terminal.
+        verified: what `verify` has found there; it may be all that there is to say of a folder.
     """
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
@@ -47,10 +49,20 @@ def show(
     elif (path / "table.json").is_file() or (path / "cells.json").is_file():
         _table(path, plot, as_json, wide)
     else:
-        _anything(path, plot, as_json, tensors, wide)
+        _anything(path, plot, as_json, tensors, wide, verified)
 
 
-def verify(path: Path) -> None:
+@dataclass(frozen=True)
+class VerifiedReport:
+    """A folder that only holds what Aegis wrote: how many files agree with their digests."""
+
+    kind: str
+    path: str
+    verified: int
+    without_digest: int
+
+
+def verify(path: Path) -> VerifiedReport:
     """Read the artifacts at a path whole, and say how many have a digest.
 
     Raises:
@@ -64,6 +76,7 @@ def verify(path: Path) -> None:
     if bare:
         listed = ", ".join(bare[:_LISTED]) + (" ..." if len(bare) > _LISTED else "")
         render.note(f"{len(bare)} without a digest, written by an earlier Aegis: {listed}")
+    return VerifiedReport("folder", str(path), len(found) - len(bare), len(bare))
 
 
 def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
@@ -131,11 +144,24 @@ def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bo
     render.show(report, views.get(type(report), render.stream_study), as_json, wide)
 
 
-def _anything(path: Path, plot: Path | None, as_json: bool, tensors: bool, wide: bool) -> None:
-    """An artifact, a run, a model or a dataset."""
+def _anything(
+    path: Path,
+    plot: Path | None,
+    as_json: bool,
+    tensors: bool,
+    wide: bool,
+    verified: VerifiedReport | None,
+) -> None:
+    """An artifact, a run, a model or a dataset, or a folder whose files were verified."""
     from aegis_cli import inspection
 
-    report = inspection.run(path)
+    try:
+        report = inspection.run(path)
+    except inspection.UnknownFolder:
+        if verified is None or plot is not None:
+            raise
+        render.show(verified, render.facts, as_json)
+        return
     if plot is not None:
         _draw(report, path, plot)
     stream = isinstance(report, inspection.StreamInspection)

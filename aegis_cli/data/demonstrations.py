@@ -21,6 +21,7 @@ from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data import relative
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.fitted import FittedFrames
 from aegis_cli.data.lerobot import dataset, download, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import source as sources
@@ -33,7 +34,7 @@ _MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
-Frames = Tensor | FramesOnDemand  # of one camera, [N, H, W, 3] uint8
+Frames = Tensor | FramesOnDemand | FittedFrames  # of one camera, [N, H, W, 3] uint8
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,11 @@ class Demonstrations:
             if all(names) and len(names) == rows.shape[1] > 0
         }
         return found if self.fps is None else {**found, "fps": self.fps}
+
+    def fitted(self, sizes: Sequence[tuple[int, int]]) -> Demonstrations:
+        """The same demonstrations, whose frames are shown in one (height, width) per camera."""
+        shown = (_fitted(*each) for each in zip(self.frames, sizes, strict=True))
+        return replace(self, frames=tuple(shown))
 
     def check_files(self) -> None:
         """Raise AegisError if somebody has written to what the frames are read from."""
@@ -170,6 +176,11 @@ class Demonstrations:
         actions, is_pad = self.chunks(frames, chunk)
         origins = relative.Origins(places)(self.tensors["proprio"][frames])
         return (actions - origins)[~is_pad]
+
+
+def _fitted(frames: Frames, size: tuple[int, int]) -> Frames:
+    """A camera's frames in that size; themselves, where they have it already."""
+    return frames if tuple(frames.shape[1:3]) == size else FittedFrames(frames, size)
 
 
 def at(path: str | Path) -> Path:

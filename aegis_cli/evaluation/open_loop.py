@@ -90,7 +90,8 @@ class OpenLoopReport:
         split: which episodes these are: the run's own `validation` episodes, all of `other data`
             than it was trained on, those that were `chosen`, or all where it is `unknown` what the
             policy was trained on.
-        trained_on: those of the episodes that the run was trained on.
+        trained_on: those of the episodes that the run was trained on; empty where that is not
+            known, as of an exported policy.
         relative_error: mean squared error over the recorded actions' variance, mean over the
             dimensions that vary; 1 is the error of the best constant action.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
@@ -161,6 +162,8 @@ def run(
         cache=False,
     )
     _check_fit(policy, shown, meta, data)
+    shown = _as_deployed(policy, shown, meta)
+    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
     _check_names(shown, meta, data, on_event)
     _check_rate(shown, meta, data, on_event)
     at = _spread(shown, chosen, frames)
@@ -252,10 +255,13 @@ class _Source:
             everything = UNKNOWN if self.digest is None else OTHER
             return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
         if self.recipe is None:
+            if asked is not None:
+                return CHOSEN, _existing(asked, count, data), []
             raise AegisError(
                 f"'{self.checkpoint}', a checkpoint outside its run, which was trained on '{data}'",
                 "the run, whose recipe says which episodes were held out",
-                "give the run's folder, or demonstrations that it was not trained on",
+                "give the run's folder, choose the episodes (--episodes 6,7), or give "
+                "demonstrations that it was not trained on",
             )
         share = self.recipe.train.validation_share
         own = demonstrations.learned_from(data, count, self.recipe.demos.only)
@@ -281,7 +287,7 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
 
 
 def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], data: Path) -> None:
-    """Raise AegisError for demonstrations of another robot, other cameras or unknown words."""
+    """Raise AegisError for demonstrations of another robot or other cameras."""
     own = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
     found = shown.tensors["proprio"].shape[1], shown.tensors["actions"].shape[1]
     if own != found:
@@ -297,7 +303,17 @@ def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], d
             "the cameras that it was trained on",
             "give the run's folder, whose recipe names them",
         )
-    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
+
+
+def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any]) -> Demonstrations:
+    """The demonstrations, each camera's frames in the size in which a robot's are shown.
+
+    A policy knows pictures of the sizes of its training; those of another camera are fitted to
+    them wherever it acts, and are here. They are as they are where the sizes are not known.
+    """
+    side = policy.backbone.image_size
+    sizes = checkpoint.sizes_of(meta) if side is None else ((side, side),) * len(shown.frames)
+    return shown.fitted(sizes) if sizes else shown
 
 
 def _check_names(

@@ -134,6 +134,8 @@ def run(
             read += backbones.model_files(baseline)
         if anchor is not None:
             read.append(anchor)
+        if (run := results.run_of(Path(target))) is not None:
+            read += [path for path in run.rglob("*") if path.is_file()]
         files.check_apart("--predictions", predictions, read)
     model = backbones.load(target)
     before = None if baseline is None else backbones.load(baseline)

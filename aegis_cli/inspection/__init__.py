@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from aegis_cli.common import hub
@@ -23,6 +24,7 @@ from aegis_cli.inspection.report import (
     SiteSpectrum,
     StreamInspection,
     TensorInfo,
+    UnknownFolder,
 )
 from aegis_cli.models import shipped
 
@@ -36,6 +38,7 @@ __all__ = [
     "SiteSpectrum",
     "StreamInspection",
     "TensorInfo",
+    "UnknownFolder",
     "run",
     "verify",
 ]
@@ -81,7 +84,7 @@ def verify(path: Path) -> dict[Path, bool]:
     if not path.is_dir():
         return {path: artifacts.load(path).header.digest is not None}
     # Copies and links of one checkpoint are one file.
-    listed = {os.path.realpath(each): each for each in sorted(path.rglob("*.safetensors"))}
+    listed = {os.path.realpath(each): each for each in _artifacts_below(path)}
     found = {}
     for each in listed.values():
         if artifacts.is_artifact(each):
@@ -91,6 +94,19 @@ def verify(path: Path) -> dict[Path, bool]:
             f"no artifact of Aegis in '{path}'", "a file or folder that it wrote", "check the path"
         )
     return found
+
+
+def _artifacts_below(folder: Path) -> Iterator[Path]:
+    """The safetensors files below a folder and the folders that links in it lead to, in order."""
+    seen = set()
+    for place, inner, names in os.walk(folder, followlinks=True):
+        inner.sort()
+        real = os.path.realpath(place)
+        if real in seen:  # a link to a folder above would go round for ever
+            inner.clear()
+            continue
+        seen.add(real)
+        yield from (Path(place, name) for name in sorted(names) if name.endswith(".safetensors"))
 
 
 def _located(path: Path) -> Path:

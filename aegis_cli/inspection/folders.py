@@ -20,7 +20,12 @@ from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import figures, file
-from aegis_cli.inspection.report import InspectReport, StreamInspection, TensorInfo
+from aegis_cli.inspection.report import (
+    InspectReport,
+    StreamInspection,
+    TensorInfo,
+    UnknownFolder,
+)
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.recipes import Recipe
@@ -31,7 +36,8 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     """What a folder is.
 
     Raises:
-        AegisError: nothing we know, damaged, a run without a ledger yet, or a stream that is not
+        UnknownFolder: nothing we know.
+        AegisError: damaged, a run without a ledger yet, or a stream that is not
             learned to its end.
     """
     if recipes.is_stream_run(path):
@@ -56,7 +62,7 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
-    raise AegisError(
+    raise UnknownFolder(
         f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}"
     )
 
@@ -117,6 +123,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["cameras"] = cameras
     if dataset_id := header.meta.get("dataset"):
         facts["dataset"] = dataset_id
+    if base_model := header.meta.get("base_model"):
+        facts["base_model"] = base_model
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
     energies = figures.of_ledger(rows, until)
     if at is not None:

@@ -10,6 +10,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from aegis_cli.common.errors import AegisError
+
 if TYPE_CHECKING:
     from aegis_cli.continual.report import StreamReport
     from aegis_cli.data.lerobot.summary import FeatureInfo
@@ -87,6 +89,10 @@ class Bin:
     last_step: int
     energy_shed: float
     layers: tuple[float, ...]
+
+
+class UnknownFolder(AegisError):
+    """A folder that is nothing by itself, whatever it holds."""
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,29 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.devices import autocast, send
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
+
+
+def check_actions(actions: Tensor) -> Tensor:
+    """The actions of any shape that are about to be sent to a robot.
+
+    Raises:
+        AegisError: some are not finite.
+    """
+    if not (finite := actions.isfinite()).all():
+        raise AegisError(
+            f"{int((~finite).sum())} of {actions.numel()} predicted numbers that are not finite",
+            "actions of finite numbers",
+            "see whether the positions are in the units of the demonstrations; if they are, take "
+            "an earlier checkpoint",
+        )
+    return actions
 
 
 class Policy(nn.Module):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, methods, recipes, sim
-from aegis_cli.common import artifacts, hub
+from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import InspectReport
@@ -23,7 +23,6 @@ from aegis_cli.training import checkpoint
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
-_AS_IT_IS = "{}"  # what `probe.ask` makes of a question where it changes nothing
 
 _AVERAGED = " The weights are an exponential moving average of the training's, of decay {:g}."
 
@@ -121,7 +120,7 @@ def text(
     options = json.dumps(recipes.options(recipe), sort_keys=True)
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     return _CARD.format(
-        front=_front_matter(recipe, form, facts.get("dataset")),
+        front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {recipe.train.method}",
         backbone=recipe.backbone,
         version=__version__,
@@ -163,12 +162,7 @@ def _use(
 def _probe_command(folder: str, recipe: Recipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
-    words = ["aegis", "probe", folder, "--baseline", recipe.backbone, "--vqa", str(probe.vqa)]
-    if probe.ask != _AS_IT_IS:
-        words += ["--ask", probe.ask]
-    if probe.skip_bad:
-        words.append("--skip-bad")
-    return shlex.join(words)
+    return shlex.join(["aegis", "probe", folder, "--baseline", recipe.backbone, *probe.asking])
 
 
 def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str:
@@ -194,15 +188,15 @@ def _measured(run: Path, at: Path) -> InspectReport:
     return found
 
 
-def _front_matter(recipe: Recipe, form: str, dataset: str | None) -> str:
-    """The lines that the hub reads; `dataset` is the demonstrations' id there."""
+def _front_matter(form: str, base_model: str | None, dataset: str | None) -> str:
+    """The lines that the hub reads, with the backbone's and the demonstrations' ids there."""
     lines = [
         f"library_name: {'lerobot' if form == LEROBOT else 'aegis-vla'}",
         "pipeline_tag: robotics",
         "tags: [robotics, vision-language-action, aegis]",
     ]
-    if hub.is_id(recipe.backbone) and not Path(recipe.backbone).exists():
-        lines.append(f"base_model: {recipe.backbone}")
+    if base_model is not None:
+        lines.append(f"base_model: {base_model}")
     if dataset is not None:
         lines.append(f"datasets: [{dataset}]")
     return "\n".join(lines)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -79,8 +80,10 @@ def run(
             name where none is to be given, or a type that the backbone cannot have.
     """
     refuse_stream(run)
-    if out.exists():
+    if os.path.lexists(out):  # a link that leads nowhere too
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
+    if not _is_utf8(out):
+        raise AegisError(f"{str(out)!r}", "a path in UTF-8", "choose another --out")
     if camera is not None and form != card.LEROBOT:
         raise AegisError(
             f"--camera {camera} with --format {form}",
@@ -91,11 +94,12 @@ def run(
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
-    aside = out.with_name(f".{out.name}.tmp")
-    shutil.rmtree(aside, ignore_errors=True)
+    with checkpoint.writing(out):
+        around = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".tmp", dir=out.parent))
+    aside = around / out.name
     try:
         with checkpoint.writing(out):
-            aside.mkdir()
+            aside.mkdir()  # `around` is for its owner alone, and this as other folders
             if form == card.LEROBOT:
                 lerobot_folder.write(aside, policy, meta, cameras)
             else:
@@ -104,7 +108,7 @@ def run(
             _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
             os.rename(aside, out)
     finally:
-        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
+        shutil.rmtree(around, ignore_errors=True)
     return ExportReport(
         str(out),
         form,
@@ -117,6 +121,15 @@ def run(
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),
     )
+
+
+def _is_utf8(path: Path) -> bool:
+    """Whether a path's bytes are text, which safetensors and the card want."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:

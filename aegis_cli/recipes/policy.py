@@ -81,6 +81,7 @@ TASK = Check(
 )
 
 
+_AS_IT_IS = "{}"  # what `ask` makes of a question where it changes nothing
 _ASK = (
     "What a question becomes before the model reads it, with {} for it. Chat models that answer in "
     "sentences need e.g. '{} Answer with a single word or phrase.', for answers are compared whole."
@@ -684,6 +685,18 @@ class Probe:
         """This probe of each of its question sets alone, in their order."""
         names = (self.vqa,) if isinstance(self.vqa, str) else self.vqa
         return tuple(dataclasses.replace(self, vqa=name) for name in names)
+
+    @property
+    def asking(self) -> tuple[str, ...]:
+        """Options of `aegis probe` that ask the questions of this one set as this probe does.
+
+        They do so of a policy without its recipe too. With it, `skip_bad` would not be that of a
+        set which is named.
+        """
+        words: tuple[str, ...] = ("--vqa", str(self.vqa))
+        if self.ask != _AS_IT_IS:
+            words += ("--ask", self.ask)
+        return (*words, "--skip-bad") if self.skip_bad else words
 
 
 @section

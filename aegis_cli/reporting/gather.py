@@ -213,13 +213,11 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None)
     anchor = _beside(path, "anchor.safetensors")
     again, new = path / "recipe.yaml", "NEW_FOLDER"
     inputs = ("--method", method, "--demos", demos, "--anchor", anchor, "--out", new)
-    sets = [str(settings.vqa) for settings in recipe.probe.of_each_set()]
     asked = ("--baseline", recipe.backbone, "--anchor", anchor)
     commands = [_command("aegis", "train", again, *inputs)]
-    for vqa in sets:
-        counted = ("--vqa", vqa, "--questions", recipe.probe.questions)
-        drawn = _seed(recipe.probe.seed)
-        commands.append(_command("aegis", "probe", new, *counted, *drawn, *asked))
+    for probe in recipe.probe.of_each_set():
+        counted = (*probe.asking, "--questions", probe.questions, *_seed(probe.seed))
+        commands.append(_command("aegis", "probe", new, *counted, *asked))
     if task is not None:
         episodes = ("--episodes", recipe.rollout.episodes, *_seed(recipe.rollout.seed))
         colors = [("--colors", each) for each in recipe.rollout.colors]

@@ -61,10 +61,17 @@ def run(
         on_ready: is told where, once the server listens.
 
     Raises:
-        AegisError: no such run, or an address that cannot be listened at.
+        AegisError: no such run, an address that cannot be listened at, or a prompt that the
+            policy cannot read.
         KeyboardInterrupt: a signal has come, and the connections are closed.
     """
+    if not host.strip():  # which would listen at every address there is
+        raise AegisError("an empty --host", "an address of this machine", "--host 127.0.0.1")
+    if prompt is not None and not prompt.strip():
+        raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
     policy = load_policy(run, task, seed, precision)
+    if prompt is not None:
+        policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:
         asyncio.run(
             listen(policy, host, port, prompt, on_ready, lambda: signaled.number is not None)

@@ -33,7 +33,14 @@ def decode(data: bytes) -> Any:
     """
     try:
         return msgpack.unpackb(data, object_hook=_unmarked)
-    except (ValueError, TypeError, KeyError, OverflowError, msgpack.UnpackException) as error:
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        OverflowError,
+        SyntaxError,  # of a type's name, which NumPy reads as a piece of a program
+        msgpack.UnpackException,
+    ) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(
             f"a message of {len(data)} bytes that cannot be read: {what}",

@@ -98,7 +98,8 @@ class TrainingRun:
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
         if it is not float32; `relative`, for each action the place of the position that it is
         predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
-        as the demonstrations say them; `dataset`, their id, if they come from the hub.
+        as the demonstrations say them; `dataset`, their id, and `base_model`, the backbone's, if
+        they come from the hub.
         """
         found = {
             "method": self.method.name,
@@ -112,6 +113,8 @@ class TrainingRun:
             found["relative"] = list(self.policy.origins.places)
         if self.demos.dataset is not None:
             found["dataset"] = self.demos.dataset
+        if self.policy.backbone.hub_id is not None:
+            found["base_model"] = self.policy.backbone.hub_id
         if self.demos.cameras:
             found["cameras"] = list(self.demos.cameras)
         if self.policy.backbone.image_size is None:

@@ -441,6 +441,33 @@ def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+def buffered() -> dict[str, str]:
+    """An environment in which Python gathers what it writes, as it does for users."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    return kept | {"PYTHONPATH": str(ROOT)}
+
+
+# Reports shorter than what Python gathers before it writes, and longer ones.
+@pytest.mark.parametrize(
+    "words", ["inspect embedded --json", "recipes ls --json", "inspect embedded", "--help"]
+)
+def test_a_full_disk_loses_no_report_without_a_word(words: str, tmp_path: Path):
+    command = f"'{sys.executable}' -m aegis_cli {words} > /dev/full"
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=tmp_path, env=buffered(), capture_output=True, text=True
+    )
+    assert done.returncode == 2 and "No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
+
+
+@pytest.mark.parametrize("words", ["inspect embedded --json", "--help", "train --help"])
+def test_a_gone_reader_ends_gathered_output_alike(words: str, tmp_path: Path):
+    command = f"'{sys.executable}' -m aegis_cli {words} | true"
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(shell, cwd=tmp_path, env=buffered(), capture_output=True)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
 @pytest.mark.parametrize("moment", ["main", "parse_args"])
 def test_ctrl_c_before_a_command_begins_ends_without_a_traceback(tmp_path: Path, moment: str):
     code = f"""

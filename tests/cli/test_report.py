@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from dataclasses import replace
@@ -108,6 +109,20 @@ def test_the_commands_of_a_run_ask_and_play_by_its_seeds(aegis, job: Path) -> No
     (run / "recipe.yaml").write_text(yaml.safe_dump(keys))
     seeds = {line.split()[1]: line for line in _commands(aegis, run)}
     assert "--seed 5" in seeds["probe"] and "--seed 6" in seeds["rollout"]
+
+
+def test_the_commands_of_a_run_ask_each_set_as_its_recipe_does(aegis, job: Path) -> None:
+    run = next(path.parent for path in sorted(job.glob("*/recipe.yaml")))
+    keys = yaml.safe_load((run / "recipe.yaml").read_text())
+    ask = "{} Answer 'yes' or \"no\"."
+    asked = {"vqa": ["scenes", "data/q.jsonl"], "skip_bad": True, "ask": ask, "questions": 7}
+    keys["probe"] |= asked
+    (run / "recipe.yaml").write_text(yaml.safe_dump(keys))
+    probes = [shlex.split(line) for line in _commands(aegis, run) if "aegis probe" in line]
+    assert [words[words.index("--vqa") + 1] for words in probes] == asked["vqa"]
+    for words in probes:
+        assert "--skip-bad" in words and words[words.index("--ask") + 1] == ask
+        assert words[words.index("--questions") + 1] == "7"
 
 
 def _commands(aegis, run: Path) -> list[str]:

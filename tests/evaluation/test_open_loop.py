@@ -25,9 +25,11 @@ from aegis_cli.evaluation import open_loop
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import export
+from aegis_cli.publishing.card import AEGIS, LEROBOT
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, train
 
+FORMS = (AEGIS, LEROBOT)
 CHUNK = 3
 LENGTHS = (4, 2, 5)
 
@@ -278,6 +280,19 @@ def test_an_exported_policy_does_not_say_what_it_was_trained_on(
     assert found.relative_error == pytest.approx(same.relative_error)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_of_an_exported_policy_the_episodes_may_be_chosen(
+    form: str, naive_run: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    """Also on the data that it was trained on; which of them it was is not known."""
+    export.run(naive_run, tmp_path / "policy", form)
+    found = open_loop.run(tmp_path / "policy", demos_file, episodes=[6, 2, 6])
+    same = open_loop.run(naive_run, demos_file, episodes=[2, 6])
+    assert (found.split, found.episodes, found.trained_on) == (open_loop.CHOSEN, [2, 6], [])
+    assert found.relative_error == pytest.approx(same.relative_error)
+    assert "episode 99 of" in refusal(tmp_path / "policy", demos_file, episodes=[99])
+
+
 # --- refused --------------------------------------------------------------------------------------
 
 
@@ -291,7 +306,8 @@ def test_a_checkpoint_without_its_run_does_not_know_what_it_was_trained_on(
     naive_run: Path, demos_file: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(naive_run / "checkpoints" / "last", tmp_path / "taken")
-    assert "outside its run" in refusal(tmp_path / "taken", demos_file)
+    said = refusal(tmp_path / "taken", demos_file)
+    assert "outside its run" in said and "--episodes" in said
     other = tmp_path / "other.safetensors"
     record.run("reach", 2, 7, other, workers=1)
     assert open_loop.run(tmp_path / "taken", other).split == open_loop.OTHER

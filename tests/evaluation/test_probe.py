@@ -412,6 +412,17 @@ def test_a_run_is_asked_the_questions_that_its_recipe_names(
     assert code == 0 and json.loads(text)["questions"] == 8
 
 
+def test_predictions_do_not_replace_a_runs_own_files(
+    aegis, taught: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    train.run(recipe(taught), "naive", demos_file, None, run := tmp_path / "run")
+    before = (run / "recipe.yaml").read_bytes()
+    for target in (run, run / "checkpoints" / "last"):
+        code, _, err = aegis("probe", target, "--predictions", run / "recipe.yaml")
+        assert code == 2 and "which this command also reads or writes" in err
+    assert (run / "recipe.yaml").read_bytes() == before
+
+
 def test_another_seed_asks_other_questions(aegis, taught: Path, tmp_path: Path) -> None:
     asked = {}
     for name, options in {"plain": (), "0": ("--seed", 0), "7": ("--seed", 7)}.items():

@@ -26,6 +26,7 @@ from aegis_cli.data.lerobot import dataset, source
 from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
+from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, train
@@ -171,6 +172,36 @@ def test_the_policy_is_compared_with_what_both_have_seen(run: Path, folder: Path
     # A checkpoint alone knows its cameras too, but not which episodes were held out.
     with pytest.raises(AegisError, match="outside its run"):
         open_loop.run(copied(run / "checkpoints" / "last"), folder)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_other_sizes_are_evaluated_in_those_of_training_as_a_deployed_policy_sees_them(
+    smooth: bool, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of pictures that are decoded beforehand, and of videos that are decoded as they are read."""
+    made = episodes(2, BOTH, (40, 30), smooth=smooth)
+    known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+    data = save(tmp_path / "d", known, as_video=smooth)
+    read = demonstrations.load(data, None, 0, Selection(BOTH), cache=False)
+    assert [frames.shape[1:3] for frames in read.frames] == [(40, 30), (40, 30)]
+    monkeypatch.setattr(Policy, "draw_noise", _one_noise)
+    found = open_loop.run(run, data, batch_size=1, traced=True)
+    assert found.split == open_loop.OTHER and len(found.traces) == 2
+    own = load_policy(run)
+    for trace in found.traces:
+        first = int(read.tensors["episode_starts"][trace.episode])
+        for start in range(0, len(trace.predicted), trace.replan):
+            batch = read.batch(torch.tensor([first + start]), 1)
+            seen = {n: p.numpy() for n, p in zip(FULL, batch.images[0], strict=True)}
+            acted = own.predict_action_chunk(seen, "go to the red pad", batch.proprio[0].numpy())
+            then = trace.predicted[start : start + trace.replan]
+            np.testing.assert_array_equal(then, acted[: len(then)])
+
+
+def _one_noise(policy: Policy, frames: int, _: torch.Generator) -> torch.Tensor:
+    """The same noise for each frame, whoever asks and however often."""
+    size = policy.expert.shape.chunk, len(policy.action_scale.mean)
+    return torch.randn(size, generator=torch.Generator().manual_seed(0)).expand(frames, *size)
 
 
 def copied(checkpoint_folder: Path) -> Path:

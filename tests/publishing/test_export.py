@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -155,6 +156,26 @@ def test_nothing_is_left_of_an_export_that_fails(
     with pytest.raises(AegisError, match="No space left"):
         export.run(run_folder, tmp_path / "x")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_lies_beside_an_export_stays(run_folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / ".x.tmp" / "notes.txt"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    export.run(run_folder, tmp_path / "x")
+    assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 2
+    made = tmp_path / "plain"
+    made.mkdir()
+    assert (tmp_path / "x").stat().st_mode == made.stat().st_mode
+    (tmp_path / "link").symlink_to("nowhere")
+    with pytest.raises(AegisError, match="is there already"):
+        export.run(run_folder, tmp_path / "link")
+
+
+def test_a_name_that_is_no_text_is_refused(run_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(AegisError) as caught:
+        export.run(run_folder, tmp_path / os.fsdecode(b"caf\xe9"))
+    assert "\\udce9" in caught.value.found and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
-"""The plugin's policy keeps the names of pictures, tried with a stand-in of LeRobot."""
+"""The plugin's policy, tried with a stand-in of LeRobot."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -165,3 +166,72 @@ def test_other_pictures_are_refused_with_the_names_of_training(plugin: Any) -> N
     meta = {"task": None, "normalization": "mean_std", "cameras": [IMAGE]}
     with pytest.raises(AegisError, match=f"{WRIST}\nexpected: {IMAGE}\n"):
         plugin.AegisPolicy(config(plugin, model, WRIST), model=model, meta=meta)
+
+
+# --- acting ---------------------------------------------------------------------------------------
+
+TEXT, OTHER = "go to the red target", "go to the blue target"
+
+
+def acting(plugin: Any) -> Any:
+    """A policy that predicts at every second call."""
+    model = make_policy().eval()
+    made = config(plugin, model, IMAGE)
+    made.n_action_steps = 2
+    return plugin.AegisPolicy(made, model=model)
+
+
+def seen(text: str = TEXT, state: torch.Tensor | None = None, shade: float = 0.0) -> dict[str, Any]:
+    positions = torch.tensor([[0.3, -0.1, 0.2]]) if state is None else state
+    picture = torch.full((1, 3, 30, 40), shade)
+    return {IMAGE: picture, "observation.state": positions, "task": [text]}
+
+
+BAD_STATES = [
+    (torch.tensor([[0.0, math.nan, 0.0]]), "not finite"),
+    (torch.tensor([[0.0, math.inf, 0.0]]), "not finite"),
+    (torch.zeros(1, 2), r"\(1, 2\).*\n.*\(1, 3\)"),
+    (torch.zeros(3), r"\(3,\).*\n.*\(1, 3\)"),
+    (torch.zeros(2, 3), r"\(2, 3\).*\n.*\(1, 3\)"),
+]
+
+
+@pytest.mark.parametrize(("state", "says"), BAD_STATES)
+def test_a_broken_sensor_is_refused_at_every_call(
+    state: torch.Tensor, says: str, plugin: Any
+) -> None:
+    """Also at one that goes on with a chunk: no action of an older prediction moves the robot."""
+    fresh, begun = acting(plugin), acting(plugin)
+    begun.select_action(seen())
+    for policy in (fresh, begun):
+        for act in (policy.select_action, policy.predict_action_chunk):
+            with pytest.raises(AegisError, match=says):
+                act(seen(state=state))
+    assert torch.isfinite(begun.select_action(seen())).all()
+
+
+def test_a_batch_without_a_state_is_refused(plugin: Any) -> None:
+    batch = seen()
+    del batch["observation.state"]
+    with pytest.raises(AegisError, match="observation.state none in a batch of 1"):
+        acting(plugin).select_action(batch)
+
+
+def test_another_task_drops_the_chunk_of_the_one_before(plugin: Any) -> None:
+    """As a deployed policy does; what is left of a chunk is not taken up again."""
+    policy, other = acting(plugin), acting(plugin)
+    chunks = [
+        other.predict_action_chunk(seen(text, shade=shade))
+        for text, shade in ((TEXT, 0.0), (OTHER, 0.2), (TEXT, 0.6))
+    ]
+    texts = (TEXT, OTHER, OTHER, TEXT, TEXT)
+    taken = [policy.select_action(seen(text, shade=0.2 * i)) for i, text in enumerate(texts)]
+    expected = [chunks[0][:, :1], chunks[1][:, :2], chunks[2][:, :2]]
+    torch.testing.assert_close(torch.stack(taken, 1), torch.cat(expected, 1), rtol=0, atol=0)
+
+
+def test_actions_that_are_not_finite_are_refused(plugin: Any) -> None:
+    policy = acting(plugin)
+    for act in (policy.select_action, policy.predict_action_chunk):
+        with pytest.raises(AegisError, match="predicted numbers that are not finite"):
+            act(seen(state=torch.full((1, 3), 1e30)))

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from samples.command import refused
 from samples.hub import Hub
 from samples.small_run import recipe as small
 
-from aegis_cli import recipes
+from aegis_cli import inspection, recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.models import lerobot_folder
@@ -166,6 +167,36 @@ def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
     success = files.load_json(run_folder / results.FOLDER / "rollout-seen.json")["success"]
     assert f"| reach | seen | 2 | {100 * success:.1f} % (" in body
     assert f"hf download {REPO}" in body and "policies/reach-naive" in body
+
+
+@pytest.mark.parametrize("hosted", [True, False])
+def test_a_card_names_the_backbone_that_came_from_the_hub_and_no_folder(
+    hosted: bool,
+    hf_folder: Callable[[str], Path],
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever folder the card is written from, and what lies there by that name."""
+    name, folder = "someone/SmolVLM", hf_folder("smolvlm")
+    training, elsewhere = tmp_path / "training", tmp_path / "elsewhere"
+    for place in (training, elsewhere):
+        place.mkdir()
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: str(folder))
+    monkeypatch.chdir(training)
+    if not hosted:
+        shutil.copytree(folder, training / name)
+    run = tmp_path / "run"
+    train.run(small(name, steps=1), "naive", demos_file, None, run)
+    (elsewhere / name).mkdir(parents=True)
+    for place in (training, elsewhere, tmp_path):
+        monkeypatch.chdir(place)
+        assert inspection.run(run).facts.get("base_model") == (name if hosted else None)
+        for form in FORMS:
+            stored = card.Stored("float32", rounded=False)
+            said = card.text(run, checkpoint.last(run), form, REPO, stored)
+            front = yaml.safe_load(said.split("---\n", 2)[1])
+            assert front.get("base_model") == (name if hosted else None)
 
 
 def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:

@@ -229,6 +229,20 @@ def test_a_port_that_is_taken_is_refused() -> None:
             asyncio.run(listen(deployed(), "127.0.0.1", port, None, print, lambda: True))
 
 
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (("--prompt", "pick up the cup"), "'pick'"),
+        (("--prompt", " "), "an empty --prompt"),
+        (("--host", ""), "an empty --host"),
+    ],
+)
+def test_what_would_answer_nobody_or_everybody_is_refused_before_it_listens(
+    options: tuple[str, ...], problem: str, aegis: Any, naive_run: Path
+) -> None:
+    assert problem in refused(aegis("serve", naive_run, "--port", 0, *options))
+
+
 @pytest.mark.parametrize("precision", ["auto", "bf16", "float32"])
 def test_the_policy_acts_in_the_precision_that_was_asked_for(
     precision: str, aegis: Any, monkeypatch: pytest.MonkeyPatch

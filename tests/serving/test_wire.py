@@ -8,6 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.serving import wire
 
 ARRAYS = [
@@ -18,6 +19,13 @@ ARRAYS = [
     np.array([True, False]),
     np.array([1, 2], ">i2"),
 ]
+
+
+@pytest.mark.parametrize("name", ["f4,(", "no type", "O", ""])
+def test_a_type_that_is_none_is_one_error(name: str) -> None:
+    marked = {b"__ndarray__": True, b"data": b"", b"dtype": name, b"shape": [0]}
+    with pytest.raises(AegisError, match="that cannot be read"):
+        wire.decode(msgpack.packb(marked))
 
 
 @pytest.mark.parametrize("array", ARRAYS, ids=lambda array: f"{array.dtype}{array.shape}")

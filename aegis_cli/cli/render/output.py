@@ -53,15 +53,14 @@ def show(
         wide: give each table one line a row, however narrow the terminal is.
     """
     if as_json:
-        sys.stdout.write(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
+        text(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
     else:
         to = console(sys.stdout)
         if wide:
             to.width = _UNLIMITED
         with to.capture() as printed:
             to.print(table(_visible_in(report)))
-        sys.stdout.write(_without_trailing_blanks(printed.get()))
-        sys.stdout.flush()
+        text(_without_trailing_blanks(printed.get()))
 
 
 def _without_trailing_blanks(text: str) -> str:
@@ -103,8 +102,12 @@ def _visible_in(value: Any) -> Any:
 
 
 def text(lines: str) -> None:
-    """Lines on stdout just as they are, for another program too: never wrapped."""
+    """Lines on stdout just as they are, for another program too: never wrapped.
+
+    They are written at once, so that a full disk is found while the exit code can tell it.
+    """
     sys.stdout.write(lines)
+    sys.stdout.flush()
 
 
 def console(file: TextIO) -> Console:

@@ -30,6 +30,15 @@ def locate(name: str) -> Path:
         AegisError: no such model.
     """
     name = name.partition("#")[0]
+    if (here := _on_disk(name)) is not None:
+        return here
+    if not hub.is_local(name) and _has_transformers():
+        return model_folder.fetch(name)
+    raise _no_backbone(name)
+
+
+def _on_disk(name: str) -> Path | None:
+    """The model of ours or of this disk that `name` stands for; None: only the hub may have it."""
     if name in SHIPPED:
         return shipped.locate(name)
     path = Path(name)
@@ -40,11 +49,7 @@ def locate(name: str) -> Path:
             return folder
         if (folder / "model.safetensors").is_file():
             return folder / "model.safetensors"
-    if path.is_file():
-        return path
-    if not hub.is_local(name) and _has_transformers():
-        return model_folder.fetch(name)
-    raise _no_backbone(name)
+    return path if path.is_file() else None
 
 
 def load(name: str) -> Backbone:
@@ -67,6 +72,8 @@ def load(name: str) -> Backbone:
 
         backbone = hf.load(path, layers)
         backbone.stored = _stored_before(path) or backbone.stored
+        own = name.partition("#")[0]
+        backbone.hub_id = own if _on_disk(own) is None else None
         return backbone
     if layers is not None:
         raise AegisError(

@@ -21,7 +21,7 @@ from aegis_cli.common.pictures import fit
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
-from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.training import checkpoint
 from lerobot_policy_aegis.configuration_aegis import AegisConfig
 
@@ -82,14 +82,27 @@ class AegisPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Begin episodes: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[Tensor] = deque()
+        self._follow: list[str] = []  # the texts that the actions ahead are of
         self._generator.manual_seed(self.config.noise_seed)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """The next action of each row, [B, A]; every `n_action_steps`-th call predicts."""
+        """The next action of each row, [B, A]; every `n_action_steps`-th call predicts.
+
+        Other texts than those of the chunk predict at once, and drop what is left of it.
+
+        Raises:
+            AegisError: what `predict_action_chunk` finds wrong with texts and state, at each call:
+                a robot whose sensor fails does not move on by an older prediction.
+        """
+        texts = _texts(batch)
+        self._state(batch, len(texts))
+        if texts != self._follow:
+            self._ahead.clear()
         if not self._ahead:
             chunk = self.predict_action_chunk(batch, **kwargs)
             self._ahead.extend(chunk[:, : self.config.n_action_steps].unbind(1))
+            self._follow = texts
         return self._ahead.popleft()
 
     @torch.no_grad()
@@ -99,12 +112,17 @@ class AegisPolicy(PreTrainedPolicy):
         Args:
             batch: pictures [B, 3, H, W] in [0, 1], `observation.state` [B, P] and B texts `task`.
             noise: must be None; the policy draws its own, from `noise_seed`.
+
+        Raises:
+            AegisError: pictures, texts or a state that the policy cannot act on, or predicted
+                actions that are not finite.
         """
         if noise is not None:
             raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
         self.eval()
         images, texts = self._images(batch), _texts(batch)
-        return self.model.act(images, texts, batch[OBS_STATE].float(), self._generator)
+        state = self._state(batch, len(texts))
+        return check_actions(self.model.act(images, texts, state, self._generator))
 
     @torch.no_grad()
     def generate_text(
@@ -251,6 +269,28 @@ class AegisPolicy(PreTrainedPolicy):
                 f"pictures {', '.join(given)}", ", ".join(keys), "name them as training did"
             )
         return keys
+
+    def _state(self, batch: Mapping[str, Any], rows: int) -> Tensor:
+        """The positions [B, P] that `rows` robots are in.
+
+        Raises:
+            AegisError: none, of another shape, or not finite.
+        """
+        wanted, found = (rows, len(self.model.proprio_scale.mean)), batch.get(OBS_STATE)
+        if found is None or tuple(found.shape) != wanted:
+            said = "none" if found is None else f"of shape {tuple(found.shape)}"
+            raise AegisError(
+                f"{OBS_STATE} {said} in a batch of {rows}",
+                f"{wanted}",
+                "give what the demonstrations hold, a row per text",
+            )
+        if not found.isfinite().all():
+            raise AegisError(
+                f"an {OBS_STATE} that is not finite: {found.tolist()}",
+                "finite numbers",
+                "see what the robot's sensors say",
+            )
+        return found.float()
 
     def _images(self, batch: Mapping[str, Any]) -> Images:
         missing = [name for name in self._cameras if name not in batch]
