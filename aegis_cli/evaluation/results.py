@@ -97,7 +97,8 @@ def _soon_alone(folder: Path) -> Iterator[None]:
                 held.enter_context(locks.alone(folder))
                 break
             except AegisError:
-                if time.monotonic() > until or not folder.is_dir():
+                # It may be gone by now: who leaves an empty folder removes it.
+                if time.monotonic() > until:
                     raise
                 time.sleep(0.1)
         yield
