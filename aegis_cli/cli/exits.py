@@ -41,6 +41,10 @@ class Commands(TyperGroup):
             return super().parse_args(ctx, args)
         except OSError as error:  # of --help, whose output may be a full disk
             raise typer.Exit(_ended_by(error)) from None
+        except Exception as error:
+            if hasattr(error, "show"):
+                raise typer.Exit(_misused(error)) from None
+            raise
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)  # in the order of the pipeline
@@ -63,12 +67,21 @@ class Commands(TyperGroup):
             raise
         except Exception as error:
             if hasattr(error, "show"):
-                raise  # click's own, of a misused command line, which it prints itself
+                raise typer.Exit(_misused(error)) from None
             if _is_out_of_memory(error):
                 _say(render.error, _too_large(error))
                 raise typer.Exit(2) from None
             traceback.print_exc()  # Python's own exit code for it is that of a failed gate
             raise typer.Exit(3) from None
+
+
+def _misused(error: Any) -> int:
+    """Show click's own error, of a misused command line; the exit code.
+
+    Click would show it where nobody looks after a stderr that cannot be written.
+    """
+    _say(lambda misuse: misuse.show(), error)
+    return error.exit_code
 
 
 def _ended_by(error: OSError) -> int:

@@ -468,6 +468,17 @@ def test_a_gone_reader_ends_gathered_output_alike(words: str, tmp_path: Path):
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+@pytest.mark.parametrize("words", ["bogus", "--bogus", "train --bogus", "inspect nothing"])
+@pytest.mark.parametrize("nowhere", ["2> /dev/full", "2>&1 | true"])
+def test_a_problem_that_nobody_can_be_told_has_its_code_all_the_same(
+    words: str, nowhere: str, tmp_path: Path
+):
+    command = f"'{sys.executable}' -m aegis_cli {words} {nowhere}"
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(shell, cwd=tmp_path, env=buffered(), capture_output=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
+
+
 @pytest.mark.parametrize("moment", ["main", "parse_args"])
 def test_ctrl_c_before_a_command_begins_ends_without_a_traceback(tmp_path: Path, moment: str):
     code = f"""
