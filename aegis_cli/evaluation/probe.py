@@ -27,6 +27,7 @@ from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
+from aegis_cli.training.folder import METRICS
 
 PROBE_SEED = 0
 MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
@@ -134,8 +135,11 @@ def run(
             read += backbones.model_files(baseline)
         if anchor is not None:
             read.append(anchor)
-        if (run := results.run_of(Path(target))) is not None:
-            read += [path for path in run.rglob("*") if path.is_file()]
+        # A run's own files, and not what an earlier probe was asked to write beside them.
+        for model in (target, *([] if baseline is None else [baseline])):
+            if (run := results.run_of(Path(model))) is not None:
+                own = (path for path in run.rglob("*") if path.is_file())
+                read += [path for path in own if path.suffix != ".jsonl" or path.name == METRICS]
         files.check_apart("--predictions", predictions, read)
     model = backbones.load(target)
     before = None if baseline is None else backbones.load(baseline)

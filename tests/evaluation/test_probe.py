@@ -421,6 +421,9 @@ def test_predictions_do_not_replace_a_runs_own_files(
         code, _, err = aegis("probe", target, "--predictions", run / "recipe.yaml")
         assert code == 2 and "which this command also reads or writes" in err
     assert (run / "recipe.yaml").read_bytes() == before
+    for _ in range(2):  # an earlier probe's predictions are replaced
+        code, _, err = aegis("probe", run, "--questions", 7, "--predictions", run / "said.jsonl")
+        assert code == 0, err
 
 
 def test_another_seed_asks_other_questions(aegis, taught: Path, tmp_path: Path) -> None:
