@@ -420,6 +420,9 @@ def test_predictions_do_not_replace_a_runs_own_files(
     for target in (run, run / "checkpoints" / "last"):
         code, _, err = aegis("probe", target, "--predictions", run / "recipe.yaml")
         assert code == 2 and "which this command also reads or writes" in err
+    given = ("probe", taught, "--baseline", run, "--predictions", run / "recipe.yaml")
+    code, _, err = aegis(*given)
+    assert code == 2 and "which this command also reads or writes" in err
     assert (run / "recipe.yaml").read_bytes() == before
     for _ in range(2):  # an earlier probe's predictions are replaced
         code, _, err = aegis("probe", run, "--questions", 7, "--predictions", run / "said.jsonl")

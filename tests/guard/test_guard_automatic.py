@@ -486,6 +486,11 @@ def test_calls_of_the_guard_in_an_automatic_loop(anchors: dict[str, Path]) -> No
     refused(guard.automatic, "automatic guard")
 
 
+def test_a_name_in_place_of_the_module_whose_call_is_a_pass(anchors: dict[str, Path]) -> None:
+    _, guard = guarded("aegis", anchors)
+    refused(lambda: guard.automatic(around="policy"), "around='policy'")
+
+
 def test_a_mask_that_is_not_among_the_arguments(anchors: dict[str, Path]) -> None:
     model, guard = guarded("aegis", anchors)
     guard.automatic()

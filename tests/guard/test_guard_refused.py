@@ -245,6 +245,7 @@ def test_an_optimizer_that_clears_less_than_what_learns(anchor: Path) -> None:
         (MASK[:, None, None], None, ("[4, 1, 1, 8]",)),
         (torch.where(MASK, 0.0, -1e4), None, ("other than 0 and 1",)),
         (torch.zeros_like(MASK), None, ("without a single valid token",)),
+        (MASK.tolist(), None, ("a mask that is a list",)),
         (MASK, IMAGE[:-1], ("image mask [7]",)),
         (MASK, IMAGE * 2, ("image mask", "other than 0 and 1")),
     ],

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples.small_run import recipe as small
-from samples.training_runs import SETTINGS, STEPS, Start, assert_resumes, metrics
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_resumes,
+    metrics,
+    protected_shares,
+)
 from torch import Tensor, nn
 
 from aegis_cli.common import artifacts
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.data import demonstrations
 from aegis_cli.models import backbones
 from aegis_cli.recipes import Nullspace, Recipe
-from aegis_cli.training import checkpoint, dry_run, train
+from aegis_cli.training import checkpoint, dry_run, step, train
 from aegis_cli.training.average import Average
 
 DECAY = 0.6
@@ -33,15 +42,17 @@ def averaging(recipe: Recipe) -> Recipe:
     )
 
 
-def state(out: Path, kind: str) -> dict[str, Tensor]:
-    saved = artifacts.load(checkpoint.last(out) / checkpoint.STATE, "training-state").tensors
+def state(out: Path, kind: str, at: int | None = None) -> dict[str, Tensor]:
+    """The weights or their average in a checkpoint's training state; of the last one for None."""
+    folder = checkpoint.last(out) if at is None else out / "checkpoints" / f"{at:06d}"
+    saved = artifacts.load(folder / checkpoint.STATE, "training-state").tensors
     return {n.removeprefix(kind): t for n, t in saved.items() if n.startswith(kind)}
 
 
 # --- the average ----------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     decay=st.floats(0.01, 0.999),
     waits=st.lists(st.integers(1, 4), min_size=1, max_size=12),
@@ -50,13 +61,13 @@ def state(out: Path, kind: str) -> dict[str, Tensor]:
 def test_it_is_the_sum_that_its_definition_says(decay: float, waits: list[int], seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     weight = nn.Parameter(torch.randn(3, 2, generator=generator))
-    average, wanted, step = Average({"w": weight}, decay), weight.detach().double(), 0
+    average, wanted, done = Average({"w": weight}, decay), weight.detach().double(), 0
     for waited in waits:
-        step += waited
+        done += waited
         weight.data.copy_(torch.randn(3, 2, generator=generator))
-        average.follow(step)
-        average.follow(step)  # the second time changes nothing
-        kept = min(decay, (1 + step) / (10 + step))
+        average.follow(done)
+        average.follow(done)  # the second time changes nothing
+        kept = min(decay, (1 + done) / (10 + done))
         for _ in range(waited):
             wanted = kept * wanted + (1 - kept) * weight.detach().double()
     torch.testing.assert_close(average.weights["w"].double(), wanted, rtol=1e-5, atol=1e-6)
@@ -103,6 +114,35 @@ def test_a_checkpoint_is_the_average_and_training_does_not_notice(
     told = metrics(tmp_path / "average")[-1]["validation_loss"]
     assert told == pytest.approx(loss, rel=1e-5)
     assert told != pytest.approx(metrics(tmp_path / "plain")[-1]["validation_loss"], rel=1e-5)
+
+
+def test_it_holds_constrained_weights_alone(
+    start: Start, averaging: Recipe, tmp_path: Path, anchor_file: Path
+) -> None:
+    start("nullspace", tmp_path, recipe=averaging)
+    assert max(protected_shares(tmp_path, anchor_file, 0.9)) < 1e-8
+
+
+def test_it_follows_the_last_good_step_of_a_run_that_diverges(
+    start: Start, averaging: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the method had not constrained that step before it was known to be the last."""
+    compute, good = step.compute_gradients, STEPS - 1
+
+    def spoiled(*args: Any, index: int, **options: Any) -> step.Gradients:
+        found = compute(*args, index=index, **options)
+        return replace(found, loss=found.loss * math.nan) if index == good else found
+
+    monkeypatch.setattr(step, "compute_gradients", spoiled)
+    with pytest.raises(Diverged):
+        start("nullspace", tmp_path, recipe=averaging)
+    assert checkpoint.last(tmp_path).resolve().name == f"{good:06d}"
+    (earlier, _), (mean, weights) = (
+        [state(tmp_path, kind, at) for kind in ("average.", "weight.")] for at in (good - 1, good)
+    )
+    kept = min(DECAY, (1 + good) / (10 + good))
+    for name, tensor in mean.items():
+        torch.testing.assert_close(tensor, kept * earlier[name] + (1 - kept) * weights[name])
 
 
 def test_what_does_not_learn_has_none(start: Start, averaging: Recipe, tmp_path: Path) -> None:
