@@ -417,6 +417,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("plateau", 12, 12),
         ("rivals", 139, 139),
         ("metaworld-study", 24, 24),
+        ("metaworld-stream-study", 9, 9),
     ],
 )
 def test_every_shipped_cell_is_still_found_by_its_key(
@@ -458,6 +459,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
         "plateau",
         "rivals",
         "metaworld-study",
+        "metaworld-stream-study",
     ],
 )
 def test_every_shipped_entry_is_a_cell_of_its_study(
