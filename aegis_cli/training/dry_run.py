@@ -320,7 +320,8 @@ def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in own:
             kept[storage.data_ptr()] = storage
-        return tensor
+        # Not the tensor itself: an operation that saves its own result would hold on to itself.
+        return tensor.detach()
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
     rounded = training.masters.rounded()

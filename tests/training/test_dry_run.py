@@ -253,6 +253,33 @@ def test_what_a_gpu_has_no_memory_for_is_reported_and_no_error(
     assert "more memory than the estimate of" in str(dry_run.shortage(plan))
 
 
+@pytest.mark.parametrize("kind", ["tiny", "smolvlm"])
+def test_what_a_pass_keeps_is_gone_before_the_steps_are_measured(
+    kind: str,
+    tiny_folder: Path,
+    hf_folder: Made,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An operation that saves its own result would hold its graph for good."""
+    passed, left = dry_run._pass_kept, []
+
+    def alive() -> int:
+        return sum(storage.nbytes() for storage in dry_run._alive(torch.device("cpu")).values())
+
+    def watched(*given: Any) -> tuple[int, int]:
+        before = alive()
+        found = passed(*given)
+        left.append(alive() - before)
+        return found
+
+    monkeypatch.setattr(dry_run, "_pass_kept", watched)
+    backbone = tiny_folder if kind == "tiny" else hf_folder(kind)
+    dry_run.run(small(backbone), "naive", demos_file, None, tmp_path / "out")
+    assert left == [0]
+
+
 def test_rounded_weights_count_once_and_not_for_each_frame(
     hf_folder: Made, demos_file: Path, tmp_path: Path
 ) -> None:
