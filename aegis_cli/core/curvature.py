@@ -28,24 +28,26 @@ damped: what VQA does not read is free. K-FAC damps both factors, because it inv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core import joint
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair
+from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 
 
 @dataclass(frozen=True)
 class Curvature:
-    """The curvature at one linear map or convolution.
+    """The curvature at one linear map or convolution, or at several that are stacked.
 
-    The matrix h is made anew when it is used, because it is as large as the map.
+    The matrix h is made anew when it is used, because it is as large as the map. Of n stacked maps
+    (core/joint.py) every tensor, displacements included, has a first dimension n more.
 
     Attributes:
         inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one. They may be in half
@@ -55,7 +57,8 @@ class Curvature:
         g: relative eigenvalues of G [m]; likewise.
         damping: what is added to each eigenvalue of G, also to those that were left out.
         c_rest, g_rest: relative eigenvalue along the directions that were never resolved; 0 where
-            all were, and where those that were left out hold next to nothing.
+            all were, and where those that were left out hold next to nothing. Of stacked maps
+            [n, 1], or 0 of all.
         total: a tensor -> its sum over the processes, where each has some of the map's outputs;
             None where it has all.
     """
@@ -65,8 +68,8 @@ class Curvature:
     c: Tensor
     g: Tensor
     damping: float
-    c_rest: float = 0.0
-    g_rest: float = 0.0
+    c_rest: float | Tensor = 0.0
+    g_rest: float | Tensor = 0.0
     total: Callable[[Tensor], Tensor] | None = None
 
     def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
@@ -98,21 +101,23 @@ class Curvature:
         factor: Callable[[Tensor], Tensor],
     ) -> Pair:
         """A displacement whose entries in the eigenbases are multiplied by `factor` of w h_ij."""
-        flat = weight.flatten(1)
-        width = flat.shape[1]
+        flat = weight.flatten(self.c.ndim)
+        width = flat.shape[-1]
         if bias is not None:
             # The bias is the weight of an input that is always 1.
-            flat = torch.cat([flat, bias[:, None]], 1)
+            flat = torch.cat([flat, bias[..., None]], -1)
         flat, inputs = flat.to(self.c.dtype), self.inputs.to(self.c.dtype)
         read = flat @ inputs  # [o, k]
-        found = self._along(read, strength, self.c, factor) @ inputs.T  # [o, d]
+        found = self._along(read, strength, self.c, factor) @ inputs.mT  # [o, d]
         # Else what lies outside the stored inputs is not read on VQA, and stays.
-        if self.c_rest:
-            outside = flat - read @ inputs.T
-            rest = self.c.new_full((1,), self.c_rest)
+        rest = self.c_rest
+        if isinstance(rest, Tensor) or rest:
+            outside = flat - read @ inputs.mT
+            if not isinstance(rest, Tensor):
+                rest = self.c.new_full((1,), rest)
             found = found + self._along(outside, strength, rest, factor)
-        found_weight = found[:, :width].reshape(weight.shape)
-        return found_weight, None if bias is None else found[:, width]
+        found_weight = found[..., :width].reshape(weight.shape)
+        return found_weight, None if bias is None else found[..., width]
 
     def _along(
         self, read: Tensor, strength: float, c: Tensor, factor: Callable[[Tensor], Tensor]
@@ -120,13 +125,30 @@ class Curvature:
         """A displacement [o, k] along inputs of curvature c [k] or [1], weighed per output."""
         # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
         # least; along the stored ones the rest is added.
-        floor = factor(strength * (self.g_rest + self.damping) * c)
-        shares = factor(strength * torch.outer(self.g + self.damping, c))  # [m, k] or [m, 1]
+        floor = factor(strength * (self.g_rest + self.damping) * c)[..., None, :]
+        damped = self.g + self.damping
+        shares = factor(strength * (damped[..., :, None] * c[..., None, :]))  # [m, k] or [m, 1]
         outputs = self.outputs.to(read.dtype)
-        stored = outputs.T @ read  # [m, k]
+        stored = outputs.mT @ read  # [m, k]
         if self.total is not None:
             stored = self.total(stored)
         return read * floor + outputs @ (stored * (shares - floor))
+
+
+def stacked(found: Sequence[Curvature]) -> Curvature:
+    """The curvature of several maps of one shape as one; a single one stays as it is."""
+    first = found[0]
+    if len(found) == 1:
+        return first
+    return Curvature(
+        inputs=joint.padded([one.inputs for one in found]),
+        outputs=joint.padded([one.outputs for one in found]),
+        c=joint.padded([one.c for one in found]),
+        g=joint.padded([one.g for one in found]),
+        damping=first.damping,
+        c_rest=joint.rests([float(one.c_rest) for one in found], first.c),
+        g_rest=joint.rests([float(one.g_rest) for one in found], first.g),
+    )
 
 
 def curvatures(

@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aegis_cli.core.nullspace import Pair
+from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 

@@ -7,7 +7,7 @@ threshold has A = C (C + s)^-1 instead, with C in shares of its trace.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core import joint
 from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum, rank
 
-Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
 Remembered = tuple[Tensor | None, ...]  # what a protection keeps of a map's values
 
 
@@ -44,28 +45,35 @@ class Protection(Protocol):
 class Dense:
     """Protection of a linear map or convolution: A = U f U^T + r (1 - U U^T).
 
-    A itself [d, d] is never made.
+    A itself [d, d] is never made. Of n maps that are stacked (core/joint.py) every tensor has a
+    first dimension n more.
 
     Attributes:
         basis: U [d, k], orthonormal columns; d counts the bias's 1 if there is one.
         factor: f [k], what is removed along each of them, from 0 to 1.
-        rest: r, what is removed along every other direction.
+        rest: r, what is removed along every other direction; of stacked maps [n, 1], or 0 of all.
     """
 
     basis: Tensor
     factor: Tensor
-    rest: float = 0.0
+    rest: float | Tensor = 0.0
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        width = weight.flatten(1).shape[1]
-        along = self._along(weight, bias) * (self.factor - self.rest)
-        found = along @ self.basis.T  # [o, d]
-        protected = found[:, :width].reshape(weight.shape)
-        shifted = None if bias is None else found[:, width]
-        if self.rest:
-            protected = protected + self.rest * weight
-            shifted = None if bias is None else shifted + self.rest * bias
+        protected, shifted = self._back(
+            self._along(weight, bias) * (self.factor - self.rest)[..., None, :], weight, bias
+        )
+        rest = self.rest
+        if isinstance(rest, Tensor):
+            protected = protected + rest[..., None] * weight
+            shifted = None if bias is None else shifted + rest * bias
+        elif rest:
+            protected = protected + rest * weight
+            shifted = None if bias is None else shifted + rest * bias
         return protected, shifted
+
+    def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
+        """What `hold` takes out of the values, in their shapes."""
+        return self._back(self._lost(weight, bias, before), weight, bias)
 
     def of_rows(self, rows: slice) -> Dense:
         return self
@@ -78,9 +86,7 @@ class Dense:
 
         To know what has changed along them would take the whole of the values before.
         """
-        (known,) = before
-        assert known is not None
-        removed = (self._along(weight, bias) - known) * self.factor  # [o, k]
+        removed = self._lost(weight, bias, before)  # [o, k]
         width = weight.flatten(1).shape[1]
         if weight.is_contiguous():
             weight.view(len(weight), -1).addmm_(removed, self.basis[:width].T, alpha=-1)
@@ -91,13 +97,28 @@ class Dense:
 
     def _along(self, weight: Tensor, bias: Tensor | None) -> Tensor:
         """The coordinates [o, k] of a weight and a bias along the directions."""
-        flat = weight.flatten(1)
-        width = flat.shape[1]
-        along = flat @ self.basis[:width]
-        if bias is not None:
-            # The bias is the weight of an input that is always 1, whose row of U is the last.
-            along = along.addr(bias, self.basis[width])
-        return along
+        flat = weight.flatten(self.factor.ndim)
+        width = flat.shape[-1]
+        along = flat @ self.basis[..., :width, :]
+        if bias is None:
+            return along
+        # The bias is the weight of an input that is always 1, whose row of U is the last.
+        if along.ndim == 2:
+            return along.addr(bias, self.basis[width])
+        return along.addcmul(bias[..., None], self.basis[..., width:, :])
+
+    def _lost(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Tensor:
+        """The coordinates [o, k] of the protected part of what has changed since `remember`."""
+        (known,) = before
+        assert known is not None
+        return (self._along(weight, bias) - known) * self.factor[..., None, :]
+
+    def _back(self, along: Tensor, weight: Tensor, bias: Tensor | None) -> Pair:
+        """Coordinates [o, k] as a weight and a bias, in the shapes of these."""
+        found = along @ self.basis.mT  # [o, d]
+        if bias is None:
+            return found.reshape(weight.shape), None
+        return found[..., :-1].reshape(weight.shape), found[..., -1]
 
 
 @dataclass(frozen=True)
@@ -105,15 +126,22 @@ class Elementwise:
     """Protection of a normalisation, channel by channel.
 
     Attributes:
-        inside: [D, m, m], A of each channel's (scale, shift) for m = 2, or scale for m = 1.
+        inside: [D, m, m], A of each channel's (scale, shift) for m = 2, or scale for m = 1; of n
+            stacked normalisations [n, D, m, m].
     """
 
     inside: Tensor
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        both = weight[:, None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
+        both = weight[..., None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
         found = (self.inside @ both[..., None])[..., 0]
-        return found[:, 0], None if bias is None else found[:, 1]
+        return found[..., 0], None if bias is None else found[..., 1]
+
+    def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
+        """What `hold` takes out of the values, in their shapes."""
+        old_weight, old_bias = before
+        assert old_weight is not None
+        return self.removed(*minus((weight, bias), (old_weight, old_bias)))
 
     def of_rows(self, rows: slice) -> Elementwise:
         return Elementwise(self.inside[rows])
@@ -122,9 +150,7 @@ class Elementwise:
         return copied((weight, bias))
 
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
-        old_weight, old_bias = before
-        assert old_weight is not None
-        of_weight, of_bias = self.removed(*minus((weight, bias), (old_weight, old_bias)))
+        of_weight, of_bias = self.changed(weight, bias, before)
         weight.sub_(of_weight)
         if bias is not None:
             bias.sub_(of_bias)
@@ -275,6 +301,25 @@ def _leading(values: Tensor, energy: float) -> Tensor:
         return torch.zeros_like(values)
     last = values.flatten().sort(descending=True).values[count - 1]
     return (values >= last).to(values.dtype)
+
+
+def stacked(found: Sequence[Protection]) -> Protection:
+    """The protection of several maps, or normalisations, of one shape; a single one stays as it is.
+
+    Raises:
+        TypeError: tables, whose rows that are read are others in each.
+    """
+    if len(found) == 1:
+        return found[0]
+    dense = [one for one in found if isinstance(one, Dense)]
+    channels = [one for one in found if isinstance(one, Elementwise)]
+    if len(dense) == len(found):
+        factor = joint.padded([one.factor for one in dense])
+        rest = joint.rests([float(one.rest) for one in dense], factor)
+        return Dense(joint.padded([one.basis for one in dense]), factor, rest)
+    if len(channels) == len(found):
+        return Elementwise(torch.stack([one.inside for one in channels]))
+    raise TypeError("only maps or normalisations are stacked, not tables")
 
 
 # --- updates --------------------------------------------------------------------------------------

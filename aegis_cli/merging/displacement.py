@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import torch
 
-from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.joint import Pair
+from aegis_cli.core.nullspace import minus
 from aegis_cli.core.projection import dot
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.base import weights

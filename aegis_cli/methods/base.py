@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair
+from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import Combine
 from aegis_cli.data.batch import RobotBatch, Share
 

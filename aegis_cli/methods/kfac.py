@@ -26,14 +26,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
-from aegis_cli.core import curvature
-from aegis_cli.core.nullspace import Pair, copied_small, minus
+from aegis_cli.core import curvature, joint
+from aegis_cli.core.curvature import Curvature
+from aegis_cli.core.joint import Pair
+from aegis_cli.core.nullspace import copied_small, minus
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
@@ -72,7 +76,7 @@ def start(setting: Setting) -> Parts:
     if owners.several:
         for site, pair in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
-    origin = {site: copied_small(pair_here(pair)) for site, pair in maps.items()}
+    together = _grouped(maps, found, owners)
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -82,23 +86,64 @@ def start(setting: Setting) -> Parts:
         if growth:
             # A schedule may end at a rate of 0.
             strength /= max(update.rate_left, _LEAST_RATE) ** growth
-        for site, now in maps.items():
-            here = pair_here(now)
-            _take(here, found[site].excess(*minus(here, origin[site]), strength))
+        for group in together:
+            joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
 
     @torch.no_grad()
     def pull() -> None:
-        for site, now in maps.items():
-            added = found[site].gradient(*minus(pair_here(now), origin[site]), weight)
-            for tensor, by in zip(now, added, strict=True):
-                # Without a gradient it has not moved.
-                if tensor is not None and tensor.grad is not None and by is not None:
-                    rows_here(tensor.grad).add_(by)
+        for group in together:
+            added = group.curvature.gradient(*group.moved(), weight)
+            for now, parts in zip(group.maps, joint.apart(added, group.here()), strict=True):
+                for tensor, by in zip(now, parts, strict=True):
+                    # Without a gradient it has not moved.
+                    if tensor is not None and tensor.grad is not None and by is not None:
+                        rows_here(tensor.grad).add_(by)
 
     if options["step"] == "gradient":
         return Parts(shares=slowed, pull=pull)
     # It compares with the start, not with the step before, so no step's weights are copied.
     return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Maps that are drawn back by one computation: one map, or on a GPU several of one shape.
+
+    Attributes:
+        origin: the weights and biases that they began with, stacked as `curvature` is.
+    """
+
+    maps: Sequence[Pair]
+    origin: Pair
+    curvature: Curvature
+
+    def here(self) -> list[Pair]:
+        """The rows of each that this process has."""
+        return [pair_here(pair) for pair in self.maps]
+
+    def moved(self) -> Pair:
+        """How far they are from where they began, stacked."""
+        return minus(joint.stacked(self.here()), self.origin)
+
+
+def _grouped(
+    maps: Mapping[str, Pair], found: Mapping[str, Curvature], owners: Ranks
+) -> list[_Group]:
+    """The maps in groups, of one each where products do not wait for being started."""
+
+    def size(site: str) -> tuple[int, int]:
+        return maps[site][0].numel(), found[site].inputs.shape[-1]
+
+    sites = [[site] for site in maps]
+    if not owners.several and any(devices.reading_waits(pair[0].device) for pair in maps.values()):
+        sites = joint.groups(maps, lambda site: joint.kind_of(maps[site]), size)
+    groups = []
+    for names in sites:
+        own = [maps[name] for name in names]
+        now = joint.stacked([pair_here(pair) for pair in own])
+        curved = curvature.stacked([found[name] for name in names])
+        groups.append(_Group(own, copied_small(now), curved))
+    return groups
 
 
 def shares(
@@ -111,7 +156,7 @@ def shares(
     tensors [], which nobody reads.
     """
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
-    found_squares = owners.total(torch.stack([_squares(tensors) for tensors in learning]))
+    found_squares = owners.total(_squares(learning))
     entries = [sum(t.numel() for t in tensors) for tensors in learning]
     if devices.reading_waits(found_squares.device):
         return _unread_shares(learning, found_squares, entries, balance)
@@ -140,19 +185,23 @@ def _unread_shares(
     return shares
 
 
-def _squares(tensors: list[Tensor]) -> Tensor:
-    """Sum of their squared gradients, float64."""
-    gradients = [rows_here(t.grad) for t in tensors if t.grad is not None]
-    norms = [torch.linalg.vector_norm(gradient).double() for gradient in gradients]
-    if not norms:
-        return torch.zeros((), dtype=torch.float64, device=tensors[0].device)
-    return torch.stack(norms).square().sum()
-
-
-def _take(now: Pair, excess: Pair) -> None:
-    for tensor, by in zip(now, excess, strict=True):
-        if tensor is not None and by is not None:
-            tensor.data.sub_(by)
+def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
+    """Sum of the squared gradients of each map's tensors, two at most, [maps] float64."""
+    like = maps[0][0]
+    places, gradients = [], []
+    for number, tensors in enumerate(maps):
+        for part, tensor in enumerate(tensors):
+            if tensor.grad is not None:
+                places.append(2 * number + part)
+                gradients.append(rows_here(tensor.grad))
+    norms = [torch.zeros((), device=like.device)] * (2 * len(maps))
+    # All in few kernels, where a GPU would start thousands.
+    found = torch._foreach_norm(gradients) if gradients else ()
+    for place, norm in zip(places, found, strict=True):
+        norms[place] = norm
+    widest = reduce(torch.promote_types, (norm.dtype for norm in norms))
+    both = torch.stack([norm.to(widest) for norm in norms]).double()
+    return both.view(-1, 2).square().sum(1)
 
 
 METHOD = Method(

@@ -17,14 +17,17 @@ leaves free what no stored direction holds, of which `soft` takes a small share 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+from aegis_cli.common import devices
 from aegis_cli.common.ranks import rows_here
-from aegis_cli.core import nullspace
-from aegis_cli.core.nullspace import Pair, Protection, Remembered, Strength
+from aegis_cli.core import joint, nullspace
+from aegis_cli.core.joint import Pair
+from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Rows, Strength
 from aegis_cli.methods.base import Method, Parts, Setting, Update, pair_here, train_all, weights
 
 
@@ -44,37 +47,107 @@ def start(setting: Setting) -> Parts:
         # Every row is projected by itself, so that sharded weights need nothing of each other.
         for site, like in likes.items():
             protections[site] = protections[site].of_rows(setting.owners.rows(len(like)))
-    backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
+    groups = _grouped(setting.backbone, protections, setting.owners.several)
     if options["keeps"] == "coordinates":
-        return _by_coordinates(backbone, protections, options["every"])
+        return _by_coordinates(groups, options["every"])
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        for site, protection in protections.items():
-            now = weights(backbone, site)
-            _project(pair_here(now), pair_here(_before(site, now, update)), protection)
+        for group in groups:
+            group.project(update)
 
     return Parts(constrain=constrain, every=options["every"])
 
 
-def _by_coordinates(
-    backbone: nn.Module, protections: Mapping[str, Protection], every: int
-) -> Parts:
+def _by_coordinates(groups: Sequence[_Group], every: int) -> Parts:
     """The method with coordinates of the weights before, in place of copies."""
     before: dict[str, Remembered] = {}
 
     @torch.no_grad()
     def begin() -> None:
-        for site, protection in protections.items():
-            before[site] = protection.remember(*pair_here(weights(backbone, site)))
+        for group in groups:
+            before[group.sites[0]] = group.protection.remember(*joint.stacked(group.here()))
 
     @torch.no_grad()
     def constrain(_: Update) -> None:
-        for site, protection in protections.items():
-            weight, bias = pair_here(weights(backbone, site))
-            protection.hold(weight.data, None if bias is None else bias.data, before.pop(site))
+        for group in groups:
+            group.hold(before.pop(group.sites[0]))
 
     return Parts(constrain=constrain, begin=begin, compares=False, every=every)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Sites that are projected by one computation: one site, or on a GPU several of one shape.
+
+    Attributes:
+        backbone: it, and not the setting, which would keep the whole anchor in memory.
+        protection: that of all of them, stacked.
+    """
+
+    backbone: nn.Module
+    sites: Sequence[str]
+    protection: Protection
+
+    def pairs(self) -> list[Pair]:
+        return [weights(self.backbone, site) for site in self.sites]
+
+    def here(self) -> list[Pair]:
+        """The rows of each that this process has."""
+        return [pair_here(pair) for pair in self.pairs()]
+
+    def project(self, update: Update) -> None:
+        """Take the protected part of an update out of the weights."""
+        before = [
+            pair_here(_before(site, pair, update))
+            for site, pair in zip(self.sites, self.pairs(), strict=True)
+        ]
+        if len(self.sites) == 1:
+            _project(self.here()[0], before[0], self.protection)
+            return
+        moved = nullspace.minus(joint.stacked(self.here()), joint.stacked(before))
+        joint.subtract(self.here(), self.protection.removed(*moved))
+
+    def hold(self, before: Remembered) -> None:
+        """Take what has changed along the protected directions out of the weights."""
+        here = self.here()
+        if len(here) == 1:
+            weight, bias = here[0]
+            self.protection.hold(weight.data, None if bias is None else bias.data, before)
+            return
+        assert isinstance(self.protection, Dense | Elementwise)
+        joint.subtract(here, self.protection.changed(*joint.stacked(here), before))
+
+
+def _grouped(
+    backbone: nn.Module, protections: Mapping[str, Protection], rows: bool
+) -> list[_Group]:
+    """The sites in groups, of one each where products do not wait for being started.
+
+    Args:
+        rows: whether this process has only some rows of each weight.
+    """
+    pairs = {site: weights(backbone, site) for site in protections}
+
+    def kind(site: str) -> Hashable:
+        protection = protections[site]
+        # Each table has rows of its own that are read.
+        return (
+            site if isinstance(protection, Rows) else (type(protection), joint.kind_of(pairs[site]))
+        )
+
+    def size(site: str) -> tuple[int, int]:
+        protection = protections[site]
+        directions = len(protection.factor) if isinstance(protection, Dense) else 0
+        return pairs[site][0].numel(), directions
+
+    sites = [[site] for site in protections]
+    if not rows and any(devices.reading_waits(weight.device) for weight, _ in pairs.values()):
+        sites = joint.groups(protections, kind, size)
+    return [
+        _Group(backbone, names, nullspace.stacked([protections[name] for name in names]))
+        for names in sites
+    ]
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:

@@ -486,11 +486,29 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
     shares = {} if still or run.parts.shares is None else run.parts.shares()
     for group in run.rates:
         group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
-        group["lr"] = group["rate"] * shares.get(group["params"][0], 1.0)
+    for group, rate in zip(run.rates, _rates(run, shares), strict=True):
+        group["lr"] = rate
         if eight_bit.is_marked(group):
             group["lr"] = float(group["lr"])  # its kernel takes no tensor
     for optimizer in run.optimizers:
         optimizer.step()
+
+
+def _rates(run: TrainingRun, shares: Mapping[Tensor, float | Tensor]) -> list[float | Tensor]:
+    """The learning rate of each group of parameters, of which a method may leave a share."""
+    found: list[float | Tensor] = [group["rate"] for group in run.rates]
+    left = [shares.get(group["params"][0], 1.0) for group in run.rates]
+    unread = {index: share for index, share in enumerate(left) if isinstance(share, Tensor)}
+    if unread:
+        # One kernel for all of them.
+        rates = [run.rates[index]["rate"] for index in unread]
+        scaled = torch._foreach_mul(list(unread.values()), rates)
+        for index, rate in zip(unread, scaled, strict=True):
+            found[index] = rate
+    for index, share in enumerate(left):
+        if index not in unread:
+            found[index] *= share
+    return found
 
 
 def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:

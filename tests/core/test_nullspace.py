@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair, Protection, Strength, allowed, minus, protect
+from aegis_cli.core.joint import Pair
+from aegis_cli.core.nullspace import Protection, Strength, allowed, minus, protect
 from aegis_cli.core.spectrum import (
     Spectrum,
     channel_moment,
