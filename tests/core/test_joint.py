@@ -1,0 +1,154 @@
+"""Maps of one shape, treated as one: each gets what it would get by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from aegis_cli.core import curvature, joint, nullspace
+from aegis_cli.core.curvature import Curvature
+from aegis_cli.core.joint import Pair
+from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Rows
+
+pytestmark = pytest.mark.usefixtures("fixed_draws")
+
+OUT = 4
+SHAPES = [(OUT, 5), (OUT, 2, 3, 3)]
+# How many directions each of the maps has, those that were never resolved aside.
+RANKS = [(3,), (2, 5), (5, 1, 3)]
+
+
+def draw(*shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def pairs(count: int, shape: Sequence[int], biased: bool) -> list[Pair]:
+    return [(draw(*shape), draw(shape[0]) if biased else None) for _ in range(count)]
+
+
+def width(shape: Sequence[int], biased: bool) -> int:
+    return torch.Size(shape[1:]).numel() + biased
+
+
+def columns(size: int, count: int) -> Tensor:
+    return torch.linalg.qr(draw(size, size)).Q[:, :count]
+
+
+def curved(size: int, rank: int, rest: float) -> Curvature:
+    outputs = min(rank, OUT)
+    return Curvature(
+        inputs=columns(size, rank),
+        outputs=columns(OUT, outputs),
+        c=draw(rank).abs(),
+        g=draw(outputs).abs(),
+        damping=0.3,
+        c_rest=rest,
+        g_rest=rest,
+    )
+
+
+def assert_same(found: Sequence[Pair], expected: Sequence[Pair]) -> None:
+    for ours, theirs in zip(found, expected, strict=True):
+        for x, y in zip(ours, theirs, strict=True):
+            assert (x is None) == (y is None)
+            if x is not None and y is not None:
+                torch.testing.assert_close(x, y, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("biased", [True, False])
+@pytest.mark.parametrize("ranks", RANKS)
+@pytest.mark.parametrize("rests", ["none", "one", "all"])
+def test_stacked_curvatures_take_what_each_takes(
+    shape: tuple[int, ...], biased: bool, ranks: tuple[int, ...], rests: str
+) -> None:
+    left = {"none": [0.0] * 3, "one": [0.0, 0.2, 0.0], "all": [0.1, 0.2, 0.3]}[rests]
+    size = width(shape, biased)
+    each = [curved(size, rank, rest) for rank, rest in zip(ranks, left, strict=False)]
+    moved = pairs(len(ranks), shape, biased)
+    together = curvature.stacked(each)
+    for name in ("excess", "gradient"):
+        found = getattr(together, name)(*joint.stacked(moved), 0.7)
+        alone = [getattr(one, name)(*pair, 0.7) for one, pair in zip(each, moved, strict=True)]
+        assert_same(joint.apart(found, moved), alone)
+
+
+def dense(size: int, rank: int, rest: float) -> Protection:
+    return Dense(columns(size, rank), torch.rand(rank, dtype=torch.float64), rest)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("biased", [True, False])
+@pytest.mark.parametrize("ranks", RANKS)
+@pytest.mark.parametrize("rest", [0.0, 0.2])
+def test_stacked_maps_are_protected_as_each_is(
+    shape: tuple[int, ...], biased: bool, ranks: tuple[int, ...], rest: float
+) -> None:
+    size = width(shape, biased)
+    each = [dense(size, rank, rest * number) for number, rank in enumerate(ranks)]
+    check_protection(each, pairs(len(ranks), shape, biased), pairs(len(ranks), shape, biased))
+
+
+@pytest.mark.parametrize("biased", [True, False])
+@pytest.mark.parametrize("count", [1, 3])
+def test_stacked_normalisations_are_protected_as_each_is(count: int, biased: bool) -> None:
+    parts = 1 + biased
+    each = [Elementwise(draw(OUT, parts, parts)) for _ in range(count)]
+    check_protection(each, pairs(count, (OUT,), biased), pairs(count, (OUT,), biased))
+
+
+def check_protection(
+    each: Sequence[Protection], now: Sequence[Pair], before: Sequence[Pair]
+) -> None:
+    together = nullspace.stacked(each)
+    removed = together.removed(*joint.stacked(now))
+    alone = [one.removed(*pair) for one, pair in zip(each, now, strict=True)]
+    assert_same(joint.apart(removed, now), alone)
+
+    held = []
+    for one, pair, old in zip(each, now, before, strict=True):
+        held.append(nullspace.copied(pair))
+        one.hold(*held[-1], one.remember(*old))
+    assert isinstance(together, Dense | Elementwise)
+    remembered = together.remember(*joint.stacked(before))
+    joint.subtract(now, together.changed(*joint.stacked(now), remembered))
+    assert_same(now, held)
+
+
+def test_tables_are_not_stacked() -> None:
+    with pytest.raises(TypeError, match="not tables"):
+        nullspace.stacked([Rows(torch.ones(2, dtype=torch.bool))] * 2)
+
+
+def test_a_lone_map_is_left_as_it_is() -> None:
+    one, pair = curved(5, 2, 0.1), (draw(OUT, 5), None)
+    assert curvature.stacked([one]) is one and joint.stacked([pair]) is pair
+
+
+@given(
+    sizes=st.dictionaries(
+        st.text(min_size=1), st.tuples(st.integers(1, 50), st.integers(0, 9)), max_size=20
+    ),
+    kinds=st.integers(1, 4),
+    most=st.integers(1, 120),
+)
+def test_groups_have_each_site_once_and_one_kind_and_no_more_than_they_may(
+    sizes: dict[str, tuple[int, int]], kinds: int, most: int
+) -> None:
+    def kind(site: str) -> int:
+        return len(site) % kinds
+
+    found = joint.groups(sizes, kind, sizes.__getitem__, most)
+    assert sorted(site for group in found for site in group) == sorted(sizes)
+    for group in found:
+        assert len({kind(site) for site in group}) == 1
+        assert len(group) == 1 or sum(sizes[site][0] for site in group) <= most
+    for a, b in zip(found, found[1:], strict=False):
+        # None is begun before the last one of its kind is full.
+        if kind(a[0]) == kind(b[0]):
+            assert sum(sizes[site][0] for site in (*a, b[0])) > most
