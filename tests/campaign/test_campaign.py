@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from samples.command import ROOT, finding
 
-ROOT = Path(__file__).parent.parent.parent
 pytestmark = pytest.mark.campaign
 
 
@@ -19,11 +18,10 @@ def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> 
     counts = ("--mutations", "150", "--kills", "5", "--troubles", "16")
     state = tmp_path / "state.jsonl"
     command = [sys.executable, "-m", "tests.campaign", *counts, "--state", str(state)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [*command, "--scratch", str(tmp_path)],
         cwd=ROOT,
-        env=environment,
+        env=finding(ROOT),
         capture_output=True,
         text=True,
         check=False,

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from samples.command import ROOT, refused
+from samples.command import ROOT, finding, refused
 from samples.disk import disk
 from samples.user_folder import TRAIN, leftovers, snapshot, training
 
@@ -163,7 +163,7 @@ def interrupted(
         process = subprocess.Popen(
             command,
             cwd=place,
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            env=finding(ROOT),
             stdout=err,
             stderr=err,
             start_new_session=True,

@@ -9,7 +9,6 @@ import contextlib
 import errno
 import importlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from typing import Any
 import pytest
 import torch
 import typer
-from samples.command import ROOT, python, refused
+from samples.command import ROOT, finding, python, refused
 
 from aegis_cli.cli import render, stages
 from aegis_cli.cli.app import app
@@ -427,7 +426,7 @@ def test_closed_streams_change_no_exit_code(closed: str, tmp_path: Path):
     """A refused command exits with 2, whoever reads it: 1 would be a failed gate."""
     command = f"'{sys.executable}' -m aegis_cli inspect nothing.safetensors {closed}"
     shell = ["bash", "-o", "pipefail", "-c", command]
-    done = subprocess.run(shell, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    done = subprocess.run(shell, cwd=tmp_path, env=finding(ROOT))
     assert done.returncode == 2
 
 
@@ -435,16 +434,15 @@ def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
     """`true` reads nothing, and ends before there is a report."""
     command = f"'{sys.executable}' -m aegis_cli inspect embedded | true"
     shell = ["bash", "-o", "pipefail", "-c", command]
-    done = subprocess.run(
-        shell, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
-    )
+    done = subprocess.run(shell, cwd=tmp_path, env=finding(ROOT), capture_output=True)
     assert (done.returncode, done.stderr) == (141, b"")
 
 
 def buffered() -> dict[str, str]:
     """An environment in which Python gathers what it writes, as it does for users."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    return kept | {"PYTHONPATH": str(ROOT)}
+    kept = finding(ROOT)
+    kept.pop("PYTHONUNBUFFERED", None)
+    return kept
 
 
 # Reports shorter than what Python gathers before it writes, and longer ones.
@@ -492,8 +490,7 @@ app.Commands.{moment} = interrupted
 app.main()
 """
     command = [sys.executable, "-c", code, "doctor"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True)
+    done = subprocess.run(command, cwd=tmp_path, env=finding(ROOT), capture_output=True)
     assert (done.returncode, done.stderr) == (130, b"")
 
 

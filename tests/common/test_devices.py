@@ -16,6 +16,12 @@ from aegis_cli.common.errors import AegisError
 Aegis = Callable[..., tuple[int, str, str]]
 
 
+@pytest.fixture(autouse=True)
+def none_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No device, unlike in other tests, which are all on the CPU."""
+    monkeypatch.delenv(devices.VARIABLE, raising=False)
+
+
 @pytest.fixture
 def two_gpus(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """What torch says on a machine with two; the list has what was made the current one."""

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import mujoco
 import pytest
+from samples.command import ROOT, finding
 
 from aegis_cli.common import gl
 from aegis_cli.common.errors import AegisError
-
-ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.fixture
@@ -149,7 +148,7 @@ def test_the_command_says_so_before_any_work(
     code: str, args: tuple[str, ...], setting: str, words: str, tmp_path: Path
 ) -> None:
     command = [sys.executable, "-c", code, *args]
-    environment = os.environ | {"MUJOCO_GL": setting, "PYTHONPATH": str(ROOT)}
+    environment = finding(ROOT) | {"MUJOCO_GL": setting}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (result.returncode, result.stdout) == (2, ""), result.stderr
     assert words in result.stderr and "Traceback" not in result.stderr
@@ -164,7 +163,7 @@ def test_triton_comes_before_the_renderer(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", "import aegis_cli.sim.scene"],
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        env=finding(tmp_path),
         capture_output=True,
         text=True,
     )

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from samples.command import ROOT
+from samples.command import ROOT, finding
 
 from aegis_cli.common import locks
 from aegis_cli.common.errors import AegisError
@@ -25,12 +25,11 @@ TESTS = Path(__file__).parent.parent
 @contextmanager
 def another(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that holds the folder."""
-    paths = {"PYTHONPATH": f"{ROOT}{os.pathsep}{TESTS}"}
     process = subprocess.Popen(
         [sys.executable, "-m", "samples.workers", "hold", str(folder)],
         stdout=subprocess.PIPE,
         text=True,
-        env=os.environ | paths,
+        env=finding(ROOT, TESTS),
     )
     try:
         assert process.stdout is not None and process.stdout.readline() == "held\n"

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from samples.command import ROOT
+from samples.command import ROOT, finding
 from samples.workers import keep_while_at_work
 
 from aegis_cli.common import processes
@@ -63,7 +63,7 @@ def test_a_script_that_every_worker_would_run_again_is_told_so(
     done = subprocess.run(
         [sys.executable, script],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=finding(ROOT),
         capture_output=True,
         text=True,
     )
@@ -95,9 +95,8 @@ def test_a_worker_that_is_stopped_cleans_up(tmp_path: Path) -> None:
 def test_workers_end_with_their_parent_and_clean_up(tmp_path: Path, number: int) -> None:
     """Whatever ends it: a SIGKILL cannot be noticed by the parent, but by the worker."""
     file = tmp_path / "temporary"
-    paths = {"PYTHONPATH": f"{ROOT}{os.pathsep}{TESTS}"}
     parent = subprocess.Popen(
-        [sys.executable, "-m", "samples.workers", "employ", str(file)], env=os.environ | paths
+        [sys.executable, "-m", "samples.workers", "employ", str(file)], env=finding(ROOT, TESTS)
     )
     worker = await_worker(file)
     assert Path(f"/proc/{worker}").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -10,6 +9,7 @@ import sys
 from pathlib import Path
 
 import aegis_cli
+from samples.command import finding
 
 _SOURCE = Path(aegis_cli.__file__).parent
 
@@ -36,7 +36,7 @@ def run(package: Path, *arguments: str | Path) -> subprocess.CompletedProcess[st
     return subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=package.parent,
-        env={**os.environ, "PYTHONPATH": str(package.parent)},
+        env=finding(package.parent),
         capture_output=True,
         text=True,
         check=False,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file
-from samples.command import ROOT
+from samples.command import ROOT, finding
 from samples.second_device import NAME, POSSIBLE
 from samples.training_runs import SETTINGS, TIMES, metrics
 
@@ -89,8 +88,7 @@ def run(folder: Path, jobs: dict[str, list[str]], written: Recipe, device: str) 
         [sys.executable, "-m", "samples.second_device", "jobs.json", device],
         cwd=folder,
         env={
-            **os.environ,
-            "PYTHONPATH": f"{ROOT}{os.pathsep}{TESTS}",
+            **finding(ROOT, TESTS),
             "OMP_NUM_THREADS": "1",
             devices.VARIABLE: "cuda" if device == "cuda" else "cpu",
         },

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).parent.parent.parent
+from samples.command import ROOT, finding
 
 
 def test_memory_does_not_grow_with_the_steps() -> None:
     """The ledger of 300 steps is 60 KB; a step that kept its batch would show as 100 KB each."""
     command = [sys.executable, "-m", "tests.campaign.growth", "--steps", "300", "--points", "3"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        command, cwd=ROOT, env=finding(ROOT), capture_output=True, text=True, check=True
     )
     said = dict(line.split() for line in done.stdout.splitlines())
     sizes = [int(size) for name, size in said.items() if name != "ledger"]
