@@ -43,6 +43,8 @@ class KnownParameters:
         Raises:
             AegisError: parameters were sharded, replaced, added or resized.
         """
+        if self._unchanged():
+            return
         self._refuse_sharded()
         learning = structure.learning(self._model)
         unknown = [name for name, p in learning.items() if id(p) not in self._known]
@@ -61,6 +63,30 @@ class KnownParameters:
                 _SHARDED,
                 "train without FSDP or ZeRO",
             )
+
+    def _unchanged(self) -> bool:
+        """Whether all that learns is what it was, seen without a name of anything.
+
+        It is asked at every step, and names of a thousand modules take milliseconds.
+        """
+        sharding = () if self._may_shard else _sharding_modules()
+        waiting: list[nn.Module] = [self._model]
+        seen: set[int] = set()
+        while waiting:
+            module = waiting.pop()
+            if id(module) in seen:
+                continue
+            seen.add(id(module))
+            if isinstance(module, sharding):
+                return False
+            for parameter in module._parameters.values():
+                if parameter is None or not parameter.requires_grad:
+                    continue
+                known = self._known.get(id(parameter))
+                if known is None or parameter.shape != known[1]:
+                    return False
+            waiting += [part for part in module._modules.values() if part is not None]
+        return True
 
     def _refuse_sharded(self) -> None:
         if not self._may_shard:
@@ -108,16 +134,21 @@ def sharded(model: nn.Module) -> list[str]:
     Neither class can occur where its module was not imported, so that nothing is imported here.
     """
     tensors = sys.modules.get("torch.distributed.tensor")
-    fsdp = sys.modules.get("torch.distributed.fsdp")
     found = []
     if tensors is not None:
         found += [name for name, p in model.named_parameters() if isinstance(p, tensors.DTensor)]
-    if fsdp is not None and not found:
-        kinds = (fsdp.FSDPModule, fsdp.FullyShardedDataParallel)
+    kinds = _sharding_modules()
+    if kinds and not found:
         found += [
             name or "the model" for name, part in model.named_modules() if isinstance(part, kinds)
         ]
     return found
+
+
+def _sharding_modules() -> tuple[type, ...]:
+    """What FSDP makes of a module that it shards; nothing where it was not imported."""
+    fsdp = sys.modules.get("torch.distributed.fsdp")
+    return () if fsdp is None else (fsdp.FSDPModule, fsdp.FullyShardedDataParallel)
 
 
 def check_reached(parameters: Iterable[nn.Parameter]) -> None:

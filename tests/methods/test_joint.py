@@ -1,4 +1,4 @@
-"""`kfac` and `nullspace` where a device waits for products to be started: maps of one shape, at once.
+"""`kfac` and `nullspace` treat maps of one shape at once where to start a product takes longest.
 
 The choice is by the device; here the CPU is taken for such a one.
 """
@@ -27,7 +27,7 @@ LAYERS = ("a", "b", "c")
 
 
 class Toy(nn.Module):
-    """Three maps of one shape, one of which has no bias, two normalisations, a convolution, a row."""
+    """Three maps, one of them without a bias, two normalisations, a convolution and a lone row."""
 
     def __init__(self) -> None:
         super().__init__()
