@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common.ranks import rows_here
 from aegis_cli.methods.base import Parts, Update
 from aegis_cli.methods.known_parameters import KnownParameters
 from aegis_cli.models import structure
@@ -106,7 +105,5 @@ class Stepper:
         """The parameters' values by all their names, each copied once."""
         own = {id(p): p for p in self._learning.values()}
         copies = {one: torch.empty_like(p, requires_grad=False) for one, p in own.items()}
-        # All in few kernels, where a GPU would start one for each.
-        into = [rows_here(copy) for copy in copies.values()]
-        torch._foreach_copy_(into, [rows_here(p.detach()) for p in own.values()])
+        structure.copy_all(list(copies.values()), [p.detach() for p in own.values()])
         return {name: copies[id(p)] for name, p in self._learning.items()}

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.ranks import whole
+from aegis_cli.common.ranks import rows_here, whole
 from aegis_cli.models import wrappers
 from aegis_cli.models.wrappers import PlainNames, plain_names
 
@@ -391,13 +391,29 @@ def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Iterator[
     They must have no gradient, which is of a parameter's type.
     """
     own = [p.data for p in parameters]
-    for parameter in parameters:
-        parameter.data = parameter.data.to(dtype)
+    for parameter, values in zip(parameters, of_one_type(own, dtype), strict=True):
+        parameter.data = values
     try:
         yield
     finally:
         for parameter, values in zip(parameters, own, strict=True):
             parameter.data = values
+
+
+@torch.no_grad()
+def of_one_type(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    """Copies in a type, or the tensor itself where it has that; a GPU makes all in few kernels."""
+    found = [t if t.dtype == dtype else torch.empty_like(t, dtype=dtype) for t in tensors]
+    changed = [pair for pair in zip(found, tensors, strict=True) if pair[0] is not pair[1]]
+    copy_all([copy for copy, _ in changed], [tensor for _, tensor in changed])
+    return found
+
+
+@torch.no_grad()
+def copy_all(into: Sequence[Tensor], tensors: Sequence[Tensor]) -> None:
+    """Copy tensors into others, in few kernels where a GPU would else start one for each."""
+    if tensors:
+        torch._foreach_copy_([rows_here(t) for t in into], [rows_here(t) for t in tensors])
 
 
 def widest(parameters: Iterable[Tensor]) -> torch.dtype:

@@ -80,8 +80,10 @@ class Masters:
                 yield
             finally:
                 found = _taken(self._parameters)
+        present = [gradient for gradient in found if gradient is not None]
+        wide = iter(structure.of_one_type(present, torch.float32))
         for parameter, known, new in zip(self._parameters, before, found, strict=True):
-            parameter.grad = _sum(known, new)
+            parameter.grad = _sum(known, None if new is None else next(wide))
 
     def wide(self, gradients: Mapping[int, Tensor | None]) -> Mapping[int, Tensor | None]:
         """Gradients of the block that do not lie in `.grad`, in float32 too."""
@@ -100,10 +102,10 @@ def _taken(parameters: Iterable[nn.Parameter]) -> list[Tensor | None]:
 
 
 def _sum(known: Tensor | None, found: Tensor | None) -> Tensor | None:
-    """A gradient in float32 and one in bfloat16, as far as there are any."""
-    if found is None:
-        return known
-    return found.float() if known is None else known.add_(found)
+    """The sum of two gradients, as far as there are any."""
+    if found is None or known is None:
+        return found if known is None else known
+    return known.add_(found)
 
 
 NONE = Masters()
