@@ -161,6 +161,7 @@ def _on_questions(
     backbone: str, settings: Settings, out: Path, on_event: OnEvent, ranks: Ranks
 ) -> _Measured:
     source = sets.read(settings.vqa, settings.skip_bad, on_event, settings.ask)
+    files.check_utf8(out, "choose another --out")
     files.check_writable(out)
     files.check_apart("--out", out, [*source.files, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())
@@ -192,6 +193,7 @@ def _on_frames(
 ) -> _Measured:
     """The moments of frames of episodes, drawn without repetition, with their instructions."""
     demos = _check_frames(settings, demos)
+    files.check_utf8(out, "choose another --out")
     files.check_writable(out)
     files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
     model = backbones.load(backbone).to(devices.pick())

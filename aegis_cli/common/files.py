@@ -16,6 +16,8 @@ from typing import Any, BinaryIO
 
 from aegis_cli.common.errors import AegisError
 
+# What to do about the path of an input that is no text.
+RENAME = "rename that file or folder"
 _ATTEMPTS = 100  # at a folder above which others come and go
 
 
@@ -150,6 +152,21 @@ def _special(path: Path) -> str | None:
         return None
     kinds = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a pipe"}
     return (kinds | {stat.S_IFSOCK: "a socket"}).get(stat.S_IFMT(mode))
+
+
+def check_utf8(path: str | Path, fix: str) -> None:
+    """Refuse a path whose bytes are no text.
+
+    safetensors, tokenizers and pyarrow take none, and what they say sounds like damage.
+
+    Raises:
+        AegisError: it is one.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        found = f"the path {str(path)!r}, whose bytes are not UTF-8"
+        raise AegisError(found, "a path in UTF-8", fix) from error
 
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical, parse_json, reading
+from aegis_cli.common.files import RENAME, canonical, check_utf8, parse_json, reading
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
@@ -90,13 +90,15 @@ def opened(
         framework: what its tensors are read as.
 
     Raises:
-        AegisError: it is missing, truncated or no safetensors file.
+        AegisError: it is missing, truncated or no safetensors file, or its path is no text
+            and its tensors are read for torch.
     """
     fix = rewrite(kind)
     try:
         with reading(path, fix), safe_open(path, framework=framework) as file:
             yield file
     except SafetensorError as error:
+        check_utf8(path, RENAME)
         problem = f"'{path}' is truncated or not a safetensors file ({error})"
         raise AegisError(problem, "a complete safetensors file", fix) from error
 

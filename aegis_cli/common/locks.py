@@ -29,9 +29,11 @@ def alone(folder: Path) -> Iterator[None]:
     removed again, with those above it that were made.
 
     Raises:
-        AegisError: another process is at it, or the folder cannot be made.
+        AegisError: another process is at it, the folder cannot be made, or nothing could be read
+            from it afterwards, because its path is no text.
     """
     folder = Path(folder)
+    files.check_utf8(folder, "choose another --out, or rename the folder")
     made, descriptor, beside = _locked(folder)
     try:
         yield

@@ -265,6 +265,7 @@ def _check_form(out: Path, form: str, as_video: bool, cameras: Sequence[str]) ->
             "the format that can hold video",
             "add --format lerobot",
         )
+    files.check_utf8(out, "choose another --out")
     files.check_writable(out)
 
 

@@ -19,7 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.common.files import make_folder, write_text
+from aegis_cli.common.files import check_utf8, make_folder, write_text
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
@@ -82,8 +82,7 @@ def run(
     refuse_stream(run)
     if os.path.lexists(out):  # a link that leads nowhere too
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
-    if not _is_utf8(out):
-        raise AegisError(f"{str(out)!r}", "a path in UTF-8", "choose another --out")
+    check_utf8(out, "choose another --out")
     if camera is not None and form != card.LEROBOT:
         raise AegisError(
             f"--camera {camera} with --format {form}",
@@ -121,15 +120,6 @@ def run(
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),
     )
-
-
-def _is_utf8(path: Path) -> bool:
-    """Whether a path's bytes are text, which safetensors and the card want."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:

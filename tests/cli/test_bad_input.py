@@ -5,6 +5,7 @@ Each ends with exit 2, one error that says what to do, and nothing half-written.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -124,6 +125,18 @@ def test_foreign_files(
 )
 def test_files_in_each_others_place(command: tuple[str, ...], bad: Callable[..., str]) -> None:
     bad(*command)
+
+
+@pytest.mark.parametrize("command", ["inspect", "probe", "rollout", "export"])
+def test_a_run_whose_path_is_no_text_is_told_so(
+    command: str, bad: Callable[..., str], trained: Path, place: Path
+) -> None:
+    """It is whole, and safetensors says that it is not."""
+    run = place / os.fsdecode(b"caf\xe9")
+    shutil.copytree(trained, run, symlinks=True)
+    out = ("--out", place / "policy") if command == "export" else ()
+    said = bad(command, run, *out, says=("caf\\udce9", "not UTF-8", "rename"))
+    assert "truncated" not in said and "train" not in said
 
 
 def test_a_checkpoint_that_lost_a_part(bad: Callable[..., str], trained: Path, place: Path) -> None:

@@ -6,6 +6,7 @@ There is one clear message, nothing half-written, and runs that go on.
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import signal
 import subprocess
@@ -24,6 +25,9 @@ from aegis_cli.cli import render
 from aegis_cli.common import artifacts, locks
 from aegis_cli.common.events import Progress
 from aegis_cli.training import train
+
+NO_TEXT = os.fsdecode(b"caf\xe9")  # a legal name in another encoding than UTF-8
+
 
 # --- where nothing can be written ----------------------------------------------------------------
 
@@ -91,6 +95,22 @@ def test_a_folder_where_a_file_is_to_be(
 ) -> None:
     (place / Path(command[-1]).name).mkdir()
     bad(*command, says=(Path(command[-1]).name,))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(outputs(NO_TEXT)[name] for name in ("demos", "anchor", "train", "pretrain", "run")),
+        ("demos", "point", "--episodes", "2", "--format", "lerobot", "--out", f"{NO_TEXT}/d"),
+    ],
+    ids=itertools.count(),
+)
+def test_a_path_that_is_no_text_is_refused_before_the_work(
+    command: tuple[str, ...], bad: Callable[..., str], place: Path
+) -> None:
+    """Nobody could read what would lie there."""
+    (place / NO_TEXT).mkdir()
+    bad(*command, says=("caf\\udce9", "not UTF-8", "choose another --out"))
 
 
 @pytest.mark.parametrize(("output", "free"), [("demos", 100_000), ("anchor", 1000)])

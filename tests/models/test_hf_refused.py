@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,12 @@ def test_a_hub_id_without_network(bad: Bad) -> None:
                 "--set backbone=MODEL",
             ),
         )
+
+
+def test_a_path_that_is_no_text_is_named_as_the_reason(model: Path, bad: Bad) -> None:
+    """Transformers finds no model there."""
+    moved = model.rename(model.with_name(os.fsdecode(b"caf\xe9")))
+    bad(*MEASURE, moved, says=("caf\\udce9", "not UTF-8", "rename"))
 
 
 def test_weights_that_a_repository_has_twice_are_fetched_once(

@@ -176,7 +176,8 @@ def read_info(folder: Path) -> Info:
     """What the dataset in `folder` is.
 
     Raises:
-        AegisError: no dataset, one of another version, or an `info.json` that is not sound.
+        AegisError: no dataset, one of another version, an `info.json` that is not sound, or a path
+            that is no text, which pyarrow does not take.
     """
     if not is_dataset(folder):
         raise AegisError(
@@ -184,6 +185,7 @@ def read_info(folder: Path) -> Info:
             f"a LeRobot dataset of {READ}",
             "give the folder that holds meta/ and data/",
         )
+    files.check_utf8(folder, files.RENAME)
     raw = files.load_json(folder / INFO)
     with damaged(folder / INFO):
         _check_version(folder, str(raw["codebase_version"]))

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.files import check_utf8
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -61,6 +62,7 @@ class Limits:
 def check_new(folder: Path) -> None:
     """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
     layout.require_pyarrow()
+    check_utf8(folder, "choose another --out")
     if not folder.name:  # it is written beside itself under another name
         raise AegisError(
             f"'{folder}', which names no folder", "a folder's name", "choose another --out"

@@ -27,10 +27,11 @@ def locate(name: str) -> Path:
             is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
-        AegisError: no such model.
+        AegisError: no such model, or one whose path is no text, which no reader of it takes.
     """
     name = name.partition("#")[0]
     if (here := _on_disk(name)) is not None:
+        files.check_utf8(here, files.RENAME)
         return here
     if not hub.is_local(name) and _has_transformers():
         return model_folder.fetch(name)

@@ -79,6 +79,12 @@ def test_a_folder_that_is_no_dataset(bad: Bad, place: Path) -> None:
     bad("inspect", "d", says=("LeRobot",))
 
 
+def test_a_path_that_is_no_text_is_not_called_damage(bad: Bad, folder: Path) -> None:
+    moved = folder.rename(folder.with_name(os.fsdecode(b"caf\xe9")))
+    for command in (training(demos=str(moved)), ("inspect", moved)):
+        assert "damaged" not in bad(*command, says=("caf\\udce9", "not UTF-8", "rename"))
+
+
 @pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d")])
 @pytest.mark.parametrize("missing", ["meta/info.json", "meta/tasks.parquet", EPISODES])
 def test_a_missing_meta_file(
