@@ -1243,6 +1243,7 @@ def main() -> None:
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
         render.write_any_character(getattr(sys, name))
+    render.name_errors(sys.stdout, render.STDOUT)
     # A fault in a library, or in memory whose file was cut meanwhile, says where it happened. Other
     # threads go on meanwhile, and to walk through their frames may be a fault of its own.
     faulthandler.enable(all_threads=False)

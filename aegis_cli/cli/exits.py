@@ -152,6 +152,12 @@ def _refused(error: OSError) -> AegisError:
 
     Examples are a name too long, or a folder that may not be looked into.
     """
+    if error.filename == render.STDOUT:
+        return AegisError(
+            f"{render.STDOUT} cannot be written: {error.strerror}",
+            "an output that takes what the command says",
+            "free space on the disk that it is sent to, or send it elsewhere",
+        )
     found = str(error) if error.filename is None else f"'{error.filename}': {error.strerror}"
     fix = "check the path, the permissions of its folders (ls -ld) and the space on its disk"
     return AegisError(found, "a path that can be used", fix)

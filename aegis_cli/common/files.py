@@ -18,6 +18,7 @@ from aegis_cli.common.errors import AegisError
 
 # What to do about the path of an input that is no text.
 RENAME = "rename that file or folder"
+_REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
 _ATTEMPTS = 100  # at a folder above which others come and go
 
 
@@ -76,7 +77,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         AegisError: `path` is there and no regular file, or it cannot be written.
     """
     path = _target(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f"{hidden(path)}.{os.getpid()}.tmp")
     try:
         _sweep(path)
         with open(temporary, "wb") as file:
@@ -95,6 +96,16 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             temporary.unlink()
 
 
+def hidden(path: Path) -> str:
+    """The beginning of the names that are used beside `path` until it is whole.
+
+    A long name is not repeated: with what is added it would be longer than a file system takes.
+    """
+    name = os.fsencode(path.name)
+    short = path.name if len(name) <= _REPEATED else hashlib.sha256(name).hexdigest()
+    return f".{short}"
+
+
 def _mark(file: BinaryIO) -> None:
     """Lock a file for as long as it is being written, where the file system can."""
     with contextlib.suppress(OSError):
@@ -103,7 +114,7 @@ def _mark(file: BinaryIO) -> None:
 
 def _sweep(path: Path) -> None:
     """Remove what processes have left that were killed while they wrote `path`."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+    for left in path.parent.glob(f"{glob.escape(hidden(path))}.*.tmp"):
         with contextlib.suppress(OSError), open(left, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while somebody writes it
             left.unlink()

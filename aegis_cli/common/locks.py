@@ -89,7 +89,7 @@ def _lock(descriptor: int, folder: Path) -> tuple[int, Path] | None:
             raise
     else:
         return None
-    beside = folder.resolve().with_name(f".{folder.resolve().name}.lock")
+    beside = folder.resolve().with_name(f"{files.hidden(folder.resolve())}.lock")
     while True:
         own = os.open(beside, os.O_RDWR | os.O_CREAT, 0o644)
         try:

@@ -334,13 +334,13 @@ def check_out(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise AegisError(f"'{out}' is not empty", "a new or empty folder", "choose another --out")
     files.make_folder(out.parent)
-    files.check_writable(out.parent / f"{out.name}.new")
+    files.check_writable(out.parent / f"{files.hidden(out)}.tmp")
 
 
 def _write_whole(out: Path, fill: Callable[[Path], None]) -> None:
     """Let `fill` write a folder aside, and rename it to `out`."""
     out = out.resolve()
-    aside = out.with_name(f".{out.name}.tmp")
+    aside = out.with_name(f"{files.hidden(out)}.tmp")
     try:
         with checkpoint.writing(out):
             shutil.rmtree(aside, ignore_errors=True)

@@ -19,7 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.common.files import check_utf8, make_folder, write_text
+from aegis_cli.common.files import check_utf8, hidden, make_folder, write_text
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
@@ -94,7 +94,7 @@ def run(
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
     with checkpoint.writing(out):
-        around = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".tmp", dir=out.parent))
+        around = Path(tempfile.mkdtemp(prefix=f"{hidden(out)}.", suffix=".tmp", dir=out.parent))
     aside = around / out.name
     try:
         with checkpoint.writing(out):

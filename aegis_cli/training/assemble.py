@@ -98,8 +98,8 @@ class TrainingRun:
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
         if it is not float32; `relative`, for each action the place of the position that it is
         predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
-        as the demonstrations say them; `dataset`, their id, and `base_model`, the backbone's, if
-        they come from the hub.
+        as the demonstrations say them; `dataset`, their id, and `base_model`, that of the model
+        that the backbone began as, if they come from the hub.
         """
         found = {
             "method": self.method.name,

@@ -73,12 +73,15 @@ files.write_atomically(Path(sys.argv[1]), write)
 """
 
 
-def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    path = tmp_path / "out [1].json"
+@pytest.mark.parametrize("name", ["out [1].json", "é" * 127 + "x"])
+def test_what_a_killed_process_left_is_removed_by_the_next(name: str, tmp_path: Path) -> None:
+    """Of a name too that is as long as a file system takes, 255 bytes."""
+    path = tmp_path / name
     command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGKILL"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
-    assert left.name.startswith(".out [1].json.")
+    assert left.name.startswith(".") and left.name.endswith(".tmp")
+    assert left.name.startswith(".out [1].json.") or name != "out [1].json"
     files.save_json(path, 1)
     assert list(tmp_path.iterdir()) == [path]
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from samples.command import ROOT, finding
 
-from aegis_cli.common import locks
+from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 
 TESTS = Path(__file__).parent.parent
@@ -119,8 +119,9 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     assert "file" in refused(tmp_path / "file" / "run")
 
 
+@pytest.mark.parametrize("name", ["run", "x" * 255])
 def test_where_folders_cannot_be_locked_a_file_beside_them_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on NFS. The file is gone with the lock."""
     real = fcntl.flock
@@ -131,9 +132,9 @@ def test_where_folders_cannot_be_locked_a_file_beside_them_is(
         real(descriptor, how)
 
     monkeypatch.setattr(locks.fcntl, "flock", flock)
-    folder = tmp_path / "run"
+    folder = tmp_path / name
     with locks.alone(folder):
-        assert {path.name for path in tmp_path.iterdir()} == {"run", ".run.lock"}
+        assert {path.name for path in tmp_path.iterdir()} == {name, f"{files.hidden(folder)}.lock"}
         assert f"process {os.getpid()} on" in refused(folder)
     assert list(tmp_path.iterdir()) == []
     with locks.alone(folder):

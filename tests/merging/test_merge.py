@@ -124,12 +124,15 @@ def test_a_checkpoint_can_be_merged_too(
     assert said["facts"]["steps"] == 4
 
 
+@pytest.mark.parametrize("name", ["merged", "x" * 255])
 def test_an_empty_folder_may_be_there(
-    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    name: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
 ) -> None:
-    (tmp_path / "merged").mkdir()
-    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
-    assert (last(tmp_path / "merged") / "backbone" / "model.safetensors").is_file()
+    """Its name may be as long as a file system takes."""
+    out = tmp_path / name
+    out.mkdir()
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
+    assert (last(out) / "backbone" / "model.safetensors").is_file()
 
 
 # --- weights --------------------------------------------------------------------------------------

@@ -172,6 +172,12 @@ def test_what_lies_beside_an_export_stays(run_folder: Path, tmp_path: Path) -> N
         export.run(run_folder, tmp_path / "link")
 
 
+def test_a_name_as_long_as_a_file_system_takes(run_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / ("x" * 255)
+    export.run(run_folder, out)
+    assert list(tmp_path.iterdir()) == [out] and (out / "model.safetensors").is_file()
+
+
 def test_a_name_that_is_no_text_is_refused(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(AegisError) as caught:
         export.run(run_folder, tmp_path / os.fsdecode(b"caf\xe9"))

@@ -199,6 +199,23 @@ def test_a_card_names_the_backbone_that_came_from_the_hub_and_no_folder(
             assert front.get("base_model") == (name if hosted else None)
 
 
+def test_a_card_names_what_the_run_that_it_goes_on_from_began_with(
+    hf_folder: Callable[[str], Path],
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    name, folder = "someone/SmolVLM", hf_folder("smolvlm")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: str(folder))
+    first, second = tmp_path / "first", tmp_path / "second"
+    train.run(small(name, steps=1), "naive", demos_file, None, first)
+    train.run(small(first, steps=1), "naive", demos_file, None, second)
+    said = card.text(
+        second, checkpoint.last(second), card.AEGIS, REPO, card.Stored("float32", rounded=False)
+    )
+    assert yaml.safe_load(said.split("---\n", 2)[1])["base_model"] == name
+
+
 def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
     bare = results.probes(run_folder)
     assert bare  # so that the run itself has figures

@@ -7,7 +7,15 @@ from aegis_cli.cli.render.inspected import compared, inspect
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
 from aegis_cli.cli.render.open_loops import open_loop, open_loop_plot
-from aegis_cli.cli.render.output import error, note, show, text, write_any_character
+from aegis_cli.cli.render.output import (
+    STDOUT,
+    error,
+    name_errors,
+    note,
+    show,
+    text,
+    write_any_character,
+)
 from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
@@ -27,6 +35,7 @@ from aegis_cli.cli.render.tables import (
 )
 
 __all__ = [
+    "STDOUT",
     "bench",
     "bench_shape",
     "check_plot",
@@ -42,6 +51,7 @@ __all__ = [
     "measured",
     "merge",
     "merge_plot",
+    "name_errors",
     "note",
     "open_loop",
     "open_loop_plot",

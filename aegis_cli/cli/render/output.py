@@ -22,6 +22,7 @@ from aegis_cli.common.errors import AegisError
 
 _WIDE = 200  # columns where nothing sets a width, so that piped tables never wrap
 _UNLIMITED = 10_000
+STDOUT = "standard output"
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 _TRAILING_BLANKS = re.compile(r"(?:[ ]|\x1b\[[0-9;]*m)+$", re.MULTILINE)  # and changes of style
 # What stands for characters of ours in an output whose encoding has not got them.
@@ -128,6 +129,23 @@ def _plainly(error: UnicodeError) -> tuple[str, int]:
         raise error
     plain = "".join(_PLAIN.get(char, "?") for char in error.object[error.start : error.end])
     return plain, error.end
+
+
+def name_errors(stream: TextIO, name: str) -> None:
+    """Let the errors of writing to a stream name it: the system has no path of it to tell."""
+    for method in ("write", "flush"):
+        setattr(stream, method, _naming(getattr(stream, method), name))
+
+
+def _naming(call: Callable[..., Any], name: str) -> Callable[..., Any]:
+    def naming(*args: Any) -> Any:
+        try:
+            return call(*args)
+        except OSError as error:
+            error.filename = name
+            raise
+
+    return naming
 
 
 class Terminal(Console):

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_utf8
+from aegis_cli.common.files import check_utf8, hidden
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -96,7 +96,7 @@ def write(
         AegisError: a folder that is not new, or a disk that cannot be written.
     """
     check_new(folder)
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    aside = folder.with_name(f"{hidden(folder)}.{os.getpid()}.tmp")
     try:
         aside.mkdir()
         _Writer(aside, spec, limits).write(episodes)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from aegis_cli.common import artifacts, files, hub
 from aegis_cli.common.errors import AegisError
@@ -72,9 +74,9 @@ def load(name: str) -> Backbone:
         from aegis_cli.models.backbones import hf
 
         backbone = hf.load(path, layers)
-        backbone.stored = _stored_before(path) or backbone.stored
-        own = name.partition("#")[0]
-        backbone.hub_id = own if _on_disk(own) is None else None
+        before, own = _before(path), name.partition("#")[0]
+        backbone.stored = before.get("stored") or backbone.stored
+        backbone.hub_id = own if _on_disk(own) is None else before.get("base_model")
         return backbone
     if layers is not None:
         raise AegisError(
@@ -91,15 +93,14 @@ def load(name: str) -> Backbone:
     return load_file(path)[0]
 
 
-def _stored_before(path: Path) -> str | None:
-    """The type that a checkpoint's backbone came in before it was trained; None: not another one.
+def _before(path: Path) -> Mapping[str, Any]:
+    """What a checkpoint tells of its backbone before it was trained; nothing of another folder.
 
-    A checkpoint holds it in float32.
+    `stored` is the type that its weights came in, since a checkpoint holds them in float32;
+    `base_model` its id on the hub. Either may be missing.
     """
     expert = path.parent / "expert.safetensors"
-    if not expert.is_file():
-        return None
-    return artifacts.read_header(expert).meta.get("stored")
+    return artifacts.read_header(expert).meta if expert.is_file() else {}
 
 
 def load_dual(name: str) -> DualEncoder:

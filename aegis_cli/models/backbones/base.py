@@ -98,7 +98,7 @@ class Backbone(nn.Module, ABC):
         reads_several: whether a prompt may be about several images.
         rounds: whether its weights may be kept in another type than float32.
         stored: name of the type that the weights were read in, one of `STORED_TYPES`.
-        hub_id: its id on the hub, where it was loaded from there.
+        hub_id: the id on the hub of the model that it is, or was before Aegis trained it.
         held: names of parameters that no input describes; they are protected as lone rows are, by
             holding them still.
         idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.

@@ -330,6 +330,10 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
+def test_a_name_as_long_as_a_file_system_takes(tmp_path: Path) -> None:
+    assert save(tmp_path / ("x" * 255)) == next(tmp_path.iterdir())
+
+
 def test_the_folder_that_one_is_in_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
