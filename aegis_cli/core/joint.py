@@ -49,7 +49,9 @@ def groups(
 def kind_of(pair: Pair) -> Hashable:
     """What maps have in common that can be stacked."""
     weight, bias = pair
-    return _flat(weight).shape, weight.dtype, None if bias is None else bias.dtype
+    of_bias = None if bias is None else bias.dtype
+    # A loop of somebody else's may have its layers on several GPUs.
+    return _flat(weight).shape, weight.dtype, weight.device, of_bias
 
 
 def stacked(pairs: Sequence[Pair]) -> Pair:

@@ -40,7 +40,16 @@ from aegis_cli.core.joint import Pair
 from aegis_cli.core.nullspace import copied_small, minus
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Method, Options, Parts, Setting, Update, pair_here, weights
+from aegis_cli.methods.base import (
+    Method,
+    Options,
+    Parts,
+    Setting,
+    Update,
+    pair_here,
+    together,
+    weights,
+)
 
 _LEAST_RATE = 1e-6  # share of the peak learning rate
 
@@ -76,7 +85,7 @@ def start(setting: Setting) -> Parts:
     if owners.several:
         for site, pair in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
-    together = _grouped(maps, found, owners)
+    groups = _grouped(maps, found, owners)
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -86,12 +95,12 @@ def start(setting: Setting) -> Parts:
         if growth:
             # A schedule may end at a rate of 0.
             strength /= max(update.rate_left, _LEAST_RATE) ** growth
-        for group in together:
+        for group in groups:
             joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
 
     @torch.no_grad()
     def pull() -> None:
-        for group in together:
+        for group in groups:
             added = group.curvature.gradient(*group.moved(), weight)
             for now, parts in zip(group.maps, joint.apart(added, group.here()), strict=True):
                 for tensor, by in zip(now, parts, strict=True):
@@ -129,16 +138,9 @@ class _Group:
 def _grouped(
     maps: Mapping[str, Pair], found: Mapping[str, Curvature], owners: Ranks
 ) -> list[_Group]:
-    """The maps in groups, of one each where products do not wait for being started."""
-
-    def size(site: str) -> tuple[int, int]:
-        return maps[site][0].numel(), found[site].inputs.shape[-1]
-
-    sites = [[site] for site in maps]
-    if not owners.several and any(devices.reading_waits(pair[0].device) for pair in maps.values()):
-        sites = joint.groups(maps, lambda site: joint.kind_of(maps[site]), size)
+    """The maps in groups, each with what it began with and its curvature."""
     groups = []
-    for names in sites:
+    for names in together(maps, owners, lambda site: found[site].inputs.shape[-1]):
         own = [maps[name] for name in names]
         now = joint.stacked([pair_here(pair) for pair in own])
         curved = curvature.stacked([found[name] for name in names])

@@ -17,18 +17,26 @@ leaves free what no stored direction holds, of which `soft` takes a small share 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 
-from aegis_cli.common import devices
-from aegis_cli.common.ranks import rows_here
+from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import joint, nullspace
 from aegis_cli.core.joint import Pair
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Rows, Strength
-from aegis_cli.methods.base import Method, Parts, Setting, Update, pair_here, train_all, weights
+from aegis_cli.methods.base import (
+    Method,
+    Parts,
+    Setting,
+    Update,
+    pair_here,
+    together,
+    train_all,
+    weights,
+)
 
 
 def start(setting: Setting) -> Parts:
@@ -47,7 +55,7 @@ def start(setting: Setting) -> Parts:
         # Every row is projected by itself, so that sharded weights need nothing of each other.
         for site, like in likes.items():
             protections[site] = protections[site].of_rows(setting.owners.rows(len(like)))
-    groups = _grouped(setting.backbone, protections, setting.owners.several)
+    groups = _grouped(setting.backbone, protections, setting.owners)
     if options["keeps"] == "coordinates":
         return _by_coordinates(groups, options["every"])
 
@@ -120,34 +128,23 @@ class _Group:
 
 
 def _grouped(
-    backbone: nn.Module, protections: Mapping[str, Protection], rows: bool
+    backbone: nn.Module, protections: Mapping[str, Protection], owners: Ranks
 ) -> list[_Group]:
-    """The sites in groups, of one each where products do not wait for being started.
+    """The sites in groups, each with the protection of all its sites."""
 
-    Args:
-        rows: whether this process has only some rows of each weight.
-    """
+    def directions(site: str) -> int:
+        protection = protections[site]
+        return len(protection.factor) if isinstance(protection, Dense) else 0
+
+    def alone(site: str) -> bool:
+        return isinstance(protections[site], Rows)  # each table has rows of its own that are read
+
     pairs = {site: weights(backbone, site) for site in protections}
-
-    def kind(site: str) -> Hashable:
-        protection = protections[site]
-        # Each table has rows of its own that are read.
-        return (
-            site if isinstance(protection, Rows) else (type(protection), joint.kind_of(pairs[site]))
-        )
-
-    def size(site: str) -> tuple[int, int]:
-        protection = protections[site]
-        directions = len(protection.factor) if isinstance(protection, Dense) else 0
-        return pairs[site][0].numel(), directions
-
-    sites = [[site] for site in protections]
-    if not rows and any(devices.reading_waits(weight.device) for weight, _ in pairs.values()):
-        sites = joint.groups(protections, kind, size)
-    return [
-        _Group(backbone, names, nullspace.stacked([protections[name] for name in names]))
-        for names in sites
-    ]
+    groups = []
+    for names in together(pairs, owners, directions, alone):
+        protection = nullspace.stacked([protections[name] for name in names])
+        groups.append(_Group(backbone, names, protection))
+    return groups
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:

@@ -120,6 +120,12 @@ def test_tables_are_not_stacked() -> None:
         nullspace.stacked([Rows(torch.ones(2, dtype=torch.bool))] * 2)
 
 
+def test_maps_on_two_devices_are_of_two_kinds() -> None:
+    here, there = (torch.zeros(OUT, 5, device=device) for device in ("cpu", "meta"))
+    assert joint.kind_of((here, None)) == joint.kind_of((here.clone(), None))
+    assert joint.kind_of((here, None)) != joint.kind_of((there, None))
+
+
 def test_a_lone_map_is_left_as_it_is() -> None:
     one, pair = curved(5, 2, 0.1), (draw(OUT, 5), None)
     assert curvature.stacked([one]) is one and joint.stacked([pair]) is pair
