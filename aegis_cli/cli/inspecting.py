@@ -176,10 +176,13 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
     if isinstance(report, inspection.StreamInspection):
         render.routing_plot(report, plot)
     elif report.kind == "dataset":
-        from aegis_cli.data.lerobot import download, summary
+        from aegis_cli.data.lerobot import dataset, download, summary
 
-        of_hub = not path.exists()
-        cameras = tuple(report.facts["cameras"])
-        summary.save_sheet(download.fetch(str(path), cameras) if of_hub else path, plot)
+        folder = path
+        if not path.exists():
+            found = dataset.load(download.meta(str(path)))
+            shown = summary.on_sheet(found)
+            folder = download.fetch(str(path), found, found.info.cameras, shown)
+        summary.save_sheet(folder, plot)
     else:
         render.energy_plot(report, plot)

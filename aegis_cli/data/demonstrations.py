@@ -217,7 +217,8 @@ def locate(path: Path, selection: Selection | None = None) -> Path:
     found = dataset.load(folder)
     for feature in selection.vectors:
         found.size(feature)
-    return download.fetch(str(path), found.cameras(selection.camera))
+    cameras = found.cameras(selection.camera)
+    return download.fetch(str(path), found, cameras, _episodes(found, selection.only))
 
 
 def load(
@@ -266,10 +267,14 @@ def digest(path: Path, selection: Selection = ALL) -> str:
 
 
 def _source(found: dataset.Dataset, only: str | None) -> Source:
+    return sources.find(found, _episodes(found, only))
+
+
+def _episodes(found: dataset.Dataset, only: str | None) -> list[int] | None:
+    """The numbers of the episodes that `demos.only` names; None where it chooses none."""
     if only is None:
-        return sources.find(found)
-    count = len(found.episodes)
-    return sources.find(found, _chosen(found.folder, count, only, found.info.splits).tolist())
+        return None
+    return _chosen(found.folder, len(found.episodes), only, found.info.splits).tolist()
 
 
 def is_same(path: Path, selection: Selection, sha256: str) -> bool:

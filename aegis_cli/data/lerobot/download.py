@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError, in_short
-from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot import layout, source
+from aegis_cli.data.lerobot.dataset import Dataset
 
-_META = "meta/*"
+_META, _ROWS = "meta/*", "data/*"
+_MOST_NAMED = 1000  # files that are asked for one by one; the hub's client compares each with all
 
 
-@cache
 def meta(name: str) -> Path:
     """The local folder of a dataset on the hub, of which the meta folder is there.
 
@@ -30,7 +32,7 @@ def meta(name: str) -> Path:
             "check the path, or pip install 'aegis-vla[hub,lerobot]'",
         )
     layout.require_pyarrow()
-    folder = _snapshot(name, [_META])
+    folder = _snapshot(name, (_META,))
     if not layout.is_dataset(folder):
         raise AegisError(
             f"the dataset '{name}' of the hub has no {layout.INFO}",
@@ -41,22 +43,53 @@ def meta(name: str) -> Path:
     return folder
 
 
-@cache
-def fetch(name: str, cameras: Sequence[str]) -> Path:
-    """The same folder, with all rows and the videos of these cameras.
+def fetch(
+    name: str, found: Dataset, cameras: Sequence[str], episodes: Sequence[int] | None = None
+) -> Path:
+    """The same folder, with the rows of these episodes and their videos of these cameras.
 
     Args:
+        found: what the meta folder says.
         cameras: names of their features.
+        episodes: their numbers; None: all.
 
     Raises:
         AegisError: what is not in the cache cannot be had.
     """
+    if episodes is not None:
+        named = _named(found, cameras, episodes)
+        if len(named) <= _MOST_NAMED:
+            folder = _snapshot(name, (_META, *named))
+            if _has_rows(replace(found, folder=folder), episodes):
+                return folder
+            # The meta folder can name the file before the right one (see `source`).
+            return _snapshot(name, (_META, _ROWS, *named))
     videos = [f"videos/{glob.escape(camera)}/*" for camera in cameras]  # version 3.0
     videos += [f"videos/*/{glob.escape(camera)}/*" for camera in cameras]
-    return _snapshot(name, [_META, "data/*", *videos])
+    return _snapshot(name, (_META, _ROWS, *videos))
 
 
-def _snapshot(name: str, wanted: Sequence[str]) -> Path:
+def _named(found: Dataset, cameras: Sequence[str], episodes: Sequence[int]) -> list[str]:
+    """Patterns of the files that these episodes are in, as far as the meta folder knows."""
+    wanted = set[Path]()
+    for number in episodes:
+        episode = found.episodes[number]
+        wanted.add(episode.data)
+        wanted |= {clip.file for camera, clip in episode.clips.items() if camera in cameras}
+    return sorted(glob.escape(path.as_posix()) for path in wanted)
+
+
+def _has_rows(found: Dataset, episodes: Sequence[int]) -> bool:
+    """Whether the files that are here hold all rows of these episodes."""
+    try:
+        source.find(found, episodes)
+    except AegisError:  # the reader raises it again, once every file of rows is here
+        return False
+    return True
+
+
+@cache
+def _snapshot(name: str, wanted: tuple[str, ...]) -> Path:
     try:
         return hub.snapshot(name, "dataset", wanted)
     except (OSError, ValueError) as error:
@@ -68,3 +101,8 @@ def _snapshot(name: str, wanted: Sequence[str]) -> Path:
             f"check the path; or where there is a network: hf download --repo-type dataset {name} "
             "--local-dir FOLDER; then give FOLDER",
         ) from error
+
+
+def forget() -> None:
+    """Ask the hub anew, as a new process would."""
+    _snapshot.cache_clear()

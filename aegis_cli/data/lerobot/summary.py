@@ -71,10 +71,16 @@ def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float,
         }
 
 
+def on_sheet(found: Dataset) -> list[int]:
+    """The numbers of the episodes that `save_sheet` shows, spread over the dataset."""
+    spread = np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES)
+    return np.unique(spread.round().astype(int)).tolist()
+
+
 def save_sheet(folder: Path, out: Path) -> None:
     """Write a PNG with the first and last frame of some episodes, from every camera.
 
-    The episodes are spread over the dataset.
+    Of other episodes nothing is read.
 
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
@@ -87,12 +93,10 @@ def save_sheet(folder: Path, out: Path) -> None:
     found = dataset.load(folder)
     if not found.info.cameras:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
-    read = source.find(found)
+    shown = on_sheet(found)
+    read = source.find(found, shown)
     index = rows.read_index(read)
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
-    shown = np.unique(
-        np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES).round().astype(int)
-    )
     ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
     pictures = {
         camera: dict(zip(ends, frames.pick(read, index, camera, ends), strict=True))

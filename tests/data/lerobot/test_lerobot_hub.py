@@ -9,17 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 import torch
 import yaml
 from huggingface_hub.errors import HTTPError
 from samples.dataset_hub import DatasetHub
-from samples.lerobot import as_version_2, edit_info, episodes, save
+from samples.lerobot import as_version_2, edit_info, edit_table, episodes, replaced, save
 from samples.user_folder import training
 
 from aegis_cli.common import hub
 from aegis_cli.data import demonstrations
-from aegis_cli.data.lerobot import download, write
+from aegis_cli.data.lerobot import download, layout, write
 from aegis_cli.data.selection import Selection
 from aegis_cli.publishing import card
 from aegis_cli.training import checkpoint
@@ -38,8 +39,7 @@ def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DatasetHub:
     (repository / "weights.bin").write_text("what nobody asked for")
     found = DatasetHub(NAME, repository, tmp_path / "cache" / "snapshot")
     monkeypatch.setattr("huggingface_hub.snapshot_download", found.snapshot)
-    download.meta.cache_clear()
-    download.fetch.cache_clear()
+    download.forget()
     return found
 
 
@@ -115,7 +115,7 @@ def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: DatasetHub, 
     bad(*training(demos=NAME), says=("v1.6", "version 2.0"))
     (hosted.repository / "meta/info.json").rename(hosted.repository / "meta/other.json")
     shutil.rmtree(hosted.local)
-    download.meta.cache_clear()
+    download.forget()
     bad(*training(demos=NAME), says=(f"'{NAME}' of the hub has no meta/info.json", "--include"))
     assert hosted.asked == [["meta/*"]] * 2 and not (hosted.local / "data").exists()
 
@@ -124,7 +124,7 @@ def test_a_connection_that_breaks_is_one_error(hosted: DatasetHub, bad: Bad) -> 
     """httpx's own errors are neither OSErrors nor ValueErrors."""
     for kind in (HTTPError, type("ReadTimeout", (HTTPError,), {})):
         hosted.lacks = kind("timed out")
-        download.meta.cache_clear()
+        download.forget()
         bad(*training(demos="someone/else"), says=(kind.__name__, "timed out", "hf download"))
 
 
@@ -148,12 +148,73 @@ def test_videos_of_other_cameras_stay_where_they_are(
         if older:
             as_version_2(hosted.repository, "v2.1")
         hosted.local = tmp_path / f"snapshot {older}"
-        download.meta.cache_clear()
-        download.fetch.cache_clear()
+        download.forget()
         found = demonstrations.load(Path(NAME), None, 0, Selection("wrist"))
         assert len(found.frames) == 1
         videos = {str(path.relative_to(hosted.local)) for path in hosted.local.rglob("*.mp4")}
         assert len(videos) == 4 and all("observation.images.wrist" in path for path in videos)
+
+
+@pytest.fixture(params=["v3.0", "v2.1"])
+def films(
+    request: pytest.FixtureRequest,
+    hosted: DatasetHub,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> DatasetHub:
+    """A dataset of five episodes of two cameras, with files of one episode each."""
+    monkeypatch.setattr(write, "_MB", 0)
+    made = episodes(5, ("top", "wrist"), (64, 64), smooth=True)
+    hosted.repository = save(tmp_path / "films", made, as_video=True)
+    if request.param != "v3.0":
+        as_version_2(hosted.repository, request.param)
+    return hosted
+
+
+def test_files_of_other_episodes_stay_where_they_are(films: DatasetHub) -> None:
+    some = Selection("wrist", "1,3")
+    found = demonstrations.load(Path(NAME), None, 0, some)
+    here = demonstrations.load(films.repository, None, 0, some)
+    assert found.sha256 == here.sha256 and torch.equal(found.read, here.read)
+    assert torch.equal(found.frames[0][found.read], here.frames[0][here.read])
+    kinds = [len(list(films.local.rglob(name))) for name in ("data/**/*.parquet", "*.mp4")]
+    assert kinds == [2, 2]
+    # Others come when they are asked for.
+    assert len(demonstrations.load(Path(NAME), None, 0, Selection("top")).read) > len(found.read)
+    assert len(list(films.local.rglob("*.mp4"))) == 2 + 5
+
+
+def test_of_very_many_files_all_are_downloaded(
+    films: DatasetHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(download, "_MOST_NAMED", 3)
+    demonstrations.load(Path(NAME), None, 0, Selection("wrist", "1,3"))
+    assert len(list(films.local.rglob("*.mp4"))) == 5
+
+
+def test_rows_that_are_in_another_file_than_the_meta_folder_says_are_found(
+    hosted: DatasetHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it was in LeRobot's converter from v2.1 until 0.5.0."""
+    monkeypatch.setattr(write, "_MB", 0)
+    made = episodes(5, size=(64, 64), smooth=True)
+    hosted.repository = save(tmp_path / "films", made, as_video=True)
+    wrong = pa.array([0, 0, 2, 2, 4])
+    edit_table(
+        hosted.repository / layout.EPISODES.format(chunk_index=0, file_index=0),
+        lambda table: replaced(table, "data/file_index", wrong),
+    )
+    found = demonstrations.load(Path(NAME), None, 0, Selection(only="2,3"))
+    assert len(found.read) == sum(len(made[number].actions) for number in (2, 3))
+    kinds = [len(list(hosted.local.rglob(name))) for name in ("data/**/*.parquet", "*.mp4")]
+    assert kinds == [5, 2]
+
+
+def test_an_episode_that_is_not_there_is_said_before_anything_large(
+    hosted: DatasetHub, bad: Bad
+) -> None:
+    bad(*training(demos=NAME), "--set", "demos.only=3,8", says=("episode 8", "which has 8"))
+    assert hosted.asked == [["meta/*"]]
 
 
 def test_inspect_needs_the_meta_folder_alone(
@@ -164,7 +225,8 @@ def test_inspect_needs_the_meta_folder_alone(
     report = json.loads(out)
     here = json.loads(aegis("inspect", hosted.repository, "--json")[1])
     assert report == {**here, "path": NAME} and hosted.asked == [["meta/*"]]
-    assert aegis("inspect", NAME, "--plot", tmp_path / "sheet.png")[0] == 0
+    code, _, err = aegis("inspect", NAME, "--plot", tmp_path / "sheet.png")
+    assert code == 0, err
     assert (tmp_path / "sheet.png").is_file()
 
 
