@@ -50,6 +50,7 @@ _SAID = (
     "action_names",
     "proprio_names",
     "fps",
+    "base_model",
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 
@@ -64,7 +65,8 @@ def write(
     Args:
         meta: what a policy's user has to know: method, task, replan, normalization and, where they
             are known, what actions are relative to, the cameras and the sizes of their pictures,
-            the names of actions and positions, and the frames per second.
+            the names of actions and positions, the frames per second, and the id on the hub of the
+            model that the backbone was before it was trained.
         cameras: other names of the pictures, in the order in which the backbone takes them.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)
@@ -123,6 +125,7 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)
     backbone.stored = meta.get("stored", FLOAT32)
+    backbone.hub_id = meta.get("base_model")
     if artifact.header.fingerprint != backbone.fingerprint():
         raise AegisError(
             f"'{path}' whose backbone is not the one that its header names",

@@ -21,7 +21,7 @@ from aegis_cli import inspection, recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.models import lerobot_folder
-from aegis_cli.publishing import card, push
+from aegis_cli.publishing import card, export, push
 from aegis_cli.training import checkpoint, train
 
 Aegis = Callable[..., tuple[int, str, str]]
@@ -207,13 +207,15 @@ def test_a_card_names_what_the_run_that_it_goes_on_from_began_with(
 ) -> None:
     name, folder = "someone/SmolVLM", hf_folder("smolvlm")
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: str(folder))
-    first, second = tmp_path / "first", tmp_path / "second"
+    first, exported = tmp_path / "first", tmp_path / "exported"
     train.run(small(name, steps=1), "naive", demos_file, None, first)
-    train.run(small(first, steps=1), "naive", demos_file, None, second)
-    said = card.text(
-        second, checkpoint.last(second), card.AEGIS, REPO, card.Stored("float32", rounded=False)
-    )
-    assert yaml.safe_load(said.split("---\n", 2)[1])["base_model"] == name
+    export.run(first, exported)
+    for before in (first, exported):
+        second = tmp_path / f"after {before.name}"
+        train.run(small(before, steps=1), "naive", demos_file, None, second)
+        stored = card.Stored("float32", rounded=False)
+        said = card.text(second, checkpoint.last(second), card.AEGIS, REPO, stored)
+        assert yaml.safe_load(said.split("---\n", 2)[1])["base_model"] == name
 
 
 def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
