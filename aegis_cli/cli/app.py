@@ -9,6 +9,7 @@ import faulthandler
 import os
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -319,7 +320,7 @@ def train(
             parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
-            "none for a stream.",
+            "default: the recipe's demos.path; none for a stream.",
         ),
     ] = None,
     method: Annotated[
@@ -366,10 +367,7 @@ def train(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )
         return
-    if demos is None:
-        fix = "record some with aegis demos, and give them as --demos"
-        expected = "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub"
-        raise AegisError(f"no --demos for '{recipe}'", expected, fix)
+    demos, resolved = _learned_from(resolved, recipe, demos)
     advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     with stages.joined(device):
@@ -387,6 +385,24 @@ def train(
         failed = stage.module.shortage(report) if dry_run else None
         _say_gate(failed)
     _end_at_gate(failed)
+
+
+def _learned_from(recipe: Recipe, file: Path, demos: Path | None) -> tuple[Path, Recipe]:
+    """The demonstrations of a training, and its recipe, which names these and no others.
+
+    Raises:
+        AegisError: neither the command nor the recipe names any.
+    """
+    named = recipe.demos.path
+    if demos is None and named is None:
+        fix = "record some with aegis demos, and give them as --demos"
+        expected = "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub"
+        raise AegisError(f"no --demos for '{file}', which names none as demos.path", expected, fix)
+    if demos is None:
+        return demonstrations_path(str(named)), recipe
+    if named is not None:
+        recipe = replace(recipe, demos=replace(recipe.demos, path=str(demos)))
+    return demos, recipe
 
 
 @app.command(short_help="Move a fine-tuned backbone back, where its task allows it.")

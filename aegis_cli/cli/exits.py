@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import typer
@@ -49,6 +49,13 @@ class Commands(TyperGroup):
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)  # in the order of the pipeline
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        found = super().resolve_command(ctx, args)
+        if not ctx.resilient_parsing:
+            _, command, rest = found
+            _check_each_once(command, ctx, rest)
+        return found
+
     def invoke(self, ctx: Any) -> Any:
         try:
             with interrupts.listening():
@@ -73,6 +80,29 @@ class Commands(TyperGroup):
                 raise typer.Exit(2) from None
             traceback.print_exc()  # Python's own exit code for it is that of a failed gate
             raise typer.Exit(3) from None
+
+
+def _check_each_once(command: Any, ctx: Any, args: Sequence[str]) -> None:
+    """Raise AegisError for an option that is given twice and taken once.
+
+    Click would take the last one and say nothing of the other.
+    """
+    try:
+        own = command.context_class(command, parent=ctx)
+        _, _, order = command.make_parser(own).parse_args(list(args))
+    except Exception as error:
+        if hasattr(error, "show"):  # a misused command line, which the command itself tells
+            return
+        raise
+    given = set[str]()
+    for option in order:
+        single = option.param_type_name == "option" and option.nargs == 1 and not option.multiple
+        if not single or getattr(option, "is_flag", False):
+            continue
+        if option.name in given:
+            name = max(option.opts, key=len)
+            raise AegisError(f"{name} twice", f"one {name}", "leave one of them out")
+        given.add(option.name)
 
 
 def _misused(error: Any) -> int:

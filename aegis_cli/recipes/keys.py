@@ -162,9 +162,12 @@ class _Value:
 
     def __get_pydantic_core_schema__(self, hint: Any, handler: Callable[[Any], Any]) -> Any:
         """The protocol by which pydantic asks a type for its schema."""
-        from pydantic_core.core_schema import no_info_after_validator_function
+        from pydantic_core import core_schema
 
-        return no_info_after_validator_function(self._judged, handler(_strict(hint)))
+        judged = core_schema.no_info_after_validator_function(self._judged, handler(_strict(hint)))
+        if self.check is WITH_PLACE:
+            return core_schema.no_info_before_validator_function(_as_text, judged)
+        return judged
 
     def _judged(self, value: Any) -> Any:
         """The value; pydantic collects the errors of all keys."""
@@ -174,6 +177,11 @@ class _Value:
         if value is not None and self.check and not all(map(self.check.accepts, items)):
             raise ValueError(self.check.expected)
         return plain(value)
+
+
+def _as_text(value: Any) -> Any:
+    """`{}` without quotes, which YAML takes for an empty mapping, as the text that was meant."""
+    return "{}" if value == {} else value
 
 
 def _strict(hint: Any) -> Any:

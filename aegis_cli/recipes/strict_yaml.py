@@ -219,13 +219,19 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
 
 
 def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
-    """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says."""
+    """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says.
+
+    `c` is YAML, but for a text that begins with a place for another: `{} Answer briefly.`
+    """
     dotted, equals, text = setting.partition("=")
     dotted = dotted.strip()
     if not equals or not all(dotted.split(".")):
         fix = "write e.g. --set train.steps=200"
         return [Problem(f"--set '{setting}'", "--set KEY=VALUE", fix)]
-    value, problems = parse(text, f"--set '{setting}'")
+    if text.startswith("{}") and text.strip() != "{}":
+        value, problems = text, list[Problem]()
+    else:
+        value, problems = parse(text, f"--set '{setting}'")
     in_the_way = put(raw, dotted, plain(value))
     if in_the_way:
         found = f"--set '{setting}', but '{in_the_way}' has no keys below it"

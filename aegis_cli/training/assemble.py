@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import shlex
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -214,7 +215,7 @@ def build(
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
-    _check_parts(method, measured, recipe.backbone)
+    _check_parts(method, measured, recipe)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
     # After the fingerprint: the anchor is of the weights before they are rounded.
@@ -422,27 +423,41 @@ def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> No
     meta = artifacts.read_header(path).meta
     asked = meta.get("ask", sets.PLAIN)
     if "vqa" in meta and asked != recipe.anchor.ask:
+        wanted, own = shlex.quote(recipe.anchor.ask), shlex.quote(f"anchor.ask={asked}")
         text = (
             f"the questions of '{path}' were asked as '{asked}', and the recipe asks them as "
-            f"'{recipe.anchor.ask}' (anchor.ask): measure the anchor with --ask "
-            f"'{recipe.anchor.ask}', or --set 'anchor.ask={asked}'; and probe with the same --ask"
+            f"'{recipe.anchor.ask}' (anchor.ask): measure the anchor with --ask {wanted}, or --set "
+            f"{own}; and probe with the same --ask"
         )
         on_event(Warned("train", text))
 
 
-def _check_parts(method: Method, anchor: Anchor | None, backbone: str) -> None:
+def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:
     """Raise AegisError where the anchor lacks what the method needs."""
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
     missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
         return
-    of = "" if backbone == backbones.EMBEDDED else f" --backbone {backbone}"
     found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
     raise AegisError(
         f"{found} for method '{method.name}'",
         f"an anchor of the backbone with its {' and '.join(missing)}",
-        f"add --anchor FILE, measured by: aegis anchor{of} --parts {','.join(missing)} --out FILE",
+        f"add --anchor FILE, measured by: {_measuring(recipe, missing)}",
     )
+
+
+def _measuring(recipe: Recipe, parts: Sequence[str]) -> str:
+    """The command that measures these parts on the questions of which the recipe speaks."""
+    asked, usual = recipe.anchor, type(recipe.anchor)()
+    words = ["aegis", "anchor"]
+    if recipe.backbone != backbones.EMBEDDED:
+        words += ["--backbone", recipe.backbone]
+    for option, name in (("--vqa", "vqa"), ("--ask", "ask"), ("--temperature", "temperature")):
+        if getattr(asked, name) != getattr(usual, name):
+            words += [option, f"{getattr(asked, name)}"]
+    if asked.skip_bad:
+        words.append("--skip-bad")
+    return shlex.join([*words, "--parts", ",".join(parts), "--out", "FILE"])
 
 
 def _start(

@@ -56,6 +56,8 @@ Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stder
 
 ALL = [block for page in PAGES for block in tried(page)]
 RUN = [block for block in ALL if block.mark is None]
+# Recipes that name demonstrations of their own, so that a command without any is none to refuse.
+NAMING_DEMOS = ("recipes/paligemma2-libero.yaml",)
 
 
 # --- what every block says ------------------------------------------------------------------------
@@ -245,6 +247,10 @@ def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
         return [*words, "--demos", "none"], "--demos"
     if command == "train":
         place = rest.index("--demos")
+        if (
+            recipe in NAMING_DEMOS
+        ):  # the model, which is not there either, is the first to be missed
+            return words, "no folder 'models/"
         return [command, *rest[:place], *rest[place + 2 :]], "no --demos"
     if kind == "policy":
         return [*words, "--workers", "2"], "--workers"
