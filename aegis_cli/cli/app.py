@@ -823,8 +823,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions and by steps ahead, beside that of the best constant action
-    and, where actions are positions, that of the current one.
+    is given by dimension of the actions and by steps ahead, relative to that of always the
+    training's mean, and beside that of the current position where actions are positions. The run
+    keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
@@ -842,6 +843,7 @@ def evaluate(
         seed,
         batch_size,
         plot is not None,
+        keep=True,
         device=device,
         as_json=as_json,
     )
