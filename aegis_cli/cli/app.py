@@ -823,9 +823,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions and by steps ahead, relative to that of always the
-    training's mean, and beside that of the current position where actions are positions. The run
-    keeps the figures.
+    is given by dimension of the actions and by steps ahead, relative to that of the training's
+    mean action, and beside that of the current position where actions are positions. The run keeps
+    the figures.
 
     \b
     Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
@@ -966,8 +966,9 @@ def push(
 ) -> None:
     """Send a trained policy with its model card to the Hugging Face hub, in one commit.
 
-    The card has the VQA accuracy before and after with its interval, the gate's verdict and the
-    success, as far as aegis run, aegis probe and aegis rollout have measured them.
+    The card has the VQA accuracy before and after with its interval, the gate's verdict, the
+    success and the open-loop error, as far as aegis run, aegis probe, aegis rollout and aegis
+    evaluate have measured them.
 
     \b
     Example: aegis push runs/x your-name/reach-aegis --dry-run

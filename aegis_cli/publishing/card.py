@@ -270,7 +270,7 @@ def _evaluated(open_loops: Sequence[Result]) -> Iterator[str]:
         yield f"| {evaluated_on(figures)} | {figures['frames']:,} | {cell} |"
     yield ""
     yield "Open loop: each prediction begins at a recorded frame, and nothing is executed. The"
-    yield "error is squared, over the variance of the training's actions: always their mean has 1."
+    yield "error is squared, over the variance of the training's actions: their mean has 1."
 
 
 def _played(rollouts: Sequence[Result]) -> Iterator[str]:

@@ -136,8 +136,8 @@ def open_loops(runs: Sequence[At]) -> Markup | None:
         "Open-loop error",
         note(
             "Predicted against recorded actions, of which nothing is executed: squared error over "
-            "the variance of the training's actions, mean over the actions. Always the training's "
-            "mean has 1, and hold is the current position, repeated. Under each error, its 95 % "
+            "the variance in training, mean over the dimensions of the actions. The training's "
+            "mean action has 1. Hold is the current position, repeated. Under each error, its 95 % "
             "interval (Student's t) over episodes."
         ),
         table(("Run", "Episodes", "Frames", "Relative error", "Hold's"), rows, left=2),
