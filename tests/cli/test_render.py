@@ -436,7 +436,7 @@ def test_wide_tables_stay_whole_on_narrow_terminals(
 
 
 def open_loop_report(**changes: Any) -> OpenLoopReport:
-    dimension = DimensionError("pan", None, 0.5, 0.75, 1.25, 0.875, 0.36, [0.7, 0.8])
+    dimension = DimensionError("pan", None, 0.5, 0.75, 1.25, 1.5, 0.875, 0.36, [0.7, 0.8])
     steps = [StepError(h, 40 - h, 0.1 * h, 0.05 * h) for h in range(1, 31)]
     report = OpenLoopReport(
         "arm", "chosen", [3, 4], [4], 19, 30, 0, 0.36, (0.3, 0.42), 0.49, [dimension], steps
@@ -454,7 +454,7 @@ def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
 
 
 def test_what_an_open_loop_report_lacks_has_no_column() -> None:
-    dimension = DimensionError("pan", "rad", 0.5, 0.75, 0.0, None, None, [0.7])
+    dimension = DimensionError("pan", "rad", 0.5, 0.75, 0.0, 0.25, None, None, [0.7])
     bare = open_loop_report(
         trained_on=[],
         relative_error=None,
