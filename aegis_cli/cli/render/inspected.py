@@ -222,4 +222,8 @@ def compared(report: Any) -> RenderableType:
         (*name, *own) for name, own in zip(named, zip(*shown.values(), strict=True), strict=True)
     ]
     table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
-    return Group(table, Text(MARKS)) if len(rows) > 1 else table
+    notes = [MARKS] if len(rows) > 1 else []
+    on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
+    if on is not None and not elsewhere:
+        notes.append(f"open-loop error: on {on}")
+    return Group(table, *map(Text, notes))
