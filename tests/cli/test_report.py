@@ -103,7 +103,9 @@ def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path
     place = "/runs/0/open_loops/0/figures"
     shown = {path for path, _, _ in page.figures}
     assert {f"{place}/relative_error", f"{place}/relative_interval/1", f"{place}/frames"} <= shown
-    assert "2 chosen episodes of datasets/arm, 1 of them trained on" in page.said
+    assert page.said.count("2 chosen episodes of datasets/arm, 1 of them trained on") == 1
+    said = "Open-loop error on 2 chosen episodes of datasets/arm, 1 of them trained on"
+    assert said in reported(aegis, job / "naive")[0].said
 
 
 def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:

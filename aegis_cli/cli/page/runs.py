@@ -63,7 +63,8 @@ def at_a_glance(run: At) -> Markup:
     for result in run["rollouts"]:
         shown.append(_acted(result["figures"]))
     for result in run["open_loops"]:
-        shown.append(("Open-loop error", _off(result["figures"])))
+        on = evaluated_on(result["figures"].value)
+        shown.append((f"Open-loop error on {on}", _off(result["figures"])))
     if run["gate"].value is not None:
         shown.append(("Gate", verdict(run["gate"].value, "passed", "failed")))
     return pairs(shown, big=True)
