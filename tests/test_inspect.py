@@ -452,4 +452,5 @@ def test_a_run_is_one_page_of_what_how_well_and_what_was_lost(tmp_path, capsys):
 
 
 def test_a_run_that_nobody_measured_says_who_does(tmp_path, capsys):
-    assert "aegis probe and aegis rollout" in shown(capsys, save_run(tmp_path / "run"))
+    said = shown(capsys, save_run(tmp_path / "run"))
+    assert "aegis probe, aegis rollout and aegis evaluate" in said

@@ -839,8 +839,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions and by steps ahead, beside that of the best constant action
-    and, where actions are positions, that of the current one.
+    is given by dimension of the actions and by steps ahead, relative to that of the training's
+    mean action, and beside that of the current position where actions are positions. The run keeps
+    the figures.
 
     \b
     Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
@@ -858,6 +859,7 @@ def evaluate(
         seed,
         batch_size,
         plot is not None,
+        keep=True,
         device=device,
         as_json=as_json,
     )
@@ -980,8 +982,9 @@ def push(
 ) -> None:
     """Send a trained policy with its model card to the Hugging Face hub, in one commit.
 
-    The card has the VQA accuracy before and after with its interval, the gate's verdict and the
-    success, as far as aegis run, aegis probe and aegis rollout have measured them.
+    The card has the VQA accuracy before and after with its interval, the gate's verdict, the
+    success and the open-loop error, as far as aegis run, aegis probe, aegis rollout and aegis
+    evaluate have measured them.
 
     \b
     Example: aegis push runs/x your-name/reach-aegis --dry-run

@@ -166,6 +166,11 @@ class Demonstrations:
             actions = self._relative_actions(chunk, places)
         return fit(self.tensors["proprio"][self.train]), fit(actions)
 
+    @property
+    def action_std(self) -> list[float]:
+        """Standard deviations of the A actions over the training frames; 0 of one that is fixed."""
+        return Normalizer.fit(self.tensors["actions"][self.train]).std.tolist()
+
     def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
         """Actions [N, A] of the training frames' chunks, less their origins.
 

@@ -109,6 +109,24 @@ class RolloutFigures:
 
 
 @dataclass(frozen=True)
+class OpenLoopFigures:
+    """An open-loop evaluation."""
+
+    data: str
+    split: str
+    episodes: list[int]
+    trained_on: list[int]
+    frames: int
+    relative_error: Number | None = None
+    relative_interval: Interval = None
+    hold_error: Number | None = None
+    chunk: int | None = None
+    seed: int | None = None
+    settings: dict[str, Any] | None = None
+    step: int | None = None
+
+
+@dataclass(frozen=True)
 class TrainFigures:
     """What a training of `aegis run` ended with."""
 

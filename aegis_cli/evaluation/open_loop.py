@@ -20,11 +20,11 @@ from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations, joints
-from aegis_cli.data.batch import least_spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
+from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
@@ -32,6 +32,7 @@ from aegis_cli.training import checkpoint
 
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 TRACED = 3  # episodes that a plot shows
+_BY_PART = ("dimensions", "horizon")  # of the report
 FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions
 
 
@@ -42,10 +43,12 @@ class DimensionError:
     Attributes:
         unit: None where the data does not say.
         mae, rmse: mean absolute error, and root of the mean squared error, in raw units.
-        constant_rmse: that of the best constant action, which is the standard deviation of what
-            was recorded.
+        training_std: standard deviation over the frames of the training, which is the RMSE there of
+            always predicting their mean; 0 where nothing varied.
+        constant_rmse: that of the best constant action on these frames, which is the standard
+            deviation of what was recorded.
         hold_rmse: that of the current position, repeated; None where actions are no positions.
-        relative_error: squared error over that of the constant; None where nothing varies.
+        relative_error: squared error over the training's variance; None where nothing varied.
         rmse_by_step: [H].
     """
 
@@ -53,6 +56,7 @@ class DimensionError:
     unit: str | None
     mae: float
     rmse: float
+    training_std: float
     constant_rmse: float
     hold_rmse: float | None
     relative_error: float | None
@@ -92,8 +96,8 @@ class OpenLoopReport:
             policy was trained on.
         trained_on: those of the episodes that the run was trained on; empty where that is not
             known, as of an exported policy.
-        relative_error: mean squared error over the recorded actions' variance, mean over the
-            dimensions that vary; 1 is the error of the best constant action.
+        relative_error: mean squared error over the variance of the training's actions, mean over
+            the dimensions that varied there; 1 is the error of always predicting their mean.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
         hold_error: the same of repeating the current position, where actions are positions.
         traces: what a plot shows; empty unless asked for.
@@ -119,6 +123,11 @@ class OpenLoopReport:
         del found["traces"]
         return found
 
+    def kept(self) -> dict[str, Any]:
+        """What a run keeps of it: the figures of all dimensions and steps together."""
+        found = self.to_json()
+        return {name: value for name, value in found.items() if name not in _BY_PART}
+
 
 def run(
     run: Path,
@@ -129,6 +138,7 @@ def run(
     batch_size: int = 64,
     traced: bool = False,
     on_event: OnEvent = ignore,
+    keep: bool = False,
 ) -> OpenLoopReport:
     """Compare a run's predictions with demonstrations, frame by frame.
 
@@ -141,14 +151,16 @@ def run(
         seed: seeds the noise that the flow begins with.
         batch_size: frames per forward pass.
         traced: whether the report has what a plot shows.
+        keep: write the report into the run's folder, if it is that of a run or a checkpoint of it.
 
     Raises:
         AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
             be told from those that it was trained on.
     """
-    source = _Source.find(Path(run))
+    run, data = Path(run), Path(data)
+    source = _Source.find(run)
     policy, meta = checkpoint.load_policy(source.checkpoint)
-    learned = source.selection(meta, Path(data))
+    learned = source.selection(meta, data)
     split, chosen, trained_on = source.choose(learned, data, episodes)
     # The frames of the episodes that were learned from may have been decoded by the training.
     only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
@@ -169,12 +181,12 @@ def run(
     at = _spread(shown, chosen, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
-    report = compare(shown, at, predicted)
+    report = compare(shown, at, predicted, _training_std(policy, meta, on_event))
     traces: list[Trace] = []
     if traced:
         replan = min(meta["replan"], policy.expert.shape.chunk)
         traces = [_trace(policy, shown, e, replan, seed, batch_size) for e in chosen[:TRACED]]
-    return dataclasses.replace(
+    report = dataclasses.replace(
         report,
         data=str(data),
         split=split,
@@ -183,6 +195,13 @@ def run(
         seed=seed,
         traces=traces,
     )
+    if keep:
+        path = data.absolute()
+        settings = {"episodes": None if episodes is None else list(episodes), "frames": frames}
+        settings |= {"seed": seed, "path": str(path if path.exists() else data)}
+        name = f"{results.OPEN_LOOP}-{split}-{path.name}"
+        results.keep_if_possible(run, name, report.kept(), settings, on_event)
+    return report
 
 
 # --- which episodes -------------------------------------------------------------------------------
@@ -402,20 +421,25 @@ def _trace(
 # --- errors ---------------------------------------------------------------------------------------
 
 
-def compare(shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor) -> OpenLoopReport:
+def compare(
+    shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor, spread: np.ndarray
+) -> OpenLoopReport:
     """The errors of chunks [N, H, A] that were predicted at frames [N].
 
     Steps past an episode's end do not count.
+
+    Args:
+        spread: [A], the standard deviations in training that errors are relative to; 0 of an action
+            that never varied there.
     """
     actions, is_pad = shown.chunks(at, predicted.shape[1])
     recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
     error = predicted.double().numpy() - recorded
-    spread, varies = _spread_of(recorded[valid])
     hold = None
     if _are_positions(shown):
         hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
-    relative = _relative(error, spread, varies)
-    held = None if hold is None else _relative(hold, spread, varies)
+    relative = _relative(error, spread)
+    held = None if hold is None else _relative(hold, spread)
     episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
     interval = None if relative is None else _interval(relative[valid], episode_of)
     return OpenLoopReport(
@@ -429,9 +453,27 @@ def compare(shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor) ->
         relative_error=_mean(relative, valid),
         relative_interval=interval,
         hold_error=_mean(held, valid),
-        dimensions=_dimensions(shown, error, hold, valid, spread, varies),
+        dimensions=_dimensions(shown, recorded, error, hold, valid, spread),
         horizon=_horizon(relative, held, valid),
     )
+
+
+def _training_std(policy: Policy, meta: Mapping[str, Any], on_event: OnEvent) -> np.ndarray:
+    """Each action's standard deviation [A] over the frames that the policy was trained on.
+
+    It is the policy's scale, unless that is one of relative actions or of quantiles. Checkpoints of
+    earlier versions do not say it then, and have their scale in its place.
+    """
+    if (told := meta.get("action_std")) is not None:
+        return np.array(told, np.float64)
+    if meta.get("relative") or meta.get("normalization", "mean_std") != "mean_std":
+        text = (
+            "the checkpoint is of an earlier version and does not say how far its actions vary: "
+            "errors are relative to its scale of relative actions or quantiles, and do not compare "
+            "with other runs'"
+        )
+        on_event(Warned("evaluate", text))
+    return policy.action_scale.std.double().cpu().numpy()
 
 
 def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] | None:
@@ -446,12 +488,6 @@ def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float]
     return max(0.0, mean - half), mean + half
 
 
-def _spread_of(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each dimension's standard deviation [A] over rows [N, A], and whether it varies at all."""
-    spread = rows.std(axis=0)
-    return spread, spread > least_spread(torch.from_numpy(rows.mean(axis=0))).numpy()
-
-
 def _are_positions(shown: Demonstrations) -> bool:
     """Whether an action says which positions to take: both have the same names, one a dimension."""
     names = shown.action_names
@@ -459,8 +495,9 @@ def _are_positions(shown: Demonstrations) -> bool:
     return any(names) and names == shown.proprio_names and sizes == {len(names)}
 
 
-def _relative(error: np.ndarray, spread: np.ndarray, varies: np.ndarray) -> np.ndarray | None:
-    """Squared error over the variance [N, H], mean over the dimensions that vary."""
+def _relative(error: np.ndarray, spread: np.ndarray) -> np.ndarray | None:
+    """Squared error over the variance [N, H], mean over the dimensions that varied."""
+    varies = spread > 0
     if not varies.any():
         return None
     return np.square(error[..., varies] / spread[varies]).mean(axis=-1)
@@ -476,11 +513,11 @@ def _rmse(error: np.ndarray) -> float:
 
 def _dimensions(
     shown: Demonstrations,
+    recorded: np.ndarray,
     error: np.ndarray,
     hold: np.ndarray | None,
     valid: np.ndarray,
     spread: np.ndarray,
-    varies: np.ndarray,
 ) -> list[DimensionError]:
     unit = None if shown.task is None else FULL_ACTION
     steps = [own for h in range(valid.shape[1]) if (own := valid[:, h]).any()]
@@ -493,9 +530,10 @@ def _dimensions(
                 unit=unit,
                 mae=float(np.abs(own).mean()),
                 rmse=_rmse(own),
-                constant_rmse=float(spread[d]),
+                training_std=float(spread[d]),
+                constant_rmse=float(recorded[..., d][valid].std()),
                 hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
-                relative_error=float(np.square(own / spread[d]).mean()) if varies[d] else None,
+                relative_error=float(np.square(own / spread[d]).mean()) if spread[d] else None,
                 rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(steps)],
             )
         )

@@ -1,7 +1,8 @@
-"""What probes and rollouts have measured of a run, kept in its folder.
+"""What probes, rollouts and open-loop evaluations have measured of a run, kept in its folder.
 
 `aegis run` writes probe.json and rollout-*.json beside the checkpoints, and knows by their digests
-what is up to date. What `aegis probe` and `aegis rollout` measure lies apart, in `results`.
+what is up to date. What `aegis probe`, `aegis rollout` and `aegis evaluate` measure lies apart, in
+`results`.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
-from aegis_cli.evaluation.kept_figures import ProbeFigures, RolloutFigures
+from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
 from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
+OPEN_LOOP = "evaluate"  # what the names of its files begin with
 _PATIENCE_S = 5.0  # with others who write there
 
 
@@ -34,14 +36,14 @@ def keep(
 ) -> Path | None:
     """Write a measurement of a run, or of one of its checkpoints, into the run's folder.
 
-    A later one of the same name replaces it, if it is of the same question set: two of them may be
-    files of one name in different folders.
+    A later one of the same name replaces it, if it is of the same question set or demonstrations:
+    two of them may be files of one name in different folders.
 
     Args:
-        name: `probe-scenes`, or `rollout-seen`.
+        name: `probe-scenes`, `rollout-seen` or `evaluate-validation-arm`.
         figures: what was measured, as `--json` shows it.
         settings: what was asked for, written beside the figures; `path` is that of the question
-            set, where it is a file or a folder.
+            set or the demonstrations, where they are a file or a folder.
 
     Returns:
         The file; None where `target` is no run of one policy, or may not be written to.
@@ -53,12 +55,12 @@ def keep(
     if found is None or not os.access(found[0], os.W_OK):
         return None
     run, step = found
-    # A file's name or a question set's path may hold anything.
+    # A file's name or a data set's path may hold anything.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
     of_last = step == _last_step(run)
     with _soon_alone(run / FOLDER):
         path = run / FOLDER / (f"{plain}.json" if of_last else f"{plain}-{step:06d}.json")
-        if _is_of_another_set(path, settings):
+        if _is_of_other_data(path, settings):
             told_apart = hashlib.sha256(settings["path"].encode()).hexdigest()[:8]
             path = path.with_name(f"{path.stem}-{told_apart}.json")
         files.save_json(path, {**figures, "settings": dict(settings), "step": step})
@@ -104,8 +106,8 @@ def _soon_alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def _is_of_another_set(path: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether a file has what was measured on a question set that lies elsewhere."""
+def _is_of_other_data(path: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a file has what was measured on questions or demonstrations that lie elsewhere."""
     if "path" not in settings or not path.is_file():
         return False
     found = files.load_json(path)
@@ -170,7 +172,15 @@ def rollouts(run: Path) -> list[Result]:
     return sorted(_read(run, "rollout", RolloutFigures), key=lambda found: "held-out" in found.name)
 
 
-def _read(run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures]) -> list[Result]:
+def open_loops(run: Path) -> list[Result]:
+    """The open-loop evaluations of a run's last checkpoint; on its validation episodes first."""
+    found = _read(run, OPEN_LOOP, OpenLoopFigures)
+    return sorted(found, key=lambda one: one.figures["split"] != "validation")
+
+
+def _read(
+    run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
+) -> list[Result]:
     by_recipe = []
     for path in sorted(run.glob(f"{kind}.json")) + sorted(run.glob(f"{kind}-*.json")):
         # What a study measures on validation data chooses its knobs, and is no result.
@@ -185,6 +195,18 @@ def _read(run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures]) ->
         if step is None or step == last:
             found.append(Result(path.stem, raw, settings))
     return found
+
+
+def evaluated_on(figures: Mapping[str, Any]) -> str:
+    """The episodes of an open-loop evaluation in words, such as `3 held-out episodes of arm`."""
+    data, count, trained = Path(figures["data"]), len(figures["episodes"]), figures["trained_on"]
+    which = {"validation": "held-out ", "chosen": "chosen "}.get(figures["split"], "")
+    # A model card tells nobody where a folder lies.
+    said = f"{count:,} {which}episode{'s' * (count != 1)} of "
+    said += data.name if data.is_absolute() else str(data)
+    if figures["split"] == "other data":
+        said += ", which is other data than the training's"
+    return said + (f", {len(trained):,} of them trained on" if trained else "")
 
 
 def question_set(probed: Result, recipe: recipes.Recipe) -> str:

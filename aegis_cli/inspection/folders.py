@@ -138,6 +138,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         **energies,
         probes=probed,
         rollouts=tuple(results.rollouts(path)),
+        open_loops=tuple(results.open_loops(path)),
         gate=results.gate(probed, settings.probe.max_drop),
     )
 

@@ -104,7 +104,7 @@ class InspectReport:
         facts: what is said of it in one line each.
         energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
             taken.
-        probes, rollouts: what was measured of a run's last checkpoint.
+        probes, rollouts, open_loops: what was measured of a run's last checkpoint.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
 
@@ -123,6 +123,7 @@ class InspectReport:
     validation_loss: float | None = None
     probes: tuple[Result, ...] = ()
     rollouts: tuple[Result, ...] = ()
+    open_loops: tuple[Result, ...] = ()
     gate: bool | None = None
 
     def to_json(self) -> dict[str, Any]:

@@ -49,6 +49,7 @@ _SAID = (
     "action",
     "action_names",
     "proprio_names",
+    "action_std",
     "fps",
     "base_model",
 )
@@ -65,8 +66,8 @@ def write(
     Args:
         meta: what a policy's user has to know: method, task, replan, normalization and, where they
             are known, what actions are relative to, the cameras and the sizes of their pictures,
-            the names of actions and positions, the frames per second, and the id on the hub of the
-            model that the backbone was before it was trained.
+            the names of actions and positions, the actions' spread, the frames per second, and the
+            id on the hub of the model that the backbone was before it was trained.
         cameras: other names of the pictures, in the order in which the backbone takes them.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)

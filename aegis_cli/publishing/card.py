@@ -1,6 +1,7 @@
 """A policy's model card: what it still knows, how well it acts, and how it came to be.
 
-Every figure is one that `aegis probe`, `aegis rollout` or `aegis run` has written into the run.
+Every figure is one that `aegis probe`, `aegis rollout`, `aegis evaluate` or `aegis run` has written
+into the run.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
-from aegis_cli.evaluation.results import Result
+from aegis_cli.evaluation.results import Result, evaluated_on
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
@@ -244,13 +245,39 @@ def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> s
 
 
 def _acting(found: InspectReport) -> Iterator[str]:
-    """Success, or the share of the expert's return, in simulated episodes."""
-    if not found.rollouts:
-        yield "Not measured. `aegis rollout RUN` does it for simulated tasks."
-        return
+    """Success, or the share of the expert's return, in simulated episodes, and open-loop errors."""
+    if not found.rollouts and not found.open_loops:
+        yield "Not measured. `aegis rollout RUN` does it for simulated tasks, in open loop"
+        yield "`aegis evaluate RUN --demos DEMONSTRATIONS` for any."
+    if found.rollouts:
+        yield from _played(found.rollouts)
+    if found.rollouts and found.open_loops:
+        yield ""
+    if found.open_loops:
+        yield from _evaluated(found.open_loops)
+
+
+def _evaluated(open_loops: Sequence[Result]) -> Iterator[str]:
+    """Errors on recorded episodes, and what they mean."""
+    yield "| recorded | frames | open-loop error, with its 95 % interval |"
+    yield "|---|---|---|"
+    for result in open_loops:
+        figures = result.figures
+        error, interval = figures["relative_error"], figures["relative_interval"]
+        cell = "actions did not vary" if error is None else f"{error:.3f}"
+        if interval is not None:
+            cell += f" ({interval[0]:.3f} to {interval[1]:.3f})"
+        yield f"| {evaluated_on(figures)} | {figures['frames']:,} | {cell} |"
+    yield ""
+    yield "Open loop: each prediction begins at a recorded frame, and nothing is executed. The"
+    yield "error is squared, over the variance of the training's actions: their mean has 1."
+
+
+def _played(rollouts: Sequence[Result]) -> Iterator[str]:
+    """A table of rollouts."""
     yield "| task | colours | episodes | success, with its 95 % interval |"
     yield "|---|---|---|---|"
-    for result in found.rollouts:
+    for result in rollouts:
         figures = result.figures
         cells = [figures["task"], figures.get("colors") or "", f"{figures['episodes']:,}"]
         yield f"| {' | '.join([*cells, _success(figures)])} |"

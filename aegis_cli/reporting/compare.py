@@ -19,6 +19,7 @@ from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
 
 Interval = tuple[float, float] | None
+_Named = tuple[Any, results.Result]  # by what two runs' results are compared
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class ComparedRun:
     """One run's figures; None for what was not measured of it.
 
     Shares are in [0, 1], the drop in percentage points, times in seconds, W2^2 a mean over layers.
-    The figures of VQA are those of one probe, on the question set `vqa`.
+    The figures of VQA are those of one probe, on the question set `vqa`, and the open-loop error is
+    that of one evaluation, on the episodes that `open_loop_on` says in words.
     """
 
     run: str
@@ -43,6 +45,9 @@ class ComparedRun:
     success_seen_interval: Interval
     success_held_out: float | None
     return_share: float | None
+    open_loop_on: str | None
+    open_loop_error: float | None
+    open_loop_interval: Interval
     w2: float | None
     energy_shed: float | None
     loss: float | None
@@ -53,9 +58,10 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The runs, in the order given."""
+    """The runs, in the order given; and whether all open-loop errors are of the same frames."""
 
     rows: list[ComparedRun]
+    same_open_loop: bool = True
 
     @property
     def question_sets(self) -> list[str]:
@@ -70,23 +76,24 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     """Read what was measured of each run.
 
     Of several question sets, the first that every run was probed on is compared. Where there is
-    none, each run's own first is shown, and a warning says so.
+    none, each run's own first is shown, and a warning says so. Likewise with open-loop evaluations:
+    they are compared where episodes, frames and seed are the same, trained on or not.
 
     Raises:
         AegisError: a path that is no run of a policy, and no job of such.
     """
     found = [(path, _inspected(path)) for given in paths for path in _runs(Path(given))]
-    probed = [_by_set(path, one) for path, one in found]
-    asked = [own for own in probed if own]
-    shared = [name for name in next(iter(asked), {}) if all(name in own for own in asked)]
-    rows = []
-    for (path, one), own in zip(found, probed, strict=True):
-        name = shared[0] if shared else next(iter(own), None)
-        rows.append(_compared(path, one, name if own else None, own))
-    made = Comparison(rows)
+    probed = _one_of_each([_by_set(path, one) for path, one in found])
+    evaluated = _one_of_each([_by_episodes(one) for _, one in found])
+    rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
+    made = Comparison(rows, len({own[0] for own in evaluated if own is not None}) < 2)
     if len(made.question_sets) > 1:
         text = f"VQA is of different questions: {', '.join(made.question_sets)}"
         on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))
+    if not made.same_open_loop:
+        said = "; ".join(f"{row.run}, {row.open_loop_on}" for row in rows if row.open_loop_on)
+        text = f"open-loop errors are not of the same frames: {said}"
+        on_event(Warned("compare", f"{text}; aegis evaluate --episodes measures each on the same"))
     return made
 
 
@@ -102,6 +109,22 @@ def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
     for result in found.probes:
         probed.setdefault(results.question_set(result, recipe), result)
     return probed
+
+
+def _by_episodes(found: InspectReport) -> dict[Any, results.Result]:
+    """The run's open-loop evaluations by what has to be the same for them to be compared."""
+    named = ("episodes", "trained_on", "frames", "seed")
+    return {
+        (one.settings.get("path"), *(str(one.figures[name]) for name in named)): one
+        for one in found.open_loops
+    }
+
+
+def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Named | None]:
+    """Of each run's results by name the first that all runs with any have, else its own first."""
+    some = [own for own in measured if own]
+    shared = [name for name in next(iter(some), {}) if all(name in own for own in some)]
+    return [next(((n, own[n]) for n in (*shared[:1], *own) if n in own), None) for own in measured]
 
 
 def _runs(path: Path) -> Iterator[Path]:
@@ -121,14 +144,16 @@ def _runs(path: Path) -> Iterator[Path]:
 
 
 def _compared(
-    path: Path, found: InspectReport, vqa: str | None, by_set: Mapping[str, results.Result]
+    path: Path, found: InspectReport, asked: _Named | None, evaluated: _Named | None
 ) -> ComparedRun:
     """A run's row.
 
     Args:
-        vqa: the question set to show; None where the run was probed on none.
+        asked: the question set to show with its probe; None where the run was probed on none.
+        evaluated: the open-loop evaluation to show; None without one.
     """
-    probed = {} if vqa is None else by_set[vqa].figures
+    vqa, probed = (None, {}) if asked is None else (asked[0], asked[1].figures)
+    open_loop = {} if evaluated is None else evaluated[1].figures
     played = {result.figures.get("colors"): result.figures for result in reversed(found.rollouts)}
     seen, held_out = played.get("seen", {}), played.get("held-out", {})
     # A task without colours has one rollout, by its return or its success.
@@ -151,6 +176,9 @@ def _compared(
         success_seen_interval=(seen or only).get("interval"),
         success_held_out=held_out.get("success"),
         return_share=only.get("return_share"),
+        open_loop_on=None if evaluated is None else results.evaluated_on(open_loop),
+        open_loop_error=open_loop.get("relative_error"),
+        open_loop_interval=open_loop.get("relative_interval"),
         w2=statistics.fmean(layers) if layers else None,
         energy_shed=found.energy_shed_mean,
         loss=found.loss,

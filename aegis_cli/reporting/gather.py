@@ -50,7 +50,8 @@ class RunDocument:
         layers, over_time, energy_shed_mean: the energy that the projection shed; empty where no
             anchor gradient was taken.
         train: the figures of train.json; empty where `aegis run` did not train it.
-        probes, rollouts: what was measured of the last checkpoint, and with which settings.
+        probes, rollouts, open_loops: what was measured of the last checkpoint, and with which
+            settings.
         gate: whether the drop is within `probe.max_drop` or `--max-drop`; None without one.
         machine: on which it was trained; empty for a run of an earlier Aegis.
         commands: which make the same again.
@@ -71,6 +72,7 @@ class RunDocument:
     train: dict[str, Any]
     probes: list[results.Result]
     rollouts: list[results.Result]
+    open_loops: list[results.Result]
     gate: bool | None
     machine: dict[str, Any]
     videos: list[Video]
@@ -196,6 +198,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         train=kept_figures.read(train, kept_figures.TrainFigures) if train.is_file() else {},
         probes=results.probes(path),
         rollouts=list(found.rollouts),
+        open_loops=list(found.open_loops),
         gate=found.gate,
         machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],

@@ -99,7 +99,8 @@ class TrainingRun:
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
         if it is not float32; `relative`, for each action the place of the position that it is
         predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
-        as the demonstrations say them; `dataset`, their id, and `base_model`, that of the model
+        as the demonstrations say them; `action_std`, the actions' standard deviations, where the
+        policy's scale is another; `dataset`, their id, and `base_model`, that of the model
         that the backbone began as, if they come from the hub.
         """
         found = {
@@ -112,6 +113,8 @@ class TrainingRun:
         found |= self.demos.recorded
         if self.policy.origins.places:
             found["relative"] = list(self.policy.origins.places)
+        if "relative" in found or found["normalization"] != "mean_std":
+            found["action_std"] = self.demos.action_std
         if self.demos.dataset is not None:
             found["dataset"] = self.demos.dataset
         if self.policy.backbone.hub_id is not None:

@@ -390,7 +390,7 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
 
 
 def _check_recorded(meta: Mapping[str, Any], actions: int, positions: int) -> None:
-    """Raise ValueError unless names and rate, where there are any, are of such a robot.
+    """Raise ValueError unless names, spread and rate, where there are any, are of such a robot.
 
     Checkpoints that were written before these were kept have none of them.
     """
@@ -402,6 +402,11 @@ def _check_recorded(meta: Mapping[str, Any], actions: int, positions: int) -> No
             raise ValueError(f"'{key}' is {names!r}")
         if len(names) != count:
             raise ValueError(f"'{key}' has {len(names)} names for {count} numbers")
+    spread = meta.get("action_std", [0.0] * actions)
+    if not isinstance(spread, list) or len(spread) != actions:
+        raise ValueError(f"'action_std' is {spread!r} for {actions} numbers")
+    if not all(type(one) in (int, float) and 0 <= one < math.inf for one in spread):
+        raise ValueError(f"'action_std' is {spread!r}")
     fps = meta.get("fps", 1.0)
     if type(fps) not in (int, float) or not 0 < fps < math.inf:
         raise ValueError(f"'fps' is {fps!r}")

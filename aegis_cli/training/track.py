@@ -1,8 +1,9 @@
 """Trackers that show a training while it runs: TensorBoard, Trackio and Weights & Biases.
 
-Each gets the lines of metrics.jsonl, under their names there, and later what probes and rollouts
-measure of the run. A tracker's package is imported when a recipe names it. Nothing leaves the
-machine unless the user says so to the tracker itself, as by its environment variables.
+Each gets the lines of metrics.jsonl, under their names there, and later what probes, rollouts and
+open-loop evaluations measure of the run. A tracker's package is imported when a recipe names it.
+Nothing leaves the machine unless the user says so to the tracker itself, as by its environment
+variables.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _TABLES = ("families", "tasks")  # of a probe, and of a rollout of a set of task
 
 @dataclass(frozen=True)
 class Measured:
-    """What a probe or a rollout found of a run.
+    """What a probe, a rollout or an open-loop evaluation found of a run.
 
     Attributes:
         name: of its file, `probe-scenes`.

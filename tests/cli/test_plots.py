@@ -249,6 +249,6 @@ def test_each_predicted_chunk_is_a_line_beside_what_was_recorded() -> None:
 
 def test_the_open_loop_plot_says_its_finding_and_what_was_trained_on() -> None:
     drawn = open_loops._drawn(open_loop_report())
-    assert drawn.get_suptitle() == "Open-loop error: 0.25 of the best constant action's"
+    assert drawn.get_suptitle() == "Open-loop error: 0.25 of that of the training's mean action"
     assert [axis.get_title() for axis in drawn.axes[:2]] == ["episode 0", "episode 1 (trained on)"]
     assert [axis.get_ylabel() for axis in drawn.axes[::2]] == ["joint 0", "joint 1", "joint 2"]

@@ -30,6 +30,8 @@ from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.evaluation.open_loop import DimensionError, OpenLoopReport, StepError
+from aegis_cli.evaluation.results import Result
+from aegis_cli.inspection import InspectReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
@@ -436,12 +438,21 @@ def test_wide_tables_stay_whole_on_narrow_terminals(
 
 
 def open_loop_report(**changes: Any) -> OpenLoopReport:
-    dimension = DimensionError("pan", None, 0.5, 0.75, 1.25, 0.875, 0.36, [0.7, 0.8])
+    dimension = DimensionError("pan", None, 0.5, 0.75, 1.25, 1.5, 0.875, 0.36, [0.7, 0.8])
     steps = [StepError(h, 40 - h, 0.1 * h, 0.05 * h) for h in range(1, 31)]
     report = OpenLoopReport(
         "arm", "chosen", [3, 4], [4], 19, 30, 0, 0.36, (0.3, 0.42), 0.49, [dimension], steps
     )
     return dataclasses.replace(report, **changes)
+
+
+def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() -> None:
+    figures = {"data": "arm", "split": "validation", "episodes": [1, 2], "trained_on": []}
+    figures |= {"relative_error": 0.25, "relative_interval": None, "frames": 1000}
+    evaluated = Result("evaluate-validation-arm", figures, {})
+    shown = text_of(render.inspect(InspectReport("run", "x", {}, open_loops=(evaluated,))))
+    assert re.search(r"2 held-out episodes of arm +0\.250 +- +- +1,000", shown)
+    assert "nothing is measured" not in shown
 
 
 def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
@@ -454,7 +465,7 @@ def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
 
 
 def test_what_an_open_loop_report_lacks_has_no_column() -> None:
-    dimension = DimensionError("pan", "rad", 0.5, 0.75, 0.0, None, None, [0.7])
+    dimension = DimensionError("pan", "rad", 0.5, 0.75, 0.0, 0.25, None, None, [0.7])
     bare = open_loop_report(
         trained_on=[],
         relative_error=None,

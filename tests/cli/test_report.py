@@ -15,10 +15,11 @@ from typing import Any
 import pytest
 import yaml
 from samples.command import refused
-from samples.reports import HOSTILE, METHODS, write_job
+from samples.reports import HOSTILE, METHODS, open_loop, write_job
 from samples.studies import found
 
 from aegis_cli.common import files
+from aegis_cli.evaluation import results
 from aegis_cli.studies.tuning import PolicyPoint
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
@@ -92,6 +93,19 @@ def test_figures_of_a_job_are_those_of_json(aegis, job: Path) -> None:
         "/runs/1/rollouts/0/figures/interval/1",
         "/runs/1/energy_shed_mean",
     } <= paths
+
+
+def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path) -> None:
+    evaluated = open_loop(1, 2, split="chosen", trained_on=[2])
+    results.keep(job / "naive", "evaluate-chosen-arm", evaluated, {})
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    place = "/runs/0/open_loops/0/figures"
+    shown = {path for path, _, _ in page.figures}
+    assert {f"{place}/relative_error", f"{place}/relative_interval/1", f"{place}/frames"} <= shown
+    assert page.said.count("2 chosen episodes of datasets/arm, 1 of them trained on") == 1
+    said = "Open-loop error on 2 chosen episodes of datasets/arm, 1 of them trained on"
+    assert said in reported(aegis, job / "naive")[0].said
 
 
 def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:

@@ -16,12 +16,15 @@ import torch
 from samples import lerobot
 from samples.training_runs import SETTINGS
 
+from aegis_cli import inspection
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Warned
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Selection
-from aegis_cli.evaluation import open_loop
+from aegis_cli.evaluation import open_loop, results
+from aegis_cli.evaluation.open_loop import OpenLoopReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import export
@@ -59,6 +62,7 @@ def recorded(names: tuple[str, ...] = (), positions: tuple[str, ...] = ()) -> De
 
 
 EVERY = torch.arange(sum(LENGTHS))
+SPREAD = np.array([2.0, 0.0])  # in training, where the second action never changed either
 
 
 def entries(shown: Demonstrations) -> np.ndarray:
@@ -69,33 +73,46 @@ def entries(shown: Demonstrations) -> np.ndarray:
 
 def test_exact_predictions_have_no_error() -> None:
     shown = recorded()
-    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0])
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0], SPREAD)
     assert found.relative_error == 0 and [d.rmse for d in found.dimensions] == [0, 0]
     assert [d.mae for d in found.dimensions] == [0, 0]
     assert {step.relative_error for step in found.horizon} == {0}
 
 
-def test_the_best_constant_action_has_a_relative_error_of_one() -> None:
+def test_the_trainings_mean_action_has_a_relative_error_of_one_on_what_was_trained_on() -> None:
     shown = recorded()
-    own = entries(shown)
-    mean = torch.tensor([own.mean(), 7.0], dtype=torch.float64)
-    found = open_loop.compare(shown, EVERY, mean.expand(len(EVERY), CHUNK, 2))
+    trained = shown.tensors["actions"].double()
+    found = open_loop.compare(
+        shown, EVERY, trained.mean(0).expand(len(EVERY), 1, 2), np.array(shown.action_std)
+    )
     first, still = found.dimensions
     assert found.relative_error == pytest.approx(1) and first.relative_error == pytest.approx(1)
-    assert first.rmse == pytest.approx(own.std()) == first.constant_rmse
-    assert still.relative_error is None and still.constant_rmse == 0  # it never varies
+    assert first.rmse == pytest.approx(trained[:, 0].std(unbiased=False)) == first.training_std
+    assert still.relative_error is None and still.training_std == 0  # it never varied
+
+
+def test_an_action_that_rests_in_the_evaluated_frames_weighs_no_more_than_another() -> None:
+    """The error of one held-out episode is in the units of all that was trained on."""
+    shown = recorded()
+    actions, _ = shown.chunks(EVERY, CHUNK)
+    found = open_loop.compare(shown, EVERY, actions + 0.5, np.array([2.0, 1.0]))
+    moved, rested = found.dimensions
+    assert rested.constant_rmse == 0 and rested.relative_error == pytest.approx(0.25)
+    assert moved.relative_error == pytest.approx(0.0625)
+    assert found.relative_error == pytest.approx((0.25 + 0.0625) / 2)
 
 
 def test_errors_are_those_of_the_definition() -> None:
     shown = recorded()
     actions, is_pad = shown.chunks(EVERY, CHUNK)
     off = torch.randn(actions.shape, generator=torch.Generator().manual_seed(0))
-    found = open_loop.compare(shown, EVERY, actions + off)
+    found = open_loop.compare(shown, EVERY, actions + off, SPREAD)
     first = found.dimensions[0]
     own = (actions + off - actions)[..., 0].double()[~is_pad].numpy()
     assert first.mae == pytest.approx(np.abs(own).mean(), rel=1e-5)
     assert first.rmse == pytest.approx(np.sqrt((own**2).mean()), rel=1e-5)
-    assert first.relative_error == pytest.approx((own**2).mean() / entries(shown).var(), rel=1e-5)
+    assert first.relative_error == pytest.approx((own**2).mean() / SPREAD[0] ** 2, rel=1e-5)
+    assert first.constant_rmse == pytest.approx(entries(shown).std(), rel=1e-5)
     low, high = found.relative_interval
     assert low < found.relative_error < high
 
@@ -104,7 +121,7 @@ def test_what_lies_past_an_episodes_end_does_not_count() -> None:
     shown = recorded()
     actions, is_pad = shown.chunks(EVERY, CHUNK)
     wild = torch.where(is_pad[..., None], torch.tensor(1e6), actions)
-    found = open_loop.compare(shown, EVERY, wild)
+    found = open_loop.compare(shown, EVERY, wild, SPREAD)
     assert found.relative_error == 0
     assert [s.frames for s in found.horizon] == [11, 8, 5] == (~is_pad).sum(0).tolist()
 
@@ -112,7 +129,7 @@ def test_what_lies_past_an_episodes_end_does_not_count() -> None:
 def test_a_step_that_no_episode_is_long_enough_for_is_left_out() -> None:
     shown = recorded()
     at = torch.tensor([4, 5])  # the episode of two frames
-    found = open_loop.compare(shown, at, shown.chunks(at, CHUNK)[0])
+    found = open_loop.compare(shown, at, shown.chunks(at, CHUNK)[0], SPREAD)
     assert [s.step for s in found.horizon] == [1, 2]
     assert len(found.dimensions[0].rmse_by_step) == 2
     assert found.relative_interval is None and found.episodes == [1]
@@ -132,7 +149,7 @@ def test_the_current_position_is_compared_with_where_actions_are_positions(
     names: tuple[str, ...], positions: tuple[str, ...], held: bool
 ) -> None:
     shown = recorded(names, positions)
-    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0])
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0], SPREAD)
     assert (found.hold_error is not None) == held
     assert all((d.hold_rmse is not None) == held for d in found.dimensions)
     if held:
@@ -293,6 +310,102 @@ def test_of_an_exported_policy_the_episodes_may_be_chosen(
     assert "episode 99 of" in refusal(tmp_path / "policy", demos_file, episodes=[99])
 
 
+# --- what errors are relative to ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "train_as", [{}, {"normalization": "quantiles"}, {"relative_actions": True}]
+)
+def test_whatever_the_policys_scale_errors_are_relative_to_how_the_trainings_actions_vary(
+    train_as: dict[str, Any], recipe: Recipe, demos_file: Path, tmp_path: Path
+) -> None:
+    same = demonstrations.load(demos_file, SETTINGS.validation_share, 0)
+    data = tmp_path / "arm.safetensors"
+    saved = artifacts.load(demos_file, "demos")
+    meta = dict(saved.header.meta)
+    meta["proprio_names"] = [*meta["action_names"], *meta["proprio_names"][2:]]
+    artifacts.save(data, "demos", saved.tensors, seed=0, meta=meta)
+    changed = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, **train_as))
+    train.run(changed, "naive", data, None, tmp_path / "run")
+    found, warned = evaluated(tmp_path / "run", data)
+    spread = same.tensors["actions"][same.train].double().std(0, unbiased=False)
+    assert [d.training_std for d in found.dimensions] == pytest.approx(spread.tolist())
+    assert not warned
+    export.run(tmp_path / "run", tmp_path / "policy", LEROBOT)
+    exported, _ = evaluated(tmp_path / "policy", data, episodes=found.episodes)
+    assert exported.relative_error == pytest.approx(found.relative_error)
+
+
+def test_an_earlier_checkpoint_by_quantiles_is_warned_of(
+    named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
+) -> None:
+    earlier = renamed({"normalization": "quantiles"}, named, tmp_path / "earlier")
+    (text,) = warnings_of(earlier, demos_file)
+    assert "of an earlier version" in text and "do not compare" in text
+    told = renamed({"normalization": "quantiles", "action_std": [1.0, 2.0]}, named, tmp_path / "x")
+    found, warned = evaluated(told, demos_file, episodes=[0], frames=2)
+    assert [d.training_std for d in found.dimensions] == [1.0, 2.0] and not warned
+
+
+@pytest.mark.parametrize("wrong", [[1.0], [1.0, -1.0], [1.0, "x"], 1.0])
+def test_a_checkpoint_with_a_spread_that_cannot_be_is_refused(
+    wrong: Any, named: tuple[Policy, dict[str, Any]], demos_file: Path, tmp_path: Path
+) -> None:
+    assert "action_std" in refusal(
+        renamed({"action_std": wrong}, named, tmp_path / "x"), demos_file
+    )
+
+
+# --- what a run keeps -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_run(naive_run: Path, tmp_path: Path) -> Path:
+    shutil.copytree(naive_run, tmp_path / "own", symlinks=True)
+    return tmp_path / "own"
+
+
+def test_a_run_keeps_what_was_found_of_all_dimensions_and_steps_together(
+    own_run: Path, demos_file: Path
+) -> None:
+    found = open_loop.run(own_run, demos_file, keep=True)
+    (kept,) = results.open_loops(own_run)
+    assert kept.name == f"evaluate-validation-{demos_file.name}"
+    left_out = {"dimensions", "horizon"}
+    plain = {name: value for name, value in found.to_json().items() if name not in left_out}
+    assert kept.figures == json.loads(json.dumps(plain))
+    assert kept.settings["path"] == str(demos_file) and kept.settings["episodes"] is None
+    again = inspection.run(own_run)
+    assert [one.figures for one in again.open_loops] == [kept.figures]
+
+
+def test_chosen_episodes_are_another_result_than_held_out_ones(
+    own_run: Path, demos_file: Path
+) -> None:
+    open_loop.run(own_run, demos_file, [0, 1, 2], keep=True)
+    held_out = open_loop.run(own_run, demos_file, keep=True)
+    trained = len({0, 1, 2} - set(held_out.episodes))
+    said = [results.evaluated_on(one.figures) for one in results.open_loops(own_run)]
+    count, data = len(held_out.episodes), demos_file.name
+    assert said[0] == f"{count} held-out episode{'s' * (count != 1)} of {data}"
+    assert said[1] == f"3 chosen episodes of {data}, {trained} of them trained on"
+
+
+def test_an_earlier_checkpoints_error_is_no_figure_of_the_run_and_an_exports_is_kept_nowhere(
+    own_run: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    steps = sorted(p.name for p in (own_run / "checkpoints").iterdir() if p.name.isdigit())
+    assert len(steps) > 1
+    open_loop.run(own_run / "checkpoints" / steps[0], demos_file, keep=True)
+    (path,) = (own_run / "results").glob("*.json")
+    assert path.stem.endswith(steps[0]) and not results.open_loops(own_run)
+    for form in FORMS:
+        export.run(own_run, tmp_path / form, form)
+        before = sorted((tmp_path / form).rglob("*"))
+        open_loop.run(tmp_path / form, demos_file, [0], keep=True)
+        assert sorted((tmp_path / form).rglob("*")) == before
+
+
 # --- refused --------------------------------------------------------------------------------------
 
 
@@ -345,10 +458,15 @@ def test_joints_in_another_order_are_refused(
     assert f"positions {', '.join(names)}" in refusal(turned, demos_file)
 
 
-def warnings_of(policy: Path, data: Path) -> list[str]:
+def evaluated(policy: Path, data: Path, **options: Any) -> tuple[OpenLoopReport, list[str]]:
+    """The report, and what was warned of."""
     events: list[Event] = []
-    open_loop.run(policy, data, episodes=[0], frames=2, on_event=events.append)
-    return [event.text for event in events if isinstance(event, Warned)]
+    found = open_loop.run(policy, data, on_event=events.append, **options)
+    return found, [event.text for event in events if isinstance(event, Warned)]
+
+
+def warnings_of(policy: Path, data: Path) -> list[str]:
+    return evaluated(policy, data, episodes=[0], frames=2)[1]
 
 
 def test_joints_of_other_names_are_warned_of(

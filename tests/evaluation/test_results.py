@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from samples.reports import probe, rollout, write_job
+from samples.reports import open_loop, probe, rollout, write_job
 
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
@@ -79,6 +79,46 @@ def test_sets_of_one_name_in_two_folders_are_two_results(run: Path) -> None:
         results.keep(run, "probe-q.jsonl", probe("shape", drop), {"path": f"/{place}/q.jsonl"})
     kept = {r.settings["path"]: r.figures["drop_points"] for r in results.probes(run)[1:]}
     assert kept == {"/home/q.jsonl": 30.0, "/kitchen/q.jsonl": 20.0}
+
+
+def test_demonstrations_of_one_name_in_two_folders_are_two_results(run: Path) -> None:
+    for place, error in (("home", 0.25), ("kitchen", 0.5), ("home", 0.75)):
+        found, settings = open_loop(3, error=error), {"path": f"/{place}/arm"}
+        results.keep(run, "evaluate-validation-arm", found, settings)
+    kept = {r.settings["path"]: r.figures["relative_error"] for r in results.open_loops(run)}
+    assert kept == {"/home/arm": 0.75, "/kitchen/arm": 0.5}
+
+
+def test_errors_on_held_out_episodes_come_first_and_only_those_of_the_last_checkpoint(
+    run: Path,
+) -> None:
+    results.keep(run, "evaluate-chosen-arm", open_loop(1, split="chosen"), {})
+    results.keep(run, "evaluate-validation-arm", open_loop(3), {})
+    assert [r.figures["split"] for r in results.open_loops(run)] == ["validation", "chosen"]
+    link = run / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to(checkpoint_at(run, 9).name)
+    assert results.open_loops(run) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "2 held-out episodes of datasets/arm"),
+        ({"episodes": [4]}, "1 held-out episode of datasets/arm"),
+        ({"data": "/home/somebody/arm"}, "2 held-out episodes of arm"),
+        (
+            {"split": "chosen", "trained_on": [1]},
+            "2 chosen episodes of datasets/arm, 1 of them trained on",
+        ),
+        (
+            {"split": "other data"},
+            "2 episodes of datasets/arm, which is other data than the training's",
+        ),
+    ],
+)
+def test_it_is_said_which_episodes_an_error_is_of(changes: dict[str, object], said: str) -> None:
+    assert results.evaluated_on({**open_loop(1, 2), **changes}) == said
 
 
 @pytest.mark.parametrize("name", ["probe-okvqa_validation.jsonl", "probe-questions-validation"])

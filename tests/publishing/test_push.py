@@ -15,11 +15,14 @@ import torch
 import yaml
 from samples.command import refused
 from samples.hub import Hub
+from samples.reports import open_loop
+from samples.reports import rollout as rollout_figures
 from samples.small_run import recipe as small
 
 from aegis_cli import inspection, recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
+from aegis_cli.evaluation.results import Result
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export, push
 from aegis_cli.training import checkpoint, train
@@ -222,8 +225,23 @@ def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
     bare = results.probes(run_folder)
     assert bare  # so that the run itself has figures
     recipe_of_run = recipes.load(run_folder / "recipe.yaml")
-    found = card._knowledge(card.inspection.InspectReport("run", "x", {}), recipe_of_run)
+    unmeasured = card.inspection.InspectReport("run", "x", {})
+    found = card._knowledge(unmeasured, recipe_of_run)
     assert next(found).startswith("Not measured")
+    assert next(card._acting(unmeasured)).startswith("Not measured")
+
+
+def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_where_it_can() -> None:
+    evaluated = Result("evaluate-validation-arm", open_loop(1, 2, data="/home/somebody/arm"), {})
+    played = Result("rollout-seen", rollout_figures("seen", 0.75), {})
+    alone = card.inspection.InspectReport("run", "x", {}, open_loops=(evaluated,))
+    line = "| 2 held-out episodes of arm | 50 | 0.250 (0.125 to 0.375) |"
+    lines = [*card._acting(alone)]
+    assert line in lines and not any("Not measured" in each for each in lines)
+    both = [*card._acting(dataclasses.replace(alone, rollouts=(played,)))]
+    assert line in both and any(each.startswith("| reach | seen | 4 | 75.0 %") for each in both)
+    # A Markdown table ends with an empty line.
+    assert both[both.index(lines[0]) - 1] == "" and lines[lines.index(line) + 1] == ""
 
 
 def test_equal_runs_have_equal_cards(run_folder: Path) -> None:

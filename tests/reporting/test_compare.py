@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from samples.command import refused
-from samples.reports import METHODS, probe, write_job
+from samples.reports import METHODS, open_loop, probe, write_job
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -68,6 +68,43 @@ def test_figures_of_different_questions_are_not_compared_without_a_word(
     assert code == 0 and "different questions: own.jsonl, scenes" in err
     line = next(line for line in out.splitlines() if line.startswith(" naive"))
     assert "own.jsonl" in line and "40.0" in line and "!40.0" not in line and "*40.0" not in line
+
+
+def test_open_loop_errors_on_the_same_episodes_are_compared(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    for number, name in enumerate(("naive", "aegis")):
+        own, shared = open_loop(number), open_loop(7, 8, error=0.25 + number, split="chosen")
+        results.keep(job / name, "evaluate-validation-arm", own, {"path": "/arm"})
+        results.keep(job / name, "evaluate-chosen-arm", shared, {"path": "/arm"})
+    found = compare.run([job])
+    assert [row.open_loop_error for row in found.rows] == [0.25, 1.25] and found.same_open_loop
+    assert {row.open_loop_on for row in found.rows} == {"2 chosen episodes of datasets/arm"}
+    _, out, err = aegis("compare", "naive", "aegis")
+    assert "*0.250" in out and "1.250" in out and "same frames" not in err
+    assert out.rstrip().endswith("open-loop error: on 2 chosen episodes of datasets/arm")
+
+
+@pytest.mark.parametrize("other", [{"episodes": [2]}, {"seed": 1}, {"trained_on": [1]}])
+def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
+    other: dict[str, object], aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where as many episodes of the same data were held out."""
+    monkeypatch.chdir(job)
+    for name, own in (("naive", open_loop(1)), ("aegis", {**open_loop(1, error=0.5), **other})):
+        results.keep(job / name, "evaluate-validation-arm", own, {"path": "/arm"})
+    assert not compare.run([job]).same_open_loop
+    _, out, err = aegis("compare", "naive", "aegis")
+    assert "0.250" in out and "*0.250" not in out and "!0.500" not in out
+    assert "not of the same frames: naive, 1 held-out episode of datasets/arm" in err
+
+
+def test_without_an_evaluation_there_is_no_column_of_it(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    assert "open" not in aegis("compare", "naive", "aegis")[1].lower()
 
 
 def test_the_command_shows_one_line_a_run(

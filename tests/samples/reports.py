@@ -127,6 +127,23 @@ def rollout(colors: str, success: float) -> dict[str, Any]:
     }
 
 
+def open_loop(*episodes: int, error: float = 0.25, **changes: Any) -> dict[str, Any]:
+    """What an open-loop evaluation on held-out episodes found, as a run keeps it."""
+    found = {
+        "data": "datasets/arm",
+        "split": "validation",
+        "episodes": list(episodes),
+        "trained_on": [],
+        "frames": 50,
+        "chunk": 8,
+        "seed": 0,
+        "relative_error": error,
+        "relative_interval": [error - 0.125, error + 0.125],
+        "hold_error": 0.5,
+    }
+    return {**found, **changes}
+
+
 def _row(method: str, number: int) -> dict[str, Any]:
     return {
         "method": method,

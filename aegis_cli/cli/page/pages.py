@@ -103,6 +103,7 @@ def _measured(found: Sequence[At]) -> list[Child]:
     """The sections that a run and a job have in common."""
     return [
         runs.successes(found),
+        runs.open_loops(found),
         *runs.families(found),
         runs.drift(found),
         *runs.energy(found),

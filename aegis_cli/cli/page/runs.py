@@ -11,6 +11,7 @@ from aegis_cli.cli.page.charts import HeatMap, Row, Series, is_number
 from aegis_cli.cli.page.cursor import At, between, decimal, plain, share, whole, with_interval
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
+from aegis_cli.evaluation.results import evaluated_on
 
 _TICKS = 5  # below a heat map
 
@@ -61,6 +62,9 @@ def at_a_glance(run: At) -> Markup:
             shown.append(("VQA accuracy lost, points", [decimal(vqa["drop_points"]), ends]))
     for result in run["rollouts"]:
         shown.append(_acted(result["figures"]))
+    for result in run["open_loops"]:
+        on = evaluated_on(result["figures"].value)
+        shown.append((f"Open-loop error on {on}", _off(result["figures"])))
     if run["gate"].value is not None:
         shown.append(("Gate", verdict(run["gate"].value, "passed", "failed")))
     return pairs(shown, big=True)
@@ -110,6 +114,34 @@ def successes(runs: Sequence[At]) -> Markup | None:
         "Success in closed loop",
         note("Under each success, its 95 % interval (Wilson), over the episodes played."),
         table(header, rows, left=3),
+    )
+
+
+def _off(evaluated: At) -> Child:
+    """The relative error of an open-loop evaluation, with its interval."""
+    error, interval = evaluated["relative_error"], evaluated["relative_interval"]
+    return with_interval(error, interval, lambda at: decimal(at, 3))
+
+
+def open_loops(runs: Sequence[At]) -> Markup | None:
+    """Every open-loop evaluation of every run, with its interval."""
+    rows = []
+    for run in runs:
+        for result in run["open_loops"]:
+            found = result["figures"]
+            on, hold = evaluated_on(found.value), decimal(found["hold_error"], 3)
+            rows.append((run["label"], on, whole(found["frames"]), _off(found), hold))
+    if not rows:
+        return None
+    return section(
+        "Open-loop error",
+        note(
+            "Predicted against recorded actions, of which nothing is executed: squared error over "
+            "the variance in training, mean over the dimensions of the actions. The training's "
+            "mean action has 1. Hold is the current position, repeated. Under each error, its 95 % "
+            "interval (Student's t) over episodes."
+        ),
+        table(("Run", "Episodes", "Frames", "Relative error", "Hold's"), rows, left=2),
     )
 
 

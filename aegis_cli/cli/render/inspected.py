@@ -60,10 +60,13 @@ def _measured(report: Any) -> list[RenderableType]:
     parts: list[RenderableType] = []
     if report.rollouts:
         parts.append(_played([result.figures for result in report.rollouts]))
+    if report.open_loops:
+        parts.append(_evaluated(report.open_loops))
     if report.probes:
         parts.append(_known(report.probes))
     if not parts:
-        return [Text("nothing is measured yet: aegis probe and aegis rollout do that")]
+        does = "aegis probe, aegis rollout and aegis evaluate do that"
+        return [Text(f"nothing is measured yet: {does}")]
     verdict = {True: "passed", False: "failed", None: "none: no drop was held to a limit"}
     return [*parts, Text(f"gate: {verdict[report.gate]}\n")]
 
@@ -82,6 +85,19 @@ def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
         for found in rollouts
     ]
     return plain_table(header, rows, left=2)
+
+
+def _evaluated(open_loops: Sequence[Any]) -> Table:
+    from aegis_cli.evaluation import results  # with it comes torch, as with what it has read
+
+    header = ("Open loop on", "Relative error", "95 % interval", "Hold's", "Frames")
+    rows = []
+    for result in open_loops:
+        found = result.figures
+        error, hold = (fixed(found.get(name), 3) for name in ("relative_error", "hold_error"))
+        ends = _ends(found.get("relative_interval"), lambda end: fixed(end, 3))
+        rows.append((results.evaluated_on(found), error, ends, hold, f"{found['frames']:,}"))
+    return plain_table(header, rows)
 
 
 def _known(probes: Sequence[Any]) -> Table:
@@ -157,6 +173,7 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
 
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
+_OPEN_LOOP = "Open-loop error"
 
 
 def compared(report: Any) -> RenderableType:
@@ -168,12 +185,15 @@ def compared(report: Any) -> RenderableType:
         "Success seen %": ("success_seen", True),
         "Success held-out %": ("success_held_out", True),
         "Return % of highest": ("return_share", True),
+        _OPEN_LOOP: ("open_loop_error", False),
         "W2²": ("w2", False),
         "Validation loss": ("validation_loss", False),
         "Step (s)": ("step_s", False),
     }
     several = len(report.question_sets) > 1  # then their figures are not compared
-    better = {name: of for name, of in better.items() if not (several and name in _OF_QUESTIONS)}
+    elsewhere = not report.same_open_loop
+    apart = {*(_OF_QUESTIONS if several else ()), *([_OPEN_LOOP] if elsewhere else [])}
+    better = {name: of for name, of in better.items() if name not in apart}
     columns: dict[str, Callable[[Any], str]] = {
         "Steps": lambda r: "-" if r.steps is None else f"{r.steps:,}",
         "Questions": lambda r: (r.vqa or "-") if several else "-",
@@ -184,6 +204,8 @@ def compared(report: Any) -> RenderableType:
         "Success seen %": lambda r: percent(r.success_seen),
         "Success held-out %": lambda r: percent(r.success_held_out),
         "Return % of highest": lambda r: percent(r.return_share),
+        "Open loop on": lambda r: (r.open_loop_on or "-") if elsewhere else "-",
+        _OPEN_LOOP: lambda r: fixed(r.open_loop_error, 3),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
         "Validation loss": lambda r: fixed(r.validation_loss, 4),
@@ -200,4 +222,8 @@ def compared(report: Any) -> RenderableType:
         (*name, *own) for name, own in zip(named, zip(*shown.values(), strict=True), strict=True)
     ]
     table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
-    return Group(table, Text(MARKS)) if len(rows) > 1 else table
+    notes = [MARKS] if len(rows) > 1 else []
+    on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
+    if on is not None and not elsewhere:
+        notes.append(f"open-loop error: on {on}")
+    return Group(table, *map(Text, notes))

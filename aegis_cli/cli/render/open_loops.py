@@ -39,7 +39,7 @@ def open_loop(report: Any) -> RenderableType:
     }
     if report.trained_on:
         facts["trained_on"] = report.trained_on
-    scale = "relative error: squared error over that of the best constant action, which has 1"
+    scale = "relative error: squared error over that of the training's mean action, which has 1"
     if report.hold_error is not None:
         scale += "\nhold: the current position, repeated"
     return Group(pairs(facts), _by_dimension(report), _by_step(report), Text(scale))
@@ -49,7 +49,7 @@ def _by_dimension(report: Any) -> Table:
     shown = {
         "MAE": lambda d: number(d.mae),
         "RMSE": lambda d: number(d.rmse),
-        "Constant's RMSE": lambda d: number(d.constant_rmse),
+        "Std in training": lambda d: number(d.training_std),
         "Relative error": lambda d: fixed(d.relative_error, 3),
     }
     if report.hold_error is not None:
@@ -126,8 +126,8 @@ def _titled(report: Any, trace: Any) -> str:
 
 def _finding(report: Any) -> str:
     if report.relative_error is None:
-        return "Predicted and recorded actions, which do not vary"
-    return f"Open-loop error: {report.relative_error:.2f} of the best constant action's"
+        return "Predicted and recorded actions, which did not vary in training"
+    return f"Open-loop error: {report.relative_error:.2f} of that of the training's mean action"
 
 
 def _explain(drawn: Any, replan: int) -> None:
