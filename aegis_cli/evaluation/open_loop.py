@@ -26,11 +26,11 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import t_quantile
+from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
 
-VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 TRACED = 3  # episodes that a plot shows
 _BY_PART = ("dimensions", "horizon")  # of the report
 FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions

@@ -28,6 +28,8 @@ from aegis_cli.training import checkpoint, track
 
 FOLDER = "results"
 OPEN_LOOP = "evaluate"  # what the names of its files begin with
+# Which episodes an open-loop evaluation is of.
+VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 _PATIENCE_S = 5.0  # with others who write there
 
 
@@ -175,7 +177,7 @@ def rollouts(run: Path) -> list[Result]:
 def open_loops(run: Path) -> list[Result]:
     """The open-loop evaluations of a run's last checkpoint; on its validation episodes first."""
     found = _read(run, OPEN_LOOP, OpenLoopFigures)
-    return sorted(found, key=lambda one: one.figures["split"] != "validation")
+    return sorted(found, key=lambda one: one.figures["split"] != VALIDATION)
 
 
 def _read(
@@ -200,11 +202,11 @@ def _read(
 def evaluated_on(figures: Mapping[str, Any]) -> str:
     """The episodes of an open-loop evaluation in words, such as `3 held-out episodes of arm`."""
     data, count, trained = Path(figures["data"]), len(figures["episodes"]), figures["trained_on"]
-    which = {"validation": "held-out ", "chosen": "chosen "}.get(figures["split"], "")
+    which = {VALIDATION: "held-out ", CHOSEN: "chosen "}.get(figures["split"], "")
     # A model card tells nobody where a folder lies.
     said = f"{count:,} {which}episode{'s' * (count != 1)} of "
     said += data.name if data.is_absolute() else str(data)
-    if figures["split"] == "other data":
+    if figures["split"] == OTHER:
         said += ", which is other data than the training's"
     return said + (f", {len(trained):,} of them trained on" if trained else "")
 

@@ -101,8 +101,3 @@ def _snapshot(name: str, wanted: tuple[str, ...]) -> Path:
             f"check the path; or where there is a network: hf download --repo-type dataset {name} "
             "--local-dir FOLDER; then give FOLDER",
         ) from error
-
-
-def forget() -> None:
-    """Ask the hub anew, as a new process would."""
-    _snapshot.cache_clear()

@@ -31,6 +31,11 @@ Bad = Callable[..., str]
 NAME = "someone/arm"
 
 
+def ask_anew() -> None:
+    """As in a new process, which has asked the hub for nothing yet."""
+    download._snapshot.cache_clear()
+
+
 @pytest.fixture
 def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DatasetHub:
     made = [replace(e, instruction="go to the red pad") for e in episodes(8)]
@@ -39,7 +44,7 @@ def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DatasetHub:
     (repository / "weights.bin").write_text("what nobody asked for")
     found = DatasetHub(NAME, repository, tmp_path / "cache" / "snapshot")
     monkeypatch.setattr("huggingface_hub.snapshot_download", found.snapshot)
-    download.forget()
+    ask_anew()
     return found
 
 
@@ -115,7 +120,7 @@ def test_nothing_large_is_downloaded_of_what_cannot_be_read(hosted: DatasetHub, 
     bad(*training(demos=NAME), says=("v1.6", "version 2.0"))
     (hosted.repository / "meta/info.json").rename(hosted.repository / "meta/other.json")
     shutil.rmtree(hosted.local)
-    download.forget()
+    ask_anew()
     bad(*training(demos=NAME), says=(f"'{NAME}' of the hub has no meta/info.json", "--include"))
     assert hosted.asked == [["meta/*"]] * 2 and not (hosted.local / "data").exists()
 
@@ -124,7 +129,7 @@ def test_a_connection_that_breaks_is_one_error(hosted: DatasetHub, bad: Bad) -> 
     """httpx's own errors are neither OSErrors nor ValueErrors."""
     for kind in (HTTPError, type("ReadTimeout", (HTTPError,), {})):
         hosted.lacks = kind("timed out")
-        download.forget()
+        ask_anew()
         bad(*training(demos="someone/else"), says=(kind.__name__, "timed out", "hf download"))
 
 
@@ -148,7 +153,7 @@ def test_videos_of_other_cameras_stay_where_they_are(
         if older:
             as_version_2(hosted.repository, "v2.1")
         hosted.local = tmp_path / f"snapshot {older}"
-        download.forget()
+        ask_anew()
         found = demonstrations.load(Path(NAME), None, 0, Selection("wrist"))
         assert len(found.frames) == 1
         videos = {str(path.relative_to(hosted.local)) for path in hosted.local.rglob("*.mp4")}

@@ -1,7 +1,11 @@
-"""What is given twice and taken once is refused, and what begins with a place is a text."""
+"""What is taken of the options that are given: each once, texts as they are meant, demonstrations.
+
+Advice that names options can be followed as it stands.
+"""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +13,8 @@ import pytest
 from samples.command import ROOT
 
 from aegis_cli import recipes
+from aegis_cli.common.events import Event, Warned
+from aegis_cli.training import assemble
 
 Bad = Callable[..., str]
 
@@ -37,6 +43,27 @@ def test_what_a_question_becomes_needs_no_quotes(text: str) -> None:
         ROOT / "recipes" / "point.yaml", [f"probe.ask={text}", f"anchor.ask={text}"]
     )
     assert found.probe.ask == found.anchor.ask == text.strip('"')
+
+
+def test_the_advice_for_a_missing_anchor_asks_the_questions_of_the_recipe(
+    bad: Bad, demos_file: Path, tmp_path: Path
+) -> None:
+    asked = ("anchor.vqa=own.jsonl", "anchor.ask={} Be brief.", "anchor.skip_bad=true")
+    options = [word for each in asked for word in ("--set", each)]
+    given = ("--method", "nullspace", "--demos", demos_file, "--out", tmp_path / "x")
+    command = (
+        "aegis anchor --vqa own.jsonl --ask '{} Be brief.' --skip-bad --parts inputs --out FILE"
+    )
+    bad("train", "reach", *given, *options, says=("no anchor", command))
+
+
+def test_the_advice_for_an_anchor_of_another_prompt_can_be_followed(anchor_file: Path) -> None:
+    point, said = ROOT / "recipes" / "point.yaml", list[Event]()
+    recipe = recipes.load(point, ["anchor.ask=Now {}"])
+    assemble._warn_of_another_prompt(anchor_file, recipe, said.append)
+    assert isinstance(said[0], Warned) and "--ask 'Now {}'" in said[0].text
+    advised = said[0].text.partition("or --set ")[2].partition(";")[0]
+    assert recipes.load(point, shlex.split(advised)).anchor.ask == "{}"
 
 
 def test_a_training_learns_from_what_its_recipe_names(
