@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import RENAME, canonical, check_utf8, parse_json, reading
+from aegis_cli.common.files import (
+    RENAME,
+    canonical,
+    check_utf8,
+    parse_json,
+    reading,
+    refuse_pointer,
+)
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
@@ -99,6 +106,7 @@ def opened(
             yield file
     except SafetensorError as error:
         check_utf8(path, RENAME)
+        refuse_pointer(path)
         problem = f"'{path}' is truncated or not a safetensors file ({error})"
         raise AegisError(problem, "a complete safetensors file", fix) from error
 

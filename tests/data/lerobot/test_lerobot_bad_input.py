@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 from samples.lerobot import data_files, edit_info, edit_table, episodes, replaced, save
-from samples.user_folder import TRAIN, training
+from samples.user_folder import LFS_POINTER, TRAIN, training
 
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.data.lerobot.write import Limits
@@ -320,6 +320,16 @@ def test_a_corrupt_parquet_file(name: str, damage: str, bad: Bad, folder: Path) 
         data[_page(path)] ^= 1
     path.write_bytes({"truncated": data[:-30], "flipped": data, "foreign": b"hello"}[damage])
     bad(*FROM_FOLDER, says=(name, "is damaged"))
+
+
+@pytest.mark.parametrize("name", [IMAGE, EPISODES, "meta/tasks.parquet", "meta/info.json", VIDEO])
+def test_a_pointer_of_git_lfs_is_not_called_damage(
+    name: str, bad: Bad, place: Path, images: Path, videos: Path
+) -> None:
+    folder = shutil.copytree(videos if name == VIDEO else images, place / "d")
+    (folder / name).write_text(LFS_POINTER)
+    says = bad(*FROM_FOLDER, says=(name, "Git LFS pointer", "git lfs pull"))
+    assert "damaged" not in says
 
 
 def _page(path: Path) -> int:
