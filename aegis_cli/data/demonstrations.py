@@ -113,6 +113,12 @@ class Demonstrations:
         """The instructions of these frames, each once."""
         return [self.instructions[i] for i in self.instruction_of[self.read].unique().tolist()]
 
+    @cached_property
+    def without_instruction(self) -> Tensor:
+        """Numbers of the episodes that were read in which an instruction is empty or blank."""
+        blank = torch.tensor([not text.strip() for text in self.instructions])
+        return self.episode_of[self.read[blank[self.instruction_of[self.read]]]].unique()
+
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
         seen = [frames[frame] for frames in self.frames]

@@ -277,6 +277,21 @@ def test_a_place_or_time_that_is_no_number(
     bad(*FROM_FOLDER, says=(IMAGE, f"NaN or infinite values in '{column}'"))
 
 
+@pytest.mark.parametrize(("fps", "step"), [(5, "200 ms"), (15, "66.67 ms"), (1e4, "0.1 ms")])
+def test_another_rate_than_that_of_the_timestamps(
+    fps: float, step: str, bad: Bad, folder: Path
+) -> None:
+    edit_info(folder, lambda info: info.update(fps=fps))
+    bad(*FROM_FOLDER, says=("100 ms apart", step, f"fps {fps:g}", "here 10,"))
+
+
+def test_times_that_stand_still(bad: Bad, folder: Path) -> None:
+    edit_table(
+        folder / IMAGE, lambda t: replaced(t, "timestamp", pa.array(np.zeros(len(t), np.float32)))
+    )
+    bad(*FROM_FOLDER, says=("0 ms apart", "fps 10", "mend the timestamps"))
+
+
 @pytest.mark.parametrize(
     "column", ["length", "episode_index", "dataset_from_index", "data/chunk_index"]
 )
