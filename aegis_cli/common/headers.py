@@ -70,10 +70,10 @@ def schema(kind: str) -> int:
     return 1 + len(MIGRATIONS.get(kind, ()))
 
 
-def read_header(path: str | Path) -> Header:
-    """What a file is, from its header's bytes alone."""
-    with opened(path, None) as file:
-        return parse_header(path, file.metadata(), None)
+def read_header(path: str | Path, kind: str | None = None) -> Header:
+    """What a file is, from its header's bytes alone; of that kind, if one is given."""
+    with opened(path, kind) as file:
+        return parse_header(path, file.metadata(), kind)
 
 
 def is_artifact(path: str | Path) -> bool:
