@@ -172,10 +172,12 @@ def _check_types(header: Header) -> None:
 
 def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
     if expected is not None and kind != expected:
+        option = KINDS[kind].option if kind in KINDS else None
         raise AegisError(
             f"'{path}' is of kind '{kind}'",
             f"a file of kind '{expected}'",
-            f"give the file that '{KINDS[expected].command}' wrote",
+            f"give the file that '{KINDS[expected].command}' wrote"
+            + (f"; this one belongs to {option}" if option else ""),
         )
     if kind not in KINDS:
         raise AegisError(

@@ -79,6 +79,17 @@ def test_a_folder_that_is_no_dataset(bad: Bad, place: Path) -> None:
     bad("inspect", "d", says=("LeRobot",))
 
 
+@pytest.mark.parametrize("name", ["meta/info.json", IMAGE])
+def test_a_file_of_a_dataset_in_place_of_its_folder(name: str, bad: Bad, folder: Path) -> None:
+    commands = (
+        training(demos=f"d/{name}"),
+        ("run", "small.yaml", "--set", f"demos.path=d/{name}"),
+        ("anchor", "--demos", f"d/{name}", "--out", "a.safetensors"),
+    )
+    for command in commands:
+        bad(*command, says=(f"'d/{name}', a file of a LeRobot dataset", f"give '{folder}'"))
+
+
 def test_a_path_that_is_no_text_is_not_called_damage(bad: Bad, folder: Path) -> None:
     moved = folder.rename(folder.with_name(os.fsdecode(b"caf\xe9")))
     for command in (training(demos=str(moved)), ("inspect", moved)):
