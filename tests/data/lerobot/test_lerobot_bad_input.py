@@ -172,7 +172,15 @@ def test_a_camera_has_to_be_chosen(bad: Bad, place: Path) -> None:
     both = ("observation.images.top", "observation.images.wrist")
     bad(*FROM_FOLDER, says=("2 cameras", *both, "--set demos.camera="))
     bad(*FROM_FOLDER, "--set", "demos.camera=front", says=("no camera 'front'", *both))
-    bad(*TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera out"))
+    bad(
+        *TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera", "out")
+    )
+    of_anchor = ("anchor", "--demos", "d", "--out", "a.safetensors")
+    bad(*of_anchor, says=("2 cameras", "aegis anchor: --camera observation.images.top,"))
+    bad(*of_anchor, "--camera", "front", says=("no camera 'front'", "aegis anchor: --camera"))
+    bad(*of_anchor, "--camera", "top", "--camera", "top", says=("twice", "--camera of aegis"))
+    file = ("anchor", "--demos", "demos.safetensors", "--out", "a.safetensors")
+    bad(*file, "--camera", "top", says=("demos.safetensors", "(of aegis anchor: --camera) out"))
     several = (
         "top, wrist with a backbone that reads one image",
         "Hugging Face",
