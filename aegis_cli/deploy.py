@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from aegis_cli.common import devices
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
 from aegis_cli.data.lerobot import layout
@@ -29,6 +29,7 @@ from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.recipes import is_robot_stream_run
 from aegis_cli.training import checkpoint
 
+_ORDER = "the order is: pictures, instruction, positions"
 Pictures = np.ndarray | Mapping[str, np.ndarray]
 
 
@@ -150,7 +151,7 @@ class DeployedPolicy:
         self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """The pictures in the backbone's order, and the positions [P] float32."""
-        given = np.asarray(positions, dtype=np.float32)
+        given = _numbers(positions)
         if given.shape != (self.positions,):
             raise AegisError(
                 f"positions of shape {given.shape}",
@@ -164,9 +165,8 @@ class DeployedPolicy:
                 "see what the robot's sensors say",
             )
         if not isinstance(instruction, str):
-            raise AegisError(
-                f"an instruction of type {type(instruction).__name__}", "a text", "give one str"
-            )
+            found = f"an instruction of type {type(instruction).__name__}"
+            raise AegisError(found, "a text", f"give one str; {_ORDER}")
         return [_picture(shown) for shown in self._in_order(pictures)], given
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
@@ -197,6 +197,19 @@ class DeployedPolicy:
         if side is not None:
             return np.ascontiguousarray(fit(picture, side, side))
         return np.ascontiguousarray(fit(picture, *self.sizes[camera]) if self.sizes else picture)
+
+
+def _numbers(given: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The positions as float32.
+
+    Raises:
+        AegisError: they are no numbers.
+    """
+    try:
+        return np.asarray(given, dtype=np.float32)
+    except (TypeError, ValueError) as error:  # a text, or lists of several lengths
+        found = f"positions of type {type(given).__name__}: {in_short(error)}"
+        raise AegisError(found, "numbers, one for each position", _ORDER) from error
 
 
 def _picture(given: np.ndarray) -> np.ndarray:

@@ -192,6 +192,9 @@ def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
     [
         ((), frame(), [0.0], ("positions of shape (1,)", "(3,)")),
         ((), frame(), [0.0, math.nan, 0.0], ("not finite", "finite numbers")),
+        ((), frame(), TEXT, ("positions of type str", "instruction, positions")),
+        ((), frame(), [[0.0], [0.0, 1.0]], ("positions of type list", "numbers")),
+        ((), TEXT, POSITIONS, ("a picture of shape ()", "[H, W, 3] uint8")),
         ((), frame()[None], POSITIONS, ("shape (1, ", "[H, W, 3] uint8")),
         ((), frame().astype(np.float32) / 255, POSITIONS, ("float32", "0 to 255")),
         ((), frame().transpose(2, 0, 1), POSITIONS, ("shape (3, ", "channels come last")),
@@ -203,7 +206,7 @@ def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
     ],
 )
 def test_what_it_was_not_trained_on_is_one_error(
-    cameras: tuple[str, ...], pictures: Any, positions: list[float], told: tuple[str, ...]
+    cameras: tuple[str, ...], pictures: Any, positions: Any, told: tuple[str, ...]
 ) -> None:
     """At the call that predicts, and at one that goes on with a chunk."""
     begun = deployed(cameras=cameras)
@@ -213,6 +216,13 @@ def test_what_it_was_not_trained_on_is_one_error(
             policy.select_action(pictures, TEXT, positions)
         said = f"{caught.value.found} {caught.value.expected} {caught.value.fix}"
         assert all(part in said for part in told)
+
+
+def test_state_and_text_in_each_others_place_are_one_error() -> None:
+    for state in (POSITIONS, np.array(POSITIONS), torch.tensor(POSITIONS)):
+        with pytest.raises(AegisError) as caught:
+            deployed().select_action(frame(), state, TEXT)  # type: ignore[arg-type]
+        assert caught.value.fix == "the order is: pictures, instruction, positions"
 
 
 def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ class AnchorReport:
     Attributes:
         samples: questions, or frames; at most as many as were asked for, where files hold fewer.
         skipped: bad questions that were left out.
-        image_tokens, text_tokens: valid tokens in the moments (0 where those were not measured).
-        layers: layers in the moments.
+        image_tokens, text_tokens: valid tokens in the moments; None without moments.
+        layers: layers in the moments; None without moments.
         directions: share of the directions of all maps' inputs whose eigenvectors were kept; None
             without inputs.
         entropy: of the answers' words by the backbone's own distribution, in nats a word; None
@@ -48,9 +48,9 @@ class AnchorReport:
 
     samples: int
     skipped: int
-    image_tokens: int
-    text_tokens: int
-    layers: int
+    image_tokens: int | None
+    text_tokens: int | None
+    layers: int | None
     directions: float | None
     entropy: float | None
     seconds: dict[str, float]
@@ -122,12 +122,12 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
         },
     )
     # Every layer sees the same tokens, so the first one's count is that of all.
-    counts = [found[0].count if found else 0 for found in (anchor.image, anchor.text)]
+    counts = [found[0].count if found else None for found in (anchor.image, anchor.text)]
     return AnchorReport(
         measured.samples,
         measured.skipped,
         *counts,
-        len(anchor.image),
+        len(anchor.image) or None,
         inputs.kept_share(anchor.inputs),
         measured.entropy,
         measured.seconds,

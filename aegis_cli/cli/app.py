@@ -510,8 +510,13 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, out, plot)
+    asks_nothing = strength is not None and (method == "linear" or anchor is not None)
+    if asks_nothing and vqa is not None:
+        reason = "--method linear" if method == "linear" else "--anchor"
+        found = f"--vqa {vqa} with {reason} and --strength, which ask no question"
+        raise AegisError(found, "questions that are asked", "leave --vqa out, or give a sweep")
     asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
-    if anchor is None or strength is None:
+    if not asks_nothing:
         advice.of_questions(target, asks.vqa)
     settings = MergeSettings(
         method=method,

@@ -19,6 +19,7 @@ from aegis_cli.common.errors import AegisError
 # What to do about the path of an input that is no text.
 RENAME = "rename that file or folder"
 _REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
+_LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
 _ATTEMPTS = 100  # at a folder above which others come and go
 
 
@@ -51,6 +52,7 @@ def load_json(path: str | Path) -> Any:
     try:
         return parse_json(text)
     except ValueError as error:
+        refuse_pointer(path)
         raise AegisError(
             f"'{path}' is not JSON: {error}", "a JSON file", "run its command again"
         ) from error
@@ -214,6 +216,27 @@ def refuse_special(path: str | Path) -> None:
     """
     if (special := _special(Path(path))) is not None:
         raise AegisError(f"'{path}' is {special}", "a regular file", "write it to a file first")
+
+
+def refuse_pointer(path: str | Path) -> None:
+    """Refuse what Git LFS leaves in place of a large file until it is pulled.
+
+    Those who read formats call it once they have failed: what they say sounds like damage.
+
+    Raises:
+        AegisError: it is such a pointer.
+    """
+    try:
+        with open(path, "rb") as file:
+            is_pointer = file.read(len(_LFS)) == _LFS
+    except (OSError, ValueError):  # a folder, or nothing: whoever reads it says so
+        return
+    if is_pointer:
+        raise AegisError(
+            f"'{path}' is a Git LFS pointer, which stands for a file that was not fetched",
+            "the file itself",
+            f"git lfs pull, in the repository of '{Path(path).parent}'",
+        )
 
 
 @contextlib.contextmanager

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import RENAME, canonical, check_utf8, parse_json, reading
+from aegis_cli.common.files import (
+    RENAME,
+    canonical,
+    check_utf8,
+    parse_json,
+    reading,
+    refuse_pointer,
+)
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
@@ -63,10 +70,10 @@ def schema(kind: str) -> int:
     return 1 + len(MIGRATIONS.get(kind, ()))
 
 
-def read_header(path: str | Path) -> Header:
-    """What a file is, from its header's bytes alone."""
-    with opened(path, None) as file:
-        return parse_header(path, file.metadata(), None)
+def read_header(path: str | Path, kind: str | None = None) -> Header:
+    """What a file is, from its header's bytes alone; of that kind, if one is given."""
+    with opened(path, kind) as file:
+        return parse_header(path, file.metadata(), kind)
 
 
 def is_artifact(path: str | Path) -> bool:
@@ -99,6 +106,7 @@ def opened(
             yield file
     except SafetensorError as error:
         check_utf8(path, RENAME)
+        refuse_pointer(path)
         problem = f"'{path}' is truncated or not a safetensors file ({error})"
         raise AegisError(problem, "a complete safetensors file", fix) from error
 
@@ -164,10 +172,12 @@ def _check_types(header: Header) -> None:
 
 def _check_kind(path: str | Path, kind: str, expected: str | None) -> None:
     if expected is not None and kind != expected:
+        option = KINDS[kind].option if kind in KINDS else None
         raise AegisError(
             f"'{path}' is of kind '{kind}'",
             f"a file of kind '{expected}'",
-            f"give the file that '{KINDS[expected].command}' wrote",
+            f"give the file that '{KINDS[expected].command}' wrote"
+            + (f"; this one belongs to {option}" if option else ""),
         )
     if kind not in KINDS:
         raise AegisError(

@@ -23,11 +23,13 @@ class Kind:
         command: the command that writes it.
         layout: its exact tensors; None where the model decides, and the header's own list counts.
         domain: yields what is wrong with the values of tensors that fit the layout.
+        option: by which commands take it, where one option does.
     """
 
     command: str
     layout: Callable[[Tensors], Layout] | None = None
     domain: Callable[[Tensors, Mapping[str, Any]], Iterable[str]] = lambda tensors, meta: ()
+    option: str | None = None
 
 
 def _anchor_layout(tensors: Tensors) -> Layout:
@@ -254,8 +256,8 @@ def _stream_task_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[s
 
 
 KINDS: dict[str, Kind] = {
-    "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain),
-    "demos": Kind("aegis demos", _demos_layout, _demos_domain),
+    "anchor": Kind("aegis anchor", _anchor_layout, _anchor_domain, "--anchor"),
+    "demos": Kind("aegis demos", _demos_layout, _demos_domain, "--demos"),
     "backbone": Kind("aegis pretrain"),
     "expert": Kind("aegis train"),
     "policy": Kind("aegis export"),

@@ -113,6 +113,12 @@ class Demonstrations:
         """The instructions of these frames, each once."""
         return [self.instructions[i] for i in self.instruction_of[self.read].unique().tolist()]
 
+    @cached_property
+    def without_instruction(self) -> Tensor:
+        """Numbers of the episodes that were read in which an instruction is empty or blank."""
+        blank = torch.tensor([not text.strip() for text in self.instructions])
+        return self.episode_of[self.read[blank[self.instruction_of[self.read]]]].unique()
+
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
         seen = [frames[frame] for frames in self.frames]
@@ -192,7 +198,8 @@ def at(path: str | Path) -> Path:
     """A path of demonstrations as somebody wrote it, or the id of a dataset on the hub.
 
     Raises:
-        AegisError: nothing is there, and it can be no id; './a/b' is none.
+        AegisError: nothing is there, and it can be no id, as './a/b'; or a file of a LeRobot
+            dataset, instead of its folder.
     """
     if not Path(path).exists() and hub.is_local(str(path)):
         raise AegisError(
@@ -200,7 +207,18 @@ def at(path: str | Path) -> Path:
             "a file of aegis demos, the folder of a LeRobot dataset, or its id on the hub",
             f"check the path, or record with: aegis demos{hub.not_asked(str(path))}",
         )
+    _refuse_inside(Path(path))
     return Path(path)
+
+
+def _refuse_inside(path: Path) -> None:
+    """Raise AegisError for one of the files that a LeRobot dataset consists of."""
+    if path.is_dir() or path.suffix == ".safetensors":
+        return
+    if (folder := next(filter(layout.is_dataset, path.absolute().parents), None)) is not None:
+        raise AegisError(
+            f"'{path}', a file of a LeRobot dataset", "the dataset's folder", f"give '{folder}'"
+        )
 
 
 def locate(path: Path, selection: Selection | None = None) -> Path:
@@ -257,6 +275,7 @@ def load(
     if here.is_dir():
         found = _load_folder(here, split, selection, image_size, workers, cache, on_event)
         return found if here == path else replace(found, dataset=str(path))
+    artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
     selection.check_file(here)
     return _load_file(here, split)
 

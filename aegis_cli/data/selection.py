@@ -35,6 +35,7 @@ class Selection:
 
     def check_file(self, path: Path) -> None:
         """Raise AegisError where something is chosen that a file of `aegis demos` does not have."""
+        of_anchor = {"camera": " (of aegis anchor: --camera)"}
         for name, what in (("camera", "a camera"), ("state", "features"), ("action", "features")):
             chosen = getattr(self, name)
             if chosen in (getattr(ALL, name), ()):
@@ -43,7 +44,7 @@ class Selection:
             raise AegisError(
                 f"demos.{name}: {named} with the file '{path}'",
                 f"a LeRobot folder, to choose {what} of",
-                f"leave demos.{name} out",
+                f"leave demos.{name}{of_anchor.get(name, '')} out",
             )
 
 

@@ -21,7 +21,7 @@ from aegis_cli.guard import accumulation
 from aegis_cli.guard.accumulation import Group
 from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
 from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
-from aegis_cli.guard.options import SECTIONS, start
+from aegis_cli.guard.options import SECTIONS, naming_its_part, start
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.guard.trainer_callback import trainer_callback
 from aegis_cli.methods import backward
@@ -104,7 +104,7 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
-        model = structure.part_of(model, part)
+        model, path = structure.part_of(model, part), Path(anchor)
         dual = methods.get(method).dual
         self._owners = _owners(model, accumulation.resolved(process_group))
         if dual:
@@ -117,11 +117,11 @@ class Guard(Removable):
                 "model.requires_grad_(True)",
             )
         # The other methods look at maps, and need not be told which modules are layers.
-        found = structure.find_layers(model, layers) if dual else {}
+        with naming_its_part(model, path, part):
+            found = structure.find_layers(model, layers) if dual else {}
         groups = structure.parameter_groups(model, found) if dual else {}
         pixels = structure.plain_parts(model, vision)
-        path = Path(anchor)
-        started = start(method, model, path, found, groups, pixels, options, self._owners)
+        started = start(method, model, path, found, groups, pixels, options, self._owners, part)
         self._parts, self._widths = started.parts, started.widths
         self.unprotected = started.unprotected
         self._compared = _COMPARED[options.get("scope", "all")]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -66,10 +67,12 @@ def start(
     vision: Sequence[str],
     options: Mapping[str, Any],
     owners: Ranks,
+    part: str | None = None,
 ) -> StartedMethod:
     """Check everything against everything, then start the method.
 
     Args:
+        part: the name by which the model was found in a policy, where it was.
         owners: the processes that have some rows of every weight.
 
     Raises:
@@ -79,9 +82,10 @@ def start(
     chosen = method_options(method, options)
     anchor, header = load_anchor(method, path)
     plain = plain_names(model)
-    if layers:
-        _check_layers(anchor, list(map(plain, layers)), header.meta.get("layers"), path)
-    plain = _names(model, header, path)
+    with naming_its_part(model, path, part):
+        if layers:
+            _check_layers(anchor, list(map(plain, layers)), header.meta.get("layers"), path)
+        plain = _names(model, header, path)
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
     if not methods.get(method).dual:
@@ -176,6 +180,39 @@ def _check_layers(
             f"{layers[0]} ... {layers[-1]}",
             fix,
         )
+
+
+@contextlib.contextmanager
+def naming_its_part(model: nn.Module, path: Path, part: str | None) -> Iterator[None]:
+    """Advise `part=` where a model does not fit an anchor, and a part of it does.
+
+    Raises:
+        AegisError: what is raised inside the block.
+    """
+    try:
+        yield
+    except AegisError as error:
+        found = None if part is not None else _measured_part(model, path)
+        if found is None:
+            raise
+        raise AegisError(
+            error.found,
+            f"the part of the {type(model).__name__} that anchor '{path}' was measured on",
+            f'part="{found}", and every other name as it is inside that part',
+        ) from error
+
+
+def _measured_part(model: nn.Module, path: Path) -> str | None:
+    """The name of the part whose weights an anchor was measured on; None if there is none."""
+    try:
+        wanted = artifacts.read_header(path).fingerprint
+    except AegisError:  # whoever loads it says what is wrong with it
+        return None
+    for name in structure.around_blocks(model):
+        inside = structure.part_of(model, name)
+        if wanted in (structure.fingerprint(inside, within=w) for w in ("", _IN_BACKBONE)):
+            return name
+    return None
 
 
 def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames:

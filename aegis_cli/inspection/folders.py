@@ -101,6 +101,7 @@ def _tensor_infos(weights: Path) -> Iterator[TensorInfo]:
                 part = opened.get_slice(name)
                 yield TensorInfo(name, tuple(part.get_shape()), part.get_dtype(), "1")
     except (SafetensorError, OSError) as error:
+        files.refuse_pointer(weights)
         found = f"'{weights}' is truncated or not a safetensors file ({error})"
         raise AegisError(found, "a complete file", "download it again") from error
 

@@ -33,8 +33,14 @@ def part_of(model: nn.Module, name: str | None) -> nn.Module:
     """The part of this dotted name, without wrappers around it; None: the model itself.
 
     Raises:
-        AegisError: no such part.
+        AegisError: no such part, or no model.
     """
+    if not isinstance(model, nn.Module):
+        raise AegisError(
+            f"a {type(model).__name__} in place of the model",
+            "a torch.nn.Module",
+            "give the model first, then the rest: Guard(model, anchor=FILE)",
+        )
     if name is None:
         return model
     found = wrappers.innermost(model, name)
@@ -119,6 +125,15 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
             found, "different transformer layers, at least one", _name_them(candidates)
         )
     return {names[id(layer)]: layer for layer in chosen}
+
+
+def around_blocks(model: nn.Module) -> list[str]:
+    """Plain names of the parts that lists of blocks lie in, the outer ones first."""
+    found = dict[str, None]()
+    for name in _block_lists(model):
+        words = name.split(".")[:-1]
+        found |= dict.fromkeys(".".join(words[: i + 1]) for i in range(len(words)))
+    return sorted(found, key=lambda name: name.count("."))
 
 
 def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:

@@ -71,7 +71,7 @@ def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
 
     A state of an earlier version does not tell its recipe.
     """
-    saved = artifacts.read_header(path)
+    saved = artifacts.read_header(path, "training-state")
     if saved.inputs.get("recipe") == digest(recipe):
         return
     began = saved.meta.get("recipe")

@@ -215,6 +215,7 @@ def build(
     # What is to be cut stays on the CPU: a GPU may have room for its share alone.
     backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     recorded = _loaded(recipe, backbone, demos, on_event, ranks)
+    _warn_of_no_instruction(demos, recorded, on_event)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
@@ -415,6 +416,20 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
     """What the method reads of the anchor."""
     found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
     return anchor_file.to_device(found, device)
+
+
+def _warn_of_no_instruction(
+    path: Path, found: demonstrations.Demonstrations, on_event: OnEvent
+) -> None:
+    """Warn of episodes that are learned from and whose instruction is an empty text, or blanks."""
+    learned = found.episode_of[found.read].unique()
+    if bare := len(found.without_instruction):
+        text = (
+            f"{bare} of the {len(learned)} episodes to learn from in '{path}' have no instruction, "
+            "but an empty text: a policy learns from them to act without being told what to do. "
+            "Write what they do as the dataset's tasks, or choose others with demos.only"
+        )
+        on_event(Warned("train", text))
 
 
 def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> None:

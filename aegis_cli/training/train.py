@@ -18,8 +18,9 @@ from aegis_cli import methods
 from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.headers import rewrite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
-from aegis_cli.common.state_dicts import reading_meta
+from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import augment, demonstrations
 from aegis_cli.data.batch import RobotBatch
@@ -135,7 +136,8 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
             "a run that aegis train wrote",
             "continue the run that was merged, or start anew in another --out",
         )
-    saved = artifacts.read_header(state)
+    with _reading_state(run.out):
+        saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
         changed = sorted(
             k
@@ -149,7 +151,10 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
         )
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, *_LOGGED)
-    done, meta, run.reused = checkpoint.restore(run.out, run.policy, run.optimizers, run.average)
+    with _reading_state(run.out):
+        done, meta, run.reused = checkpoint.restore(
+            run.out, run.policy, run.optimizers, run.average
+        )
     _check_behind(run, done, meta, kept, lines)
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
@@ -161,6 +166,26 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     if run.ranks.first:
         folder.truncate_metrics(run.out, done)
     return done, window
+
+
+@contextmanager
+def _reading_state(out: Path) -> Iterator[None]:
+    """Say how a run can go on whose last training state would have to be written again.
+
+    Raises:
+        AegisError: what is raised inside the block.
+    """
+    try:
+        yield
+    except AegisError as error:
+        if error.fix != AS_WRITTEN and rewrite("training-state") not in error.fix:
+            raise
+        link = checkpoint.last(out)
+        older = [path for path in checkpoint.whole(out) if path.name < link.resolve().name]
+        fix = "bring back a copy of it, or begin anew with --overwrite instead of --resume"
+        if older and link.is_symlink():
+            fix = f"go on from an earlier checkpoint: ln -sfn {older[-1].name} '{link}'; or {fix}"
+        raise AegisError(error.found, error.expected, fix) from error
 
 
 def _check_behind(

@@ -127,6 +127,16 @@ def test_files_in_each_others_place(command: tuple[str, ...], bad: Callable[...,
     bad(*command)
 
 
+@pytest.mark.parametrize("override", [(), ("--set", "demos.camera=top")])
+def test_demonstrations_and_anchor_in_each_others_place_are_told_their_options(
+    override: tuple[str, ...], bad: Callable[..., str]
+) -> None:
+    both = training(demos="anchor.safetensors", anchor="demos.safetensors")
+    err = bad(*both, *override, says=("'anchor.safetensors' is of kind 'anchor'", "--anchor"))
+    assert "demos.camera" not in err
+    bad(*training(anchor="demos.safetensors"), says=("of kind 'demos'", "belongs to --demos"))
+
+
 @pytest.mark.parametrize("command", ["inspect", "probe", "rollout", "export"])
 def test_a_run_whose_path_is_no_text_is_told_so(
     command: str, bad: Callable[..., str], trained: Path, place: Path

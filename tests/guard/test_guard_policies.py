@@ -206,3 +206,21 @@ def test_a_part_that_the_policy_does_not_have(anchors: dict[str, Path]) -> None:
         Guard(Policy(make()), anchors["aegis"], LAYERS, part="vml")
     assert "vlm, expert" in caught.value.expected
     assert structure.part_of(Policy(make()), None).__class__ is Policy
+
+
+@pytest.mark.parametrize("layers", [None, LAYERS, f"vlm.{LAYERS}"])
+def test_the_part_that_the_anchor_was_measured_on_is_named_where_it_is_left_out(
+    layers: str | None, anchors: dict[str, Path]
+) -> None:
+    with pytest.raises(AegisError) as caught:
+        Guard(Policy(make()), anchors["aegis"], layers)
+    assert str(anchors["aegis"]) in caught.value.expected and 'part="vlm"' in caught.value.fix
+    with pytest.raises(AegisError) as caught:
+        Guard(Policy(make()), anchors["nullspace"], method="nullspace", vision="vlm.vision")
+    assert 'part="vlm"' in caught.value.fix
+
+
+def test_no_part_is_named_that_was_not_measured(anchors: dict[str, Path]) -> None:
+    with pytest.raises(AegisError) as caught:
+        Guard(Policy(make(seed=5)), anchors["aegis"])
+    assert "part=" not in caught.value.fix and f"vlm.{LAYERS}" in caught.value.fix

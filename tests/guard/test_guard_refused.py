@@ -75,6 +75,12 @@ def test_options(options: dict[str, Any], words: tuple[str, ...], anchor: Path) 
     refused(lambda: Guard(make(), anchor, **({"layers": LAYERS} | options)), *words)
 
 
+def test_a_model_and_an_anchor_in_each_others_place(anchor: Path) -> None:
+    for given in (anchor, str(anchor)):
+        refused(lambda given=given: Guard(given, make()), "in place of the model", "Guard(model,")
+        refused(lambda given=given: Guard.measure(given), "in place of the model")
+
+
 def test_files_that_are_no_anchor_of_this_model(anchor: Path, tmp_path: Path) -> None:
     refused(
         lambda: Guard(make(), tmp_path / "none.safetensors", LAYERS), "no file", "none.safetensors"

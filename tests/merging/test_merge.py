@@ -279,7 +279,9 @@ def test_a_hugging_face_pair(
 
     base, tuned = hf_folder("smolvlm"), hf.write("smolvlm", tmp_path / "tuned", seed=1)
     words = (tuned, "--base", base, "--strength")
-    merge(*words, 0.5, "--method", "linear", "--out", tmp_path / "line")
+    line = ("--method", "linear", "--out", tmp_path / "line", "--json")
+    code, _, said = aegis("merge", *words, 0.5, *line)
+    assert code == 0 and "scenes" not in said  # no question is asked
     pre, post, merged = map(parameters, (base, tuned, tmp_path / "line"))
     for name, found in merged.items():
         torch.testing.assert_close(found, (pre[name] + post[name]) / 2, rtol=0, atol=1e-5)
@@ -304,6 +306,9 @@ def test_options_that_do_not_go_together(aegis: Aegis, merge_place: Place, tmp_p
     bad(aegis, run, "--strength", 1, "--sweep", "1", "--out", out, says=("--sweep",))
     bad(aegis, run, "--strength", 1, says=("--out",))
     bad(aegis, run, "--max-drop", 1, says=("--out",))
+    unasked = ("--strength", 0.5, "--out", out, "--vqa", "nonsense.jsonl")
+    bad(aegis, run, "--method", "linear", *unasked, says=("--vqa nonsense.jsonl", "linear"))
+    bad(aegis, run, "--anchor", merge_place.anchor, *unasked, says=("--vqa", "--anchor"))
     bad(aegis, run, "--out", out, says=("--max-drop", "--strength"))
     bad(aegis, run, "--sweep", "1,,2", says=("1,10,100",))
     bad(aegis, run, "--sweep", "1,-2", says=("0 or more",))

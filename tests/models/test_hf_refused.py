@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from samples.backbones import TEXTS, encode, images
 from samples.hf import FAMILIES as MADE
 from samples.hf import SIZE, WITH_TORCHVISION, make_tokenizer, save_processor, write
-from samples.user_folder import TRAIN
+from samples.user_folder import LFS_POINTER, TRAIN
 from transformers.utils import is_torchvision_available
 
 from aegis_cli import inspection
@@ -360,6 +360,12 @@ def test_a_file_that_is_missing_or_cut(
     if keep is not None:
         path.write_bytes(data[: int(keep * len(data))])
     bad(*MEASURE, "model", says=("model",))
+
+
+def test_weights_that_git_lfs_has_not_fetched(bad: Bad, model: Path) -> None:
+    (model / "model.safetensors").write_text(LFS_POINTER)
+    for command in ((*MEASURE, "model"), ("inspect", "model")):
+        bad(*command, says=("model.safetensors", "Git LFS pointer", "git lfs pull"))
 
 
 def test_the_configuration_of_another_size(bad: Bad, model: Path) -> None:

@@ -22,6 +22,8 @@ PRETRAIN = PretrainRecipe(
     model=Model(width=32, depth=2, heads=2),
 )
 
+LFS_POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345678\n"
+
 
 @pytest.fixture
 def place(

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from samples.small_run import flipped
 from samples.training_runs import SETTINGS, STEPS, Start, assert_same_run, contents, stop_at
 from torch import Tensor
 
@@ -265,6 +267,35 @@ def test_a_training_state_that_does_not_fit_is_refused(
 ) -> None:
     resaved(checkpoint.last(run) / checkpoint.STATE, change)
     refused(found, start, "aegis", run, resume=True)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
+def test_a_run_with_a_damaged_state_goes_on_from_an_earlier_checkpoint_or_anew(
+    keep: float, run: Path, start: Start, tmp_path: Path
+) -> None:
+    """As the error says: both end in the bytes of a run that was never interrupted."""
+    state = checkpoint.last(run) / checkpoint.STATE
+    data = state.read_bytes()
+    state.write_bytes(data[: int(keep * len(data))])
+    said = refused("truncated", start, "aegis", run, resume=True).fix
+    link = run / "checkpoints" / "last"
+    assert f"ln -sfn 000002 '{link}'" in said and "--overwrite" in said and "run '" not in said
+    start("aegis", tmp_path / "whole")
+    shutil.copytree(run, tmp_path / "anew", symlinks=True)
+    start("aegis", tmp_path / "anew", overwrite=True)
+    subprocess.run(said.partition("; ")[0].partition(": ")[2], shell=True, check=True)
+    start("aegis", run, resume=True)
+    for out in (run, tmp_path / "anew"):
+        assert_same_run(out, tmp_path / "whole")
+
+
+def test_the_only_checkpoints_damage_leaves_to_begin_anew(start: Start, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        start("naive", tmp_path, on_event=stop_at(3, KeyboardInterrupt()))
+    state = checkpoint.last(tmp_path) / checkpoint.STATE
+    state.write_bytes(flipped(state.read_bytes()))
+    said = refused("is damaged", start, "naive", tmp_path, resume=True).fix
+    assert "--overwrite" in said and "ln -sfn" not in said
 
 
 def test_another_steps_state_is_refused(run: Path, start: Start) -> None:

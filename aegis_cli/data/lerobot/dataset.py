@@ -63,7 +63,7 @@ class Dataset:
             raise AegisError(
                 f"the camera '{twice[0]}' twice",
                 "each camera once",
-                "take one of them out of demos.camera",
+                "name it once, in demos.camera, or as --camera of aegis anchor",
             )
         return found
 
@@ -108,10 +108,14 @@ def _choose(cameras: tuple[str, ...]) -> str:
     if not cameras:
         return "give a dataset with pictures"
     one = f"--set demos.camera={cameras[0]}"
+    of_anchor = f"for aegis anchor: --camera {cameras[0]}"
     if len(cameras) == 1:
-        return one
+        return f"{one}; {of_anchor}"
     several = f"--set 'demos.camera=[{', '.join(cameras)}]'"
-    return f"{one}; a Hugging Face backbone also reads several: {several}"
+    return (
+        f"{one}; a Hugging Face backbone also reads several: {several}; {of_anchor}, which is "
+        "repeatable"
+    )
 
 
 def load(folder: Path) -> Dataset:

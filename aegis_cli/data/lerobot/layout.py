@@ -377,6 +377,7 @@ def damaged(path: Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        files.refuse_pointer(path)
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(
             f"'{path}' is damaged: {what}", "a file of LeRobot's dataset format", AGAIN
@@ -395,6 +396,7 @@ def reading_parquet(path: Path) -> Iterator[None]:
             f"no file '{path}'", "every file that the dataset's meta folder names", AGAIN
         ) from error
     except (ArrowException, OSError, ValueError, MemoryError) as error:
+        files.refuse_pointer(path)
         what = (str(error).splitlines() or ["it cannot be read"])[0]
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error
 

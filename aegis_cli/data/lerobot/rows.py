@@ -12,6 +12,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.source import LEFT_OUT, WITHOUT, DataFile, Source, column, numbers
 
+_RATE_TOLERANCE = 0.1  # share of a step by which the usual one may differ from 1 / fps
+
 
 @dataclass(frozen=True)
 class Index:
@@ -31,10 +33,11 @@ def read_index(source: Source) -> Index:
 
     Raises:
         AegisError: a file that is missing or damaged, rows that are out of place, a task without a
-            text.
+            text, times of another rate than the dataset's.
     """
     frames, texts = source.dataset.info.frames, len(source.dataset.tasks)
     index = Index(np.zeros(frames), np.zeros(frames, np.int64))
+    steps = [np.zeros(0)]
     for file in source.data:
         time, frame, task = (
             _numbers(file, name) for name in ("timestamp", "frame_index", "task_index")
@@ -44,8 +47,10 @@ def read_index(source: Source) -> Index:
             tasks, *_ = source.dataset.table_files
             found = f"'{file.path}' has a task_index that '{tasks}' lacks"
             raise AegisError(found, f"0 to {texts - 1}", layout.AGAIN)
+        steps.append(np.diff(time)[frame[1:] > 0])  # those between frames of one episode
         _put(index.timestamp, file, time)
         _put(index.task, file, task.astype(np.int64))
+    _check_rate(source, np.concatenate(steps))
     return index
 
 
@@ -117,6 +122,25 @@ def _check_order(source: Source, file: DataFile, frame: np.ndarray) -> None:
             f"row {row} of '{file.path}' is frame {int(frame[place])} of episode {episode}",
             f"frame {wanted[place]} of episode {episode}",
             WITHOUT,
+        )
+
+
+def _check_rate(source: Source, steps: np.ndarray) -> None:
+    """Raise AegisError where the usual step between frames, in seconds, is not one of `fps`.
+
+    LeRobot refuses each step that is off by 0.1 ms, and so also a recording that has a gap.
+    """
+    if not len(steps):
+        return
+    fps, step = source.dataset.info.fps, float(np.median(steps))
+    if abs(step - 1 / fps) > _RATE_TOLERANCE / fps:
+        folder = source.dataset.folder
+        raise AegisError(
+            f"frames of '{folder}' are {1000 * step:.4g} ms apart, by their timestamps",
+            f"{1000 / fps:.4g} ms, since {layout.INFO} says fps {fps:g}",
+            f"set fps in {folder / layout.INFO} to the rate at which the robot was controlled"
+            + (f", here {1 / step:.4g}" if step > 0 else "")
+            + ", or mend the timestamps",
         )
 
 

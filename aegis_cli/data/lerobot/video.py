@@ -75,6 +75,7 @@ def _reading(path: Path) -> Iterator[None]:
             f"no file '{path}'", "every file that the dataset's meta folder names", layout.AGAIN
         ) from error
     except (av.FFmpegError, OSError) as error:
+        files.refuse_pointer(path)
         raise AegisError(
             f"'{path}' is damaged: {error.strerror or error}", "an mp4 file", layout.AGAIN
         ) from error

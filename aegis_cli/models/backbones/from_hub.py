@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from torch import nn
 from transformers.utils import logging
 
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models.backbones import model_folder
 
@@ -41,6 +42,8 @@ def loading(folder: Path, what: str) -> Iterator[None]:
     try:
         yield
     except _UNLOADABLE as error:
+        for path in model_folder.weights(folder):
+            files.refuse_pointer(path)
         if "torchvision" in str(error).lower():
             raise AegisError(
                 f"the {what} in '{folder}' needs torchvision, which is not installed",

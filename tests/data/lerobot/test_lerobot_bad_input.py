@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 from samples.lerobot import data_files, edit_info, edit_table, episodes, replaced, save
-from samples.user_folder import TRAIN, training
+from samples.user_folder import LFS_POINTER, TRAIN, training
 
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.data.lerobot.write import Limits
@@ -77,6 +77,17 @@ def test_a_folder_that_is_no_dataset(bad: Bad, place: Path) -> None:
     bad("run", "small.yaml", "--set", "demos.path=d", says=("'d' is no dataset folder",))
     bad("run", "small.yaml", "--set", "demos.path=nothing", says=("nothing",))
     bad("inspect", "d", says=("LeRobot",))
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", IMAGE])
+def test_a_file_of_a_dataset_in_place_of_its_folder(name: str, bad: Bad, folder: Path) -> None:
+    commands = (
+        training(demos=f"d/{name}"),
+        ("run", "small.yaml", "--set", f"demos.path=d/{name}"),
+        ("anchor", "--demos", f"d/{name}", "--out", "a.safetensors"),
+    )
+    for command in commands:
+        bad(*command, says=(f"'d/{name}', a file of a LeRobot dataset", f"give '{folder}'"))
 
 
 def test_a_path_that_is_no_text_is_not_called_damage(bad: Bad, folder: Path) -> None:
@@ -161,7 +172,15 @@ def test_a_camera_has_to_be_chosen(bad: Bad, place: Path) -> None:
     both = ("observation.images.top", "observation.images.wrist")
     bad(*FROM_FOLDER, says=("2 cameras", *both, "--set demos.camera="))
     bad(*FROM_FOLDER, "--set", "demos.camera=front", says=("no camera 'front'", *both))
-    bad(*TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera out"))
+    bad(
+        *TRAIN, "--set", "demos.camera=top", says=("demos.safetensors", "leave demos.camera", "out")
+    )
+    of_anchor = ("anchor", "--demos", "d", "--out", "a.safetensors")
+    bad(*of_anchor, says=("2 cameras", "aegis anchor: --camera observation.images.top,"))
+    bad(*of_anchor, "--camera", "front", says=("no camera 'front'", "aegis anchor: --camera"))
+    bad(*of_anchor, "--camera", "top", "--camera", "top", says=("twice", "--camera of aegis"))
+    file = ("anchor", "--demos", "demos.safetensors", "--out", "a.safetensors")
+    bad(*file, "--camera", "top", says=("demos.safetensors", "(of aegis anchor: --camera) out"))
     several = (
         "top, wrist with a backbone that reads one image",
         "Hugging Face",
@@ -277,6 +296,21 @@ def test_a_place_or_time_that_is_no_number(
     bad(*FROM_FOLDER, says=(IMAGE, f"NaN or infinite values in '{column}'"))
 
 
+@pytest.mark.parametrize(("fps", "step"), [(5, "200 ms"), (15, "66.67 ms"), (1e4, "0.1 ms")])
+def test_another_rate_than_that_of_the_timestamps(
+    fps: float, step: str, bad: Bad, folder: Path
+) -> None:
+    edit_info(folder, lambda info: info.update(fps=fps))
+    bad(*FROM_FOLDER, says=("100 ms apart", step, f"fps {fps:g}", "here 10,"))
+
+
+def test_times_that_stand_still(bad: Bad, folder: Path) -> None:
+    edit_table(
+        folder / IMAGE, lambda t: replaced(t, "timestamp", pa.array(np.zeros(len(t), np.float32)))
+    )
+    bad(*FROM_FOLDER, says=("0 ms apart", "fps 10", "mend the timestamps"))
+
+
 @pytest.mark.parametrize(
     "column", ["length", "episode_index", "dataset_from_index", "data/chunk_index"]
 )
@@ -320,6 +354,16 @@ def test_a_corrupt_parquet_file(name: str, damage: str, bad: Bad, folder: Path) 
         data[_page(path)] ^= 1
     path.write_bytes({"truncated": data[:-30], "flipped": data, "foreign": b"hello"}[damage])
     bad(*FROM_FOLDER, says=(name, "is damaged"))
+
+
+@pytest.mark.parametrize("name", [IMAGE, EPISODES, "meta/tasks.parquet", "meta/info.json", VIDEO])
+def test_a_pointer_of_git_lfs_is_not_called_damage(
+    name: str, bad: Bad, place: Path, images: Path, videos: Path
+) -> None:
+    folder = shutil.copytree(videos if name == VIDEO else images, place / "d")
+    (folder / name).write_text(LFS_POINTER)
+    says = bad(*FROM_FOLDER, says=(name, "Git LFS pointer", "git lfs pull"))
+    assert "damaged" not in says
 
 
 def _page(path: Path) -> int:

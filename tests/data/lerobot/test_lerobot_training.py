@@ -37,7 +37,7 @@ from samples.training_runs import (
 
 from aegis_cli.common import artifacts, prefetch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import frames as camera_frames
@@ -46,7 +46,7 @@ from aegis_cli.data.lerobot.write import Limits
 from aegis_cli.data.selection import Selection
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, train
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -102,6 +102,40 @@ def test_an_episodes_text_may_change_from_frame_to_frame(tmp_path: Path) -> None
     assert loaded.batch(np.arange(6), 2).instructions == [
         loaded.instructions[i % 3] for i in range(6)
     ]
+
+
+def test_a_rate_may_be_off_a_little_and_a_recording_may_have_gaps(tmp_path: Path) -> None:
+    folder = save(tmp_path / "d", episodes(4))
+    edit_info(folder, lambda info: info.update(fps=10.9))
+    path = data_files(folder)[0]
+    edit_table(path, lambda t: replaced(t, "timestamp", _with_a_gap(t["timestamp"])))
+    assert demonstrations.load(folder, 0.3, 0).fps == 10.9
+
+
+def _with_a_gap(column: pa.ChunkedArray) -> pa.Array:
+    """The times of an episode's first five frames, of which the last comes a second later."""
+    times = column.to_numpy().copy()
+    times[4] += 1
+    return pa.array(times)
+
+
+def test_episodes_without_an_instruction_are_told_before_they_are_learned_from(
+    tmp_path: Path, tiny_folder: Path
+) -> None:
+    def warned(folder: Path, **demos: Any) -> list[str]:
+        said: list[Event] = []
+        recipe = replace(small_recipe(tiny_folder, steps=1), demos=Demos(**demos))
+        train.run(recipe, "naive", folder, None, tmp_path / "run", False, said.append, True)
+        return [event.text for event in said if isinstance(event, Warned)]
+
+    texts = ("go to the red target", "", " \t", "go to the red target", "", "go to the red target")
+    made = [replace(e, instruction=t) for e, t in zip(episodes(6), texts, strict=True)]
+    folder = save(tmp_path / "d", made)
+    (said,) = warned(folder)
+    assert f"3 of the 6 episodes to learn from in '{folder}'" in said and "demos.only" in said
+    (said,) = warned(folder, only="0,2-3")
+    assert "1 of the 3 episodes" in said
+    assert warned(folder, only="0,3,5") == []
 
 
 @pytest.mark.parametrize("as_video", [False, True])
