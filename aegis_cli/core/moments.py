@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aegis_cli.core import joint
+
 # Rows summed in float32 before the sum moves to float64. Centred rows of one block lose at most
 # ~64 rounding errors of 6e-8 (measured on 5,000 rows: 2e-8 relative on the variance), at half the
 # cost of converting every row to float64.
@@ -94,17 +96,38 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """What `batch_moments` returns, without selecting rows, so that their number is not read."""
-    x = h.flatten(0, 1)
-    x = x if x.dtype == torch.float64 else x.float()
-    valid = mask.flatten()[:, None]  # [n, 1]
+    """What `batch_moments` returns, without selecting rows, so that their number is not read.
+
+    Args:
+        h: hidden states [B, T, D], or [n, B, T, D] of n layers, whose results are [n, D].
+        mask: [B, T] bool.
+    """
+    x, valid = _all_rows(h, mask)
     count = valid.sum()
-    mean = x.masked_fill(~valid, 0).sum(0) / count
-    return mean, (x - mean).masked_fill(~valid, 0).square().sum(0) / count
+    mean = x.masked_fill(~valid, 0).sum(-2) / count
+    deviations = (x - mean.unsqueeze(-2)).masked_fill(~valid, 0)
+    return mean, deviations.square().sum(-2) / count
+
+
+def joint_moments(hidden: Sequence[Tensor], mask: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """What `padded_moments` returns of each layer, by fewer kernels: several layers have one.
+
+    Args:
+        hidden: each layer's output, L tensors [B, T, D].
+        mask: [B, T] bool.
+    """
+    found: list[tuple[Tensor, Tensor]] = []
+    for layers in _together(hidden):
+        means, variances = padded_moments(layers, mask)
+        found.extend(zip(means.unbind(), variances.unbind(), strict=True))
+    return found
 
 
 def shared_moments(
-    hidden: Sequence[Tensor], mask: Tensor, total: Callable[[Tensor], Tensor]
+    hidden: Sequence[Tensor],
+    mask: Tensor,
+    total: Callable[[Tensor], Tensor],
+    reads: bool = True,
 ) -> list[tuple[Tensor, Tensor]]:
     """Each layer's mean [D] and variance [D] of a batch that several processes share.
 
@@ -115,15 +138,53 @@ def shared_moments(
         hidden: each layer's output, L tensors [B, T, D].
         mask: [B, T] bool.
         total: a tensor -> its sum over the processes.
+        reads: whether the number of valid tokens may be read, which on a GPU waits for it.
     """
-    layers = [_valid_rows(h, mask) for h in hidden]
-    count = total(layers[0].new_tensor(len(layers[0])))
-    means = total(torch.stack([x.sum(0) for x in layers])) / count  # [L, D]
+    if reads:
+        rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
+        valid = torch.ones((), dtype=torch.bool, device=mask.device)
+        here = rows[0].new_tensor(rows[0].shape[1])
+    else:
+        rows = []
+        for layers in _together(hidden):
+            x, valid = _all_rows(layers, mask)
+            rows.append(x.masked_fill(~valid, 0))
+        here = valid.sum().to(rows[0].dtype)
+    count = total(here)
+    means = total(torch.cat([x.sum(1) for x in rows])) / count  # [L, D]
     squares = []
     # The centre's gradient is left out: over all tokens it is 0, but not over a share of them.
-    for x, centre in zip(layers, means.detach(), strict=True):
-        squares.append((x - centre).square().sum(0))
-    return list(zip(means, total(torch.stack(squares)) / count, strict=True))
+    centres = means.detach().split([len(x) for x in rows])
+    for x, centre in zip(rows, centres, strict=True):
+        deviations = x - centre.unsqueeze(1)
+        if not reads:
+            deviations = deviations.masked_fill(~valid, 0)
+        squares.append(deviations.square().sum(1))
+    return list(zip(means, total(torch.cat(squares)) / count, strict=True))
+
+
+def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
+    """Layers that follow each other, stacked [n, B, T, D] while their shapes are alike.
+
+    As many as have `joint.MOST` entries, since larger ones keep a GPU busy by themselves.
+    """
+    groups: list[list[Tensor]] = []
+    for h in hidden:
+        last = groups[-1] if groups else []
+        alike = bool(last) and (last[0].shape, last[0].dtype) == (h.shape, h.dtype)
+        if not alike or (len(last) + 1) * h.numel() > joint.MOST:
+            groups.append([])
+        groups[-1].append(h)
+    return [torch.stack(group) for group in groups]
+
+
+def _all_rows(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """All rows [..., n, D] of hidden states [..., B, T, D], and which are valid [n, 1].
+
+    They are in float32, or float64 if h is.
+    """
+    x = h.flatten(-3, -2)
+    return x if x.dtype == torch.float64 else x.float(), mask.flatten()[:, None]
 
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:

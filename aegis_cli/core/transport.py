@@ -14,13 +14,13 @@ WEIGHTINGS = ("none", "variance")
 
 
 def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
-    """Squared W2 distance: W2^2 = |mu1 - mu2|^2 + |sigma1 - sigma2|^2, all [D] -> scalar.
+    """Squared W2 distance: W2^2 = |mu1 - mu2|^2 + |sigma1 - sigma2|^2, all [..., D] -> [...].
 
     For diagonal covariances this is the general formula |mu1 - mu2|^2
     + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982). The gradient is finite
     everywhere, also where a variance is 0.
     """
-    return (mean1 - mean2).square().sum() + (_std(var1) - _std(var2)).square().sum()
+    return (mean1 - mean2).square().sum(-1) + (_std(var1) - _std(var2)).square().sum(-1)
 
 
 def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
@@ -68,13 +68,22 @@ def transport_penalty(
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
-    per_layer = []
-    for (mean, var), measured in zip(moments, anchor, strict=True):
-        per_layer.append(w2_diag(mean, var, measured.mean, measured.var))
-    w2 = torch.stack(per_layer)
+    w2 = _of_each_layer(moments, anchor)
     if weights is None:
         weights = layer_weights(anchor, weighting)
     return (w2 * weights).mean(), w2.detach()
+
+
+def _of_each_layer(moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Moments]) -> Tensor:
+    """W2^2 of each layer [L]."""
+    each = []
+    for (mean, var), measured in zip(moments, anchor, strict=True):
+        each.append((mean, var, measured.mean, measured.var))
+    if len({mean.shape for mean, *_ in each}) == 1:
+        # One computation for all layers, where a GPU would start dozens for each.
+        mean, var, then, spread = (torch.stack(part) for part in zip(*each, strict=True))
+        return w2_diag(mean, var, then, spread)
+    return torch.stack([w2_diag(*layer) for layer in each])
 
 
 def _std(var: Tensor) -> Tensor:

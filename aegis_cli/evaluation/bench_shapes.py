@@ -157,19 +157,21 @@ def run(
     measured: dict[str, _Measured | None] = {}  # parts; None did not fit into memory
     found: dict[str, _Measured | None] = {}  # methods, likewise
 
-    def tell() -> None:
+    def tell(name: str, last: _Measured | None) -> None:
+        """Say how far it is and what was measured last, which an interruption would lose."""
         done, total = len(measured) + len(found), len(parts) + len(names)
-        on_event(Progress("bench shape", done, total, "processes"))
+        figures = {} if last is None else {f"{name} s": last.seconds, "GB": last.peak / 1e9}
+        on_event(Progress("bench shape", done, total, "processes", figures))
 
     with tempfile.TemporaryDirectory() as folder, _Processes() as processes:
         out = Path(folder)
         for part in parts:
             measured[part] = processes.run(_measure_part, f"random:{shape}", part, out)
-            tell()
+            tell(part, measured[part])
         for name, recipe in recipes_by_name.items():
             lacks = any(measured[part] is None for part in methods.get(name).needs)
             found[name] = None if lacks else processes.run(_measure_method, recipe, out, turns)
-            tell()
+            tell(name, found[name])
     costs = {part: _part_cost(each) for part, each in measured.items() if each is not None}
     return _report(shape, recipes_by_name[NAIVE].train, turns, found, costs)
 

@@ -29,8 +29,8 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import (
     Moments,
     batch_moments,
+    joint_moments,
     merge,
-    padded_moments,
     shared_moments,
 )
 from aegis_cli.core.transport import layer_weights, transport_penalty
@@ -102,13 +102,14 @@ def _cost(
 ) -> tuple[Tensor, Tensor]:
     inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
     mask = seen.mask & inside
-    if seen.total is None:
-        # To select rows on a GPU would wait for their number, once a layer.
-        waits = devices.reading_waits(mask.device)
-        moments_of = padded_moments if waits else batch_moments
-        moments = [moments_of(hidden, mask) for hidden in seen.hidden]
+    # To select rows on a GPU would wait for their number, once a layer.
+    waits = devices.reading_waits(mask.device)
+    if seen.total is not None:
+        moments = shared_moments(seen.hidden, mask, seen.total, reads=not waits)
+    elif waits:
+        moments = joint_moments(seen.hidden, mask)
     else:
-        moments = shared_moments(seen.hidden, mask, seen.total)
+        moments = [batch_moments(hidden, mask) for hidden in seen.hidden]
     return transport_penalty(moments, anchor, weights=weights)
 
 

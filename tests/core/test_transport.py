@@ -77,9 +77,11 @@ def test_nan_is_not_swallowed() -> None:
 
 
 @pytest.mark.parametrize("weighting", ["none", "variance"])
-def test_penalty_is_the_weighted_mean_over_layers(weighting: str) -> None:
-    anchor = [Moments(10, *gaussian(i, width=5 + i)) for i in range(3)]
-    now = [gaussian(i + 20, width=5 + i) for i in range(3)]
+@pytest.mark.parametrize("widens", [0, 1])
+def test_penalty_is_the_weighted_mean_over_layers(weighting: str, widens: int) -> None:
+    """Of layers of one width, which are compared at once, and of several."""
+    anchor = [Moments(10, *gaussian(i, width=5 + widens * i)) for i in range(3)]
+    now = [gaussian(i + 20, width=5 + widens * i) for i in range(3)]
     penalty, w2 = transport_penalty(now, anchor, weighting)
     each = [w2_diag(*moments, a.mean, a.var) for moments, a in zip(now, anchor, strict=True)]
     scale = [a.var.sum() if weighting == "variance" else 1.0 for a in anchor]

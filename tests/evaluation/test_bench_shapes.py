@@ -59,6 +59,8 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     assert list(found.methods) == ["naive", "lora", "aegis", "nullspace"]
     assert list(found.anchor) == ["inputs", "moments"]
     assert [(e.done, e.total) for e in events] == [(i, 6) for i in range(1, 7)]
+    # What an interruption would lose is told as soon as it is known.
+    assert events[-1].metrics["nullspace s"] == found.methods["nullspace"].step_s
     naive, aegis = found.methods["naive"], found.methods["aegis"]
     assert naive.step_time == naive.peak_memory == 1 and naive.mfu is None
     assert naive.step_s is not None and aegis.step_s is not None

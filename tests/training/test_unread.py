@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,12 @@ from torch import Tensor
 from aegis_cli.common import artifacts, devices, prefetch
 from aegis_cli.common.errors import Diverged
 from aegis_cli.core import joint, projection
-from aegis_cli.core.moments import batch_moments, padded_moments
+from aegis_cli.core.moments import (
+    batch_moments,
+    joint_moments,
+    padded_moments,
+    shared_moments,
+)
 from aegis_cli.methods import METHODS, distill, kfac
 from aegis_cli.recipes import Aegis, Recipe
 from aegis_cli.training import assemble, step, train
@@ -255,6 +260,47 @@ def test_moments_without_selecting_rows_are_the_same() -> None:
         gradients.append((mean, var, gradient))
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+def graded(found: Sequence[tuple[Tensor, Tensor]], hidden: Sequence[Tensor]) -> list[Tensor]:
+    """Means, variances and a gradient of each layer."""
+    total = torch.stack([(mean.square() + var).sum() for mean, var in found]).sum()
+    gradients = torch.autograd.grad(total, hidden)
+    return [tensor for pair in found for tensor in pair] + list(gradients)
+
+
+def test_moments_of_several_layers_at_once_are_those_of_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, *_, mask = some_states()
+    of_another_width = torch.ones(3, 7, 2, dtype=torch.float64, requires_grad=True)
+    layers = [first, (2 * first).detach().requires_grad_(), of_another_width]
+    layers += [(i + first).detach().requires_grad_() for i in range(5)]
+    expected = graded([padded_moments(h, mask) for h in layers], layers)
+    # As many as two layers have: the last five are three groups.
+    for most in (joint.MOST, 2 * first.numel(), 1):
+        monkeypatch.setattr(joint, "MOST", most)
+        found = graded(joint_moments(layers, mask), layers)
+        for one, other in zip(expected, found, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+def test_moments_that_processes_share_are_the_same_without_selecting_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, _, mask = some_states()
+    layers = [(i + first).detach().requires_grad_() for i in range(3)]
+
+    def total(here: Tensor) -> Tensor:
+        """The sum over two processes, the other one of which has other tokens."""
+        return here + torch.ones_like(here)
+
+    expected = graded(shared_moments(layers, mask, total), layers)
+    for most in (joint.MOST, 2 * first.numel()):
+        monkeypatch.setattr(joint, "MOST", most)
+        found = graded(shared_moments(layers, mask, total, reads=False), layers)
+        for one, other in zip(expected, found, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("shared", [False, True])
