@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +25,7 @@ class JoinedFrames:
     def __init__(self, parts: Sequence[Tensor | FramesOnDemand | FittedFrames]) -> None:
         """Number the frames through, in the order of the sets."""
         self.parts = tuple(parts)
-        self._ends = torch.tensor([len(part) for part in self.parts]).cumsum(0)
+        self._ends = np.cumsum([len(part) for part in self.parts])
         self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
 
     def __len__(self) -> int:
@@ -33,8 +34,8 @@ class JoinedFrames:
     def __getitem__(self, numbers: Tensor) -> Tensor:
         """Frames [B, H, W, 3] by their numbers [B] int64."""
         found = torch.empty((len(numbers), *self.shape[1:]), dtype=torch.uint8)
-        of_part = torch.bucketize(numbers.contiguous(), self._ends, right=True)
-        for index in of_part.unique().tolist():
-            part, own = self.parts[index], of_part == index
+        of_part = np.searchsorted(self._ends, numbers.numpy(), side="right")
+        for index in np.unique(of_part).tolist():
+            part, own = self.parts[index], torch.from_numpy(of_part == index)
             found[own] = part[numbers[own] - (int(self._ends[index]) - len(part))]
         return found
