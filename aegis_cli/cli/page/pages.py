@@ -108,7 +108,9 @@ def _trained(run: At) -> Markup:
 def _weights(recipe: At) -> list[tuple[str, str]]:
     """A line on the shares of several sets, where they are not those of their frames."""
     weights = recipe["demos"]["weights"]
-    return [("Their shares", " : ".join(map(str, weights)))] if weights else []
+    return (
+        [("Their shares", " : ".join(f"{weight.value:g}" for weight in weights))] if weights else []
+    )
 
 
 def _measured(found: Sequence[At]) -> list[Child]:
