@@ -8,6 +8,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,7 @@ from aegis_cli.cli.options import (
 from aegis_cli.common import files, interrupts, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
-from aegis_cli.data.selection import Selection
+from aegis_cli.data.selection import Paths, Selection
 from aegis_cli.merging.settings import DAMPING, MergeSettings
 from aegis_cli.recipes import (
     ANCHOR_PARTS,
@@ -315,12 +316,13 @@ def train(
     recipe: RecipeArg,
     out: Annotated[Path, Option(metavar="FOLDER", help="Run folder to write.")],
     demos: Annotated[
-        Path | None,
+        list[Path] | None,
         Option(
             parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
-            "default: the recipe's demos.path; none for a stream.",
+            "default: the recipe's demos.path; none for a stream. Repeatable, to learn from "
+            "several sets of one robot.",
         ),
     ] = None,
     method: Annotated[
@@ -367,14 +369,14 @@ def train(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )
         return
-    demos, resolved = _learned_from(resolved, recipe, demos)
+    paths, resolved = _learned_from(resolved, recipe, demos or [])
     advice.of_training(resolved, anchor)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     with stages.joined(device):
         report = stage.run(
             resolved,
             resolved.train.method,
-            demos,
+            paths,
             anchor,
             out,
             resume=resume,
@@ -387,22 +389,32 @@ def train(
     _end_at_gate(failed)
 
 
-def _learned_from(recipe: Recipe, file: Path, demos: Path | None) -> tuple[Path, Recipe]:
+def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Paths, Recipe]:
     """The demonstrations of a training, and its recipe, which names these and no others.
+
+    Several that are given stand in the recipe in any case: that tells what the run was trained on.
 
     Raises:
         AegisError: neither the command nor the recipe names any.
     """
     named = recipe.demos.path
-    if demos is None and named is None:
+    if not given and named is None:
         fix = "record some with aegis demos, and give them as --demos"
         expected = "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub"
         raise AegisError(f"no --demos for '{file}', which names none as demos.path", expected, fix)
-    if demos is None:
-        return demonstrations_path(str(named)), recipe
-    if named is not None:
-        recipe = replace(recipe, demos=replace(recipe.demos, path=str(demos)))
-    return demos, recipe
+    if not given:
+        return _paths(named), recipe
+    told = str(given[0]) if len(given) == 1 else tuple(map(str, given))
+    if named is not None or len(given) > 1:
+        recipe = replace(recipe, demos=replace(recipe.demos, path=told))
+    return _paths(told), recipe
+
+
+def _paths(named: str | tuple[str, ...]) -> Paths:
+    """One set of demonstrations or several, as a recipe names them."""
+    if isinstance(named, str):
+        return demonstrations_path(named)
+    return tuple(map(demonstrations_path, named))
 
 
 @app.command(short_help="Move a fine-tuned backbone back, where its task allows it.")
@@ -444,11 +456,12 @@ def merge(
         str | None, Option(help="The pre-trained model; default: the run's own backbone.")
     ] = None,
     demos: Annotated[
-        Path | None,
+        list[Path] | None,
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="Demonstrations of the run; default: its recipe's, or a file beside it.",
+            help="Demonstrations of the run; default: its recipe's, or a file beside it. "
+            "Repeatable, for a run that learned from several sets, in their order.",
         ),
     ] = None,
     anchor: AnchorIn = None,
@@ -522,7 +535,7 @@ def merge(
         method=method,
         damping=damping,
         base=base,
-        demos=demos,
+        demos=tuple(demos) if demos else None,
         anchor=anchor,
         vqa=asks.vqa,
         ask=asks.ask,

@@ -43,6 +43,7 @@ _TYPES: dict[Any, str] = {
     str | tuple[str, ...]: "text or list of words",
     str | tuple[str, ...] | None: "text or list of words",
     tuple[int, ...]: "list of whole numbers",
+    tuple[float, ...] | None: "list of numbers",
     tuple: "list of words",
 }
 _ABOUT_RECIPES = """\

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,19 +22,36 @@ from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data import relative
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.fitted import FittedFrames
+from aegis_cli.data.joined_frames import JoinedFrames
 from aegis_cli.data.lerobot import dataset, download, layout, rows
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.lerobot.source import Source
-from aegis_cli.data.selection import ALL, Selection
+from aegis_cli.data.selection import ALL, Selection, listed
 
 # The scale of relative actions is fitted to so many at most: each frame has a chunk of them.
 _MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
-Frames = Tensor | FramesOnDemand | FittedFrames  # of one camera, [N, H, W, 3] uint8
+# Of one camera, [N, H, W, 3] uint8.
+Frames = Tensor | FramesOnDemand | FittedFrames | JoinedFrames
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of several sets that are learned from together.
+
+    Attributes:
+        name: its path, or its id on the hub.
+        sha256: digest of everything that it was read from.
+        train: frames to train on.
+    """
+
+    name: str
+    sha256: str
+    train: int
 
 
 @dataclass(frozen=True)
@@ -57,7 +74,8 @@ class Demonstrations:
         action_names, proprio_names: of their A and P numbers; empty where the data names none.
         fps: frames per second, which is the rate at which the robot was controlled; None where the
             data does not say.
-        dataset: its id on the hub, where that is what was asked for.
+        datasets: ids on the hub, where that is what was asked for.
+        members: the sets that these were joined of, in the order of their frames; none of one set.
     """
 
     task: str | None
@@ -74,7 +92,8 @@ class Demonstrations:
     action_names: tuple[str, ...] = ()
     proprio_names: tuple[str, ...] = ()
     fps: float | None = None
-    dataset: str | None = None
+    datasets: tuple[str, ...] = ()
+    members: tuple[Member, ...] = ()
 
     @property
     def recorded(self) -> dict[str, Any]:
@@ -97,6 +116,12 @@ class Demonstrations:
         """The same demonstrations, whose frames are shown in one (height, width) per camera."""
         shown = (_fitted(*each) for each in zip(self.frames, sizes, strict=True))
         return replace(self, frames=tuple(shown))
+
+    @property
+    def held(self) -> list[Tensor]:
+        """Every tensor that these are kept in; frames that stay in a file are mapped ones."""
+        own = [value for value in vars(self).values() if isinstance(value, Tensor)]
+        return [*own, *self.tensors.values(), *itertools.chain(*map(_held, self.frames))]
 
     def check_files(self) -> None:
         """Raise AegisError if somebody has written to what the frames are read from."""
@@ -194,6 +219,16 @@ def _fitted(frames: Frames, size: tuple[int, int]) -> Frames:
     return frames if tuple(frames.shape[1:3]) == size else FittedFrames(frames, size)
 
 
+def _held(frames: Frames) -> Iterator[Tensor]:
+    """The tensors that a camera's frames are kept in."""
+    if isinstance(frames, Tensor):
+        yield frames
+    elif isinstance(frames, FittedFrames):
+        yield from _held(frames.frames)
+    elif isinstance(frames, JoinedFrames):
+        yield from itertools.chain(*map(_held, frames.parts))
+
+
 def at(path: str | Path) -> Path:
     """A path of demonstrations as somebody wrote it, or the id of a dataset on the hub.
 
@@ -274,7 +309,7 @@ def load(
     split = (validation_share, seed, selection.only)
     if here.is_dir():
         found = _load_folder(here, split, selection, image_size, workers, cache, on_event)
-        return found if here == path else replace(found, dataset=str(path))
+        return found if here == path else replace(found, datasets=(str(path),))
     artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
     selection.check_file(here)
     return _load_file(here, split)
@@ -301,14 +336,14 @@ def _episodes(found: dataset.Dataset, only: str | None) -> list[int] | None:
     return _chosen(found.folder, len(found.episodes), only, found.info.splits).tolist()
 
 
-def is_same(path: Path, selection: Selection, sha256: str) -> bool:
-    """Whether these are the demonstrations of that digest, of which `selection` was read."""
+def is_one_of(path: Path, selection: Selection, sha256: Collection[str]) -> bool:
+    """Whether these have one of the digests, of which `selection` was read."""
     here = locate(path)
     if here.is_dir() and selection.only is not None:
         info = layout.read_info(here)
         if not episodes_of.are_there(selection.only, info.episodes, info.splits):
             return False
-    return digest(path, selection) == sha256
+    return digest(path, selection) in sha256
 
 
 def count_episodes(path: Path) -> int:
@@ -410,12 +445,10 @@ def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, t
 
     The names are empty where one of the features has none.
     """
-    chosen = (features,) if isinstance(features, str) else features
+    chosen = listed(features)
     read = [rows.read_vectors(source, name) for name in chosen]
     joined = np.concatenate([np.zeros((source.dataset.info.frames, 0), np.float32), *read], axis=1)
-    names = [source.dataset.info.features[name].components for name in chosen]
-    named = tuple(itertools.chain(*names)) if all(map(any, names)) else ()
-    return torch.from_numpy(joined), named
+    return torch.from_numpy(joined), source.dataset.names(chosen)
 
 
 def _split(

@@ -14,6 +14,7 @@ class FittedFrames:
     """Frames [N, H, W, 3] uint8 that are fitted to a size as they are asked for.
 
     Attributes:
+        frames: as they were recorded.
         shape: (N, H, W, 3).
     """
 
@@ -21,7 +22,7 @@ class FittedFrames:
         self, frames: Tensor | FramesOnDemand | FittedFrames, size: tuple[int, int]
     ) -> None:
         """Take the frames of one camera, of any size, and the (height, width) to show them in."""
-        self._frames = frames
+        self.frames = frames
         self.shape = (len(frames), *size, 3)
 
     def __len__(self) -> int:
@@ -31,6 +32,6 @@ class FittedFrames:
         """Frames [B, H, W, 3] by their numbers [B] int64."""
         _, height, width, _ = self.shape
         found = np.empty((len(numbers), height, width, 3), np.uint8)
-        for row, frame in zip(found, self._frames[numbers], strict=True):
+        for row, frame in zip(found, self.frames[numbers], strict=True):
             row[:] = pictures.fit(frame.numpy(), height, width)
         return torch.from_numpy(found)

@@ -8,6 +8,14 @@ from pathlib import Path
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot.layout import ACTION, STATE
 
+# One set of demonstrations, or several in the order in which their frames are numbered.
+Paths = Path | tuple[Path, ...]
+
+
+def listed(features: str | tuple[str, ...]) -> tuple[str, ...]:
+    """The features that one name or several stand for."""
+    return (features,) if isinstance(features, str) else features
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -28,10 +36,7 @@ class Selection:
     @property
     def vectors(self) -> tuple[str, ...]:
         """All features that are proprioception or actions."""
-        state, action = (
-            (chosen,) if isinstance(chosen, str) else chosen for chosen in (self.state, self.action)
-        )
-        return (*state, *action)
+        return (*listed(self.state), *listed(self.action))
 
     def check_file(self, path: Path) -> None:
         """Raise AegisError where something is chosen that a file of `aegis demos` does not have."""

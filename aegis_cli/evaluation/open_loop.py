@@ -19,7 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
-from aegis_cli.data import demonstrations, joints
+from aegis_cli.data import demonstrations, joints, mixture
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
@@ -211,12 +211,13 @@ def run(
 class _Source:
     """A checkpoint, and what is known of its training.
 
-    Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digest` either.
+    Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digests` of the
+    demonstrations either.
     """
 
     checkpoint: Path
     recipe: recipes.Recipe | None
-    digest: str | None
+    digests: frozenset[str]
 
     @classmethod
     def find(cls, run: Path) -> _Source:
@@ -227,12 +228,12 @@ class _Source:
                 "evaluate a run that aegis train wrote from a recipe of kind policy",
             )
         if lerobot_folder.is_policy(run):
-            return cls(run, None, None)
+            return cls(run, None, frozenset())
         chosen = checkpoint.chosen(run)
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
-        return cls(chosen, recipe, header.inputs.get("demos"))
+        return cls(chosen, recipe, mixture.digests(header.inputs))
 
     def selection(self, meta: Mapping[str, Any], data: Path) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -270,8 +271,8 @@ class _Source:
     ) -> tuple[str, list[int], list[int]]:
         """How the episodes are chosen, which they are, and which of them were trained on."""
         count = demonstrations.count_episodes(data)
-        if self.digest is None or not demonstrations.is_same(data, learned, self.digest):
-            everything = UNKNOWN if self.digest is None else OTHER
+        if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
+            everything = OTHER if self.digests else UNKNOWN
             return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
         if self.recipe is None:
             if asked is not None:

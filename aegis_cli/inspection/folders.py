@@ -124,6 +124,10 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["cameras"] = cameras
     if dataset_id := header.meta.get("dataset"):
         facts["dataset"] = dataset_id
+    if isinstance(settings.demos.path, tuple):
+        facts["demos"] = list(settings.demos.path)
+    if settings.demos.weights is not None:
+        facts["weights"] = list(settings.demos.weights)
     if base_model := header.meta.get("base_model"):
         facts["base_model"] = base_model
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.selection import Paths
 
 DAMPING = 0.01
 # Strengths of a sweep in which none are named: each method's from little to nearly all of the way.
@@ -25,7 +26,8 @@ class MergeSettings:
         method: one of `MERGES`.
         damping: added to each eigenvalue of every factor, whose mean is 1.
         base: the pre-trained model; None: the one that the run's recipe names.
-        demos: of the run; None: those that its recipe names, or that lie beside it.
+        demos: of the run, one set or all of several; None: those that its recipe names, or that lie
+            beside it.
         anchor: of the base; None: it is measured on `samples` questions of `vqa`.
         vqa: the questions whose answers are to be kept.
         ask: what a question becomes before a model reads it, with {} for it.
@@ -41,7 +43,7 @@ class MergeSettings:
     method: str = "factors"
     damping: float = DAMPING
     base: str | None = None
-    demos: Path | None = None
+    demos: Paths | None = None
     anchor: Path | None = None
     vqa: str = "scenes"
     skip_bad: bool = False

@@ -17,8 +17,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.data import demonstrations
+from aegis_cli.data import mixture
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import score
@@ -168,20 +169,21 @@ class PolicyRun:
     def _demos(self) -> Demonstrations:
         """The demonstrations that the policy was trained on, split as they were then."""
         wanted = self._header.inputs["demos"]
-        path = self._settings.demos or self._find_demos(wanted)
-        found = assemble.load_demonstrations(self._recipe, self.base, path, self._on_event)
+        paths = self._settings.demos or self._find_demos(wanted)
+        found = assemble.load_demonstrations(self._recipe, self.base, paths, self._on_event)
         if found.sha256 != wanted:
             raise AegisError(
-                f"other demonstrations in '{path}' than those of the run '{self._run}'",
+                f"other demonstrations in {mixture.said(paths)} than those of the run "
+                f"'{self._run}'",
                 "those that the policy was trained on, of which some were held out",
                 "give these as --demos",
             )
         return found
 
-    def _find_demos(self, wanted: str) -> Path:
+    def _find_demos(self, wanted: str) -> Paths:
         """The recipe's demonstrations, or a file beside the run, where `aegis run` puts it."""
         if self._recipe.demos.path is not None:
-            return demonstrations.at(self._recipe.demos.path)
+            return mixture.at(self._recipe.demos.path)
         for path in sorted(self._run.resolve().parent.glob("*.safetensors")):
             if files.sha256_file(path) == wanted:
                 return path

@@ -189,7 +189,7 @@ def _measured(run: Path, at: Path) -> InspectReport:
     return found
 
 
-def _front_matter(form: str, base_model: str | None, dataset: str | None) -> str:
+def _front_matter(form: str, base_model: str | None, dataset: str | list[str] | None) -> str:
     """The lines that the hub reads, with the backbone's and the demonstrations' ids there."""
     lines = [
         f"library_name: {'lerobot' if form == LEROBOT else 'aegis-vla'}",
@@ -199,7 +199,8 @@ def _front_matter(form: str, base_model: str | None, dataset: str | None) -> str
     if base_model is not None:
         lines.append(f"base_model: {base_model}")
     if dataset is not None:
-        lines.append(f"datasets: [{dataset}]")
+        named = [dataset] if isinstance(dataset, str) else dataset
+        lines.append(f"datasets: [{', '.join(named)}]")
     return "\n".join(lines)
 
 

@@ -42,6 +42,7 @@ from aegis_cli.recipes.policy import (
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.reader import (
     digest,
+    drawn,
     from_mapping,
     is_robot_stream_run,
     is_stream_run,
@@ -157,6 +158,7 @@ __all__ = [
     "cross_checks",
     "describe",
     "digest",
+    "drawn",
     "from_mapping",
     "is_robot_stream_run",
     "is_stream_run",

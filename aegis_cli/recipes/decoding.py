@@ -25,6 +25,7 @@ _PHRASES: dict[Any, str] = {
     tuple: "a list of different words such as [a, b]",
     str | tuple[str, ...]: "text, or a list of different words such as [a, b]",
     str | tuple[str, ...] | None: "text, or a list of different words such as [a, b]",
+    tuple[float, ...] | None: "a list of numbers such as [2, 1]",
     tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
     dict: "a section of keys and values",
 }

@@ -30,11 +30,15 @@ T = TypeVar("T")
 
 
 class Check(NamedTuple):
-    """Which values a key takes beyond its type; of a list, `accepts` judges each item."""
+    """Which values a key takes beyond its type; of a list, `accepts` judges each item.
+
+    The items of a list differ, unless it `repeats`.
+    """
 
     expected: str
     accepts: Callable[[Any], bool]
     choices: tuple[str, ...] = ()
+    repeats: bool = False
 
 
 def choice(*choices: str) -> Check:
@@ -44,6 +48,7 @@ def choice(*choices: str) -> Check:
 
 WITH_PLACE = Check("a text with one {}", lambda v: v.count("{}") == 1)
 POSITIVE = Check("above 0", lambda v: v > 0)
+POSITIVE_EACH = Check("above 0", lambda v: v > 0, repeats=True)
 TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)
 NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
@@ -171,7 +176,10 @@ class _Value:
 
     def _judged(self, value: Any) -> Any:
         """The value; pydantic collects the errors of all keys."""
-        if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
+        repeats = self.check is not None and self.check.repeats
+        if value == () or (
+            isinstance(value, tuple) and not repeats and len(set(value)) < len(value)
+        ):
             raise ValueError("not empty, and no word twice")
         items = value if isinstance(value, tuple) else (value,)
         if value is not None and self.check and not all(map(self.check.accepts, items)):

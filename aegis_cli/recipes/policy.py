@@ -13,6 +13,7 @@ from aegis_cli.recipes.keys import (
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
+    POSITIVE_EACH,
     SEED,
     SHARE,
     SHARE_OR_ONE,
@@ -99,11 +100,18 @@ class Demos:
         doc="Standard deviation of the noise on executed actions; 1 is their full range.",
     )
     seed: int = key(SEED, 0, doc="Seed of the recording; equal seeds give equal bytes.")
-    path: str | None = key(
+    path: str | tuple[str, ...] | None = key(
         NOT_EMPTY,
         None,
         doc="Demonstrations to use instead of recording: a file, the folder of a LeRobot dataset, "
-        "or its id on the hub.",
+        "or its id on the hub; a list has several sets of one robot learned from together.",
+    )
+    weights: tuple[float, ...] | None = key(
+        POSITIVE_EACH,
+        None,
+        later=True,
+        doc="Shares of the training frames that come from each of several sets in `path`, such as "
+        "[2, 1] for twice as many from the first. Null: each frame comes equally often.",
     )
     camera: str | tuple[str, ...] | None = key(
         NOT_EMPTY,
@@ -127,8 +135,9 @@ class Demos:
         NOT_EMPTY,
         None,
         later=True,
-        doc="Episodes of `path` to learn from and validate on; null: all. Numbers from 0 and "
-        "ranges such as '0-39,45', or the name of a split in a LeRobot dataset's info.json.",
+        doc="Episodes of a single set in `path` to learn from and validate on; null: all. Numbers "
+        "from 0 and ranges such as '0-39,45', or the name of a split in a LeRobot dataset's "
+        "info.json.",
     )
     cache: bool = key(
         default=True,

@@ -187,7 +187,7 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
     # Any number of processes trains the same weights, however they share them.
     part["train"].pop("parallel", None)
-    if chosen := selected(recipe):  # the digest of the data says nothing of the choice
+    if chosen := drawn(recipe):  # the digest of the data says nothing of the choice
         part["demos"] = chosen
     own = _own_section(recipe)
     return part | {recipe.train.method: {} if own is None else recorded(own)}
@@ -197,6 +197,12 @@ def selected(recipe: Recipe) -> dict[str, Any]:
     """What is learned of the demonstrations' frames, as far as it is not at its default."""
     changes = changed(recipe.demos)
     return {name: changes[name] for name in ("only", "state", "action") if name in changes}
+
+
+def drawn(recipe: Recipe) -> dict[str, Any]:
+    """What is learned of the demonstrations, and how often, as far as it is not at its default."""
+    changes = changed(recipe.demos)
+    return selected(recipe) | {name: changes[name] for name in ("weights",) if name in changes}
 
 
 def options(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -212,10 +213,11 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None)
     Args:
         task: a simulated one; None where nothing can be rolled out.
     """
-    demos = recipe.demos.path or _beside(path, "demos.safetensors")
+    named = recipe.demos.path or _beside(path, "demos.safetensors")
+    demos = [("--demos", each) for each in ((named,) if isinstance(named, str) else named)]
     anchor = _beside(path, "anchor.safetensors")
     again, new = path / "recipe.yaml", "NEW_FOLDER"
-    inputs = ("--method", method, "--demos", demos, "--anchor", anchor, "--out", new)
+    inputs = ("--method", method, *chain(*demos), "--anchor", anchor, "--out", new)
     asked = ("--baseline", recipe.backbone, "--anchor", anchor)
     commands = [_command("aegis", "train", again, *inputs)]
     for probe in recipe.probe.of_each_set():

@@ -9,14 +9,14 @@ import dataclasses
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import measure
 from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
-from aegis_cli.data import demonstrations
+from aegis_cli.data import mixture
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
@@ -220,10 +220,11 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
 def _check_playable(trials: Sequence[Recipe]) -> None:
     named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
     for path, camera in dict.fromkeys(named):
-        if demonstrations.playable_task(demonstrations.at(path), camera) is None:
+        given = mixture.at(path)
+        if mixture.playable_task(given, camera) is None:
             raise AegisError(
-                f"'tuning' with demonstrations in '{path}', whose policies cannot be rolled out "
-                "here",
+                f"'tuning' with demonstrations in {mixture.said(given)}, whose policies cannot be "
+                "rolled out here",
                 "demonstrations of a simulated task seen by one camera, since values are chosen "
                 "by success",
                 "delete 'tuning' and put the values under 'set', or tune on demonstrations of a "
@@ -256,7 +257,7 @@ def cell_key(
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
-        key["demos"] = {"sha256": demos_sha256, **recipes.selected(cell.recipe)}
+        key["demos"] = {"sha256": demos_sha256, **recipes.drawn(cell.recipe)}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
 
 
@@ -279,6 +280,13 @@ def _shaping(recipe: Recipe) -> dict[str, Any]:
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
 
 
+class Given(NamedTuple):
+    """Demonstrations that a recipe names: one set or several, and their digest together."""
+
+    path: mixture.Paths
+    sha256: str
+
+
 class PolicyRunner:
     """Trains and measures cells in one folder, and knows which of their files are up to date.
 
@@ -292,7 +300,7 @@ class PolicyRunner:
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event)
-        self._given: dict[tuple[str, Selection], Made] = {}
+        self._given: dict[tuple[str | tuple[str, ...], Selection], Given] = {}
         self._sha256: dict[str, str] = {}
         self._sources: dict[tuple[str, bool, str], sets.Scenes | sets.Listed] = {}
         self._questions: dict[tuple[object, ...], VQASet] = {}
@@ -305,7 +313,7 @@ class PolicyRunner:
 
     # --- what the cells share -----------------------------------------------------------------
 
-    def demos(self, recipe: Recipe) -> Made:
+    def demos(self, recipe: Recipe) -> Given | Made:
         """The demonstrations that the recipe names, or those of its task and settings."""
         settings = recipe.demos
         if settings.path is not None:
@@ -316,11 +324,11 @@ class PolicyRunner:
         )
         return self.records.demonstrations(recipe.task, settings, "demos" if plain else None)
 
-    def _given_demos(self, path: str, selection: Selection) -> Made:
+    def _given_demos(self, path: str | tuple[str, ...], selection: Selection) -> Given:
         name = (path, selection)
         if name not in self._given:
-            at = demonstrations.at(path)
-            self._given[name] = Made(at, demonstrations.digest(at, selection))
+            at = mixture.at(path)
+            self._given[name] = Given(at, mixture.digest(at, selection))
         return self._given[name]
 
     def anchor(self, recipe: Recipe) -> Made:

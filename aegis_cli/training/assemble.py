@@ -23,9 +23,10 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.data import demonstrations, joints
+from aegis_cli.data import demonstrations, joints, mixture
 from aegis_cli.data.batch import Share
 from aegis_cli.data.relative import Places
+from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -100,8 +101,8 @@ class TrainingRun:
         if it is not float32; `relative`, for each action the place of the position that it is
         predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
         as the demonstrations say them; `action_std`, the actions' standard deviations, where the
-        policy's scale is another; `dataset`, their id, and `base_model`, that of the model
-        that the backbone began as, if they come from the hub.
+        policy's scale is another; `dataset`, their id or those of several, and `base_model`, that
+        of the model that the backbone began as, if they come from the hub.
         """
         found = {
             "method": self.method.name,
@@ -115,8 +116,9 @@ class TrainingRun:
             found["relative"] = list(self.policy.origins.places)
         if "relative" in found or found["normalization"] != "mean_std":
             found["action_std"] = self.demos.action_std
-        if self.demos.dataset is not None:
-            found["dataset"] = self.demos.dataset
+        if self.demos.datasets:
+            one, *others = self.demos.datasets
+            found["dataset"] = [one, *others] if others else one
         if self.policy.backbone.hub_id is not None:
             found["base_model"] = self.policy.backbone.hub_id
         if self.demos.cameras:
@@ -126,6 +128,21 @@ class TrainingRun:
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
         return found
+
+    @property
+    def order(self) -> BatchOrder:
+        """Which of the training frames each step has, as places among them."""
+        count, batch = len(self.demos.train), self.recipe.train.batch_size
+        return BatchOrder(count, batch, self.recipe.seed, self.shares)
+
+    @property
+    def shares(self) -> list[tuple[int, int]]:
+        """Frames of each set, and how many of an epoch's are of it; empty where each comes once."""
+        weights = self.recipe.demos.weights
+        if weights is None:
+            return []
+        sizes = (member.train for member in self.demos.members)
+        return list(zip(sizes, mixture.drawn(self.demos, weights), strict=True))
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
         """Write a checkpoint, and the ledger so far; of several processes, the first does it.
@@ -194,7 +211,7 @@ class TrainingRun:
 def build(
     recipe: Recipe,
     method: Method,
-    demos: Path,
+    demos: Paths,
     anchor: Path | None,
     out: Path,
     on_event: OnEvent,
@@ -203,6 +220,7 @@ def build(
     """Load and check the inputs, adapt the backbone, start the method.
 
     Args:
+        demos: one set, or several to learn from together.
         ranks: the processes that take its steps together, each of which builds the same.
 
     Raises:
@@ -245,7 +263,7 @@ def build(
     if recipe.train.compile:
         backbone.compile_passes()
         policy.expert.compile_layers()
-    inputs = {"demos": recorded.sha256, "backbone": fingerprint}
+    inputs = {**mixture.inputs(recorded), "backbone": fingerprint}
     inputs |= _digests(recipe, None if anchor is None else watched.sha256[anchor], source)
     made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
     return TrainingRun(
@@ -297,7 +315,7 @@ def _shards(settings: Train, ranks: Ranks) -> bool:
 
 
 def _loaded(
-    recipe: Recipe, backbone: Backbone, demos: Path, on_event: OnEvent, ranks: Ranks
+    recipe: Recipe, backbone: Backbone, demos: Paths, on_event: OnEvent, ranks: Ranks
 ) -> demonstrations.Demonstrations:
     """The demonstrations, whose frames one process of each machine decodes, and the others find."""
     decodes = launch.local_rank() == 0
@@ -321,29 +339,39 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
     if recipe.expert.start is not None:
         checkpoint.load_expert(recipe.expert.start)
     if recipe.demos.path is not None:
-        backbone, path = backbones.load(recipe.backbone), demonstrations.at(recipe.demos.path)
-        load_demonstrations(recipe, backbone, path, on_event)
-        return
-    for name, of in (("camera", "a LeRobot folder"), ("only", "demonstrations")):
-        if getattr(recipe.demos, name) is not None:
+        backbone, paths = backbones.load(recipe.backbone), mixture.at(recipe.demos.path)
+        if recipe.anchor.source == "demos" and len(mixture.each(paths)) > 1:
             raise AegisError(
-                f"demos.{name} without demos.path",
-                f"{of}, to choose of",
-                "set demos.path to it",
+                f"anchor.source: demos with demonstrations in {mixture.said(paths)}",
+                "one set, whose frames an anchor is measured on",
+                "measure it on one of them with aegis anchor --demos, and train with aegis train "
+                "--anchor; or set anchor.source to questions",
             )
+        load_demonstrations(recipe, backbone, paths, on_event)
+        return
+    belonging = {
+        "camera": ("a LeRobot folder, to choose of", "set demos.path to it"),
+        "only": ("demonstrations, to choose of", "set demos.path to it"),
+        "weights": ("several sets of demonstrations", "set demos.path to a list of them"),
+    }
+    for name, (expected, fix) in belonging.items():
+        if getattr(recipe.demos, name) is not None:
+            raise AegisError(f"demos.{name} without demos.path", expected, fix)
 
 
 def load_demonstrations(
-    recipe: Recipe, backbone: Backbone, path: Path, on_event: OnEvent
+    recipe: Recipe, backbone: Backbone, paths: Paths, on_event: OnEvent
 ) -> demonstrations.Demonstrations:
     """Load what the backbone is to learn from.
 
     Raises:
-        AegisError: demonstrations of another task, or with words that the backbone does not know.
+        AegisError: demonstrations of another task, with words that the backbone does not know, or
+            of which the recipe's weights are not.
     """
     _check_cameras(backbone, recipe)
-    found = demonstrations.load(
-        path,
+    mixture.check_weights(recipe.demos.weights, len(mixture.each(paths)))
+    found = mixture.load(
+        paths,
         recipe.train.validation_share,
         recipe.seed,
         recipe.demos.selection,
@@ -357,6 +385,7 @@ def load_demonstrations(
             "one and the same task",
             f"--set task={found.task}, or record with: aegis demos {recipe.task}",
         )
+    mixture.drawn(found, recipe.demos.weights)
     # A word that the backbone does not know is found here, and ends no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
@@ -419,15 +448,16 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
 
 
 def _warn_of_no_instruction(
-    path: Path, found: demonstrations.Demonstrations, on_event: OnEvent
+    paths: Paths, found: demonstrations.Demonstrations, on_event: OnEvent
 ) -> None:
     """Warn of episodes that are learned from and whose instruction is an empty text, or blanks."""
     learned = found.episode_of[found.read].unique()
     if bare := len(found.without_instruction):
         text = (
-            f"{bare} of the {len(learned)} episodes to learn from in '{path}' have no instruction, "
-            "but an empty text: a policy learns from them to act without being told what to do. "
-            "Write what they do as the dataset's tasks, or choose others with demos.only"
+            f"{bare} of the {len(learned)} episodes to learn from in {mixture.said(paths)} have no "
+            "instruction, but an empty text: a policy learns from them to act without being told "
+            "what to do. Write what they do as the dataset's tasks, or choose others with "
+            "demos.only"
         )
         on_event(Warned("train", text))
 

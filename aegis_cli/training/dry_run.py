@@ -20,6 +20,8 @@ from aegis_cli.common import devices, launch, memory
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.ranks import Ranks, joined, rows_here
+from aegis_cli.data import mixture
+from aegis_cli.data.selection import Paths
 from aegis_cli.models import structure
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
@@ -50,7 +52,10 @@ class DryRunReport:
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
             are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
-        training_frames: those that are not held out; epochs: how often each is seen.
+        training_frames: those that are not held out; epochs: how often each is seen, or with
+            `demos.weights` is seen in the mean.
+        sets: of several sets of demonstrations, by their paths, what is said of all together and
+            the `share` of the frames that are seen; None where there is one.
         tokens_per_frame: of one frame (of all cameras) with its instruction.
         memory_mb: by what takes it, `method` being what it keeps all
             along.
@@ -77,6 +82,7 @@ class DryRunReport:
     cameras: list[str]
     training_frames: int
     epochs: float
+    sets: dict[str, dict[str, float]] | None
     tokens_per_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
@@ -109,7 +115,7 @@ class DryRunReport:
 def run(
     recipe: Recipe,
     method: str,
-    demos: Path,
+    demos: Paths,
     anchor: Path | None,
     out: Path,
     resume: bool = False,
@@ -131,12 +137,12 @@ def run(
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, on_event)
-        return _planned(recipe, Path(demos), anchor, out, overwrite, on_event, ranks)
+        return _planned(recipe, demos, anchor, out, overwrite, on_event, ranks)
 
 
 def _planned(
     recipe: Recipe,
-    demos: Path,
+    demos: Paths,
     anchor: Path | None,
     out: Path,
     overwrite: bool,
@@ -173,6 +179,7 @@ def _planned(
         cameras=list(training.demos.cameras),
         training_frames=frames,
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
+        sets=_sets(training),
         tokens_per_frame=tokens,
         memory_mb={name: size / _MB for name, size in needs.parts.items()},
         memory_total_mb=sum(needs.parts.values()) / _MB,
@@ -188,6 +195,22 @@ def _planned(
         disk_fits=disk <= room,
         out=str(out),
     )
+
+
+def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
+    """What each of several sets of demonstrations has, and how much of it is seen."""
+    demos, settings = training.demos, training.recipe.train
+    counts = mixture.drawn(demos, training.recipe.demos.weights)
+    seen = settings.steps * settings.batch_size / len(demos.train)  # epochs of all together
+    found = {
+        member.name: {
+            "training_frames": member.train,
+            "share": count / len(demos.train),
+            "epochs": seen * count / member.train,
+        }
+        for member, count in zip(demos.members, counts, strict=True)
+    }
+    return found or None
 
 
 class _Needs(NamedTuple):
@@ -352,13 +375,9 @@ def _alive(device: torch.device) -> dict[int, torch.UntypedStorage]:
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
     """Bytes that the method keeps for as long as it works."""
-    demos = [
-        *training.demos.tensors.values(),
-        *(frames for frames in training.demos.frames if isinstance(frames, Tensor)),
-        *(v for v in vars(training.demos).values() if isinstance(v, Tensor)),
-    ]
     weights = [*training.policy.parameters(), *training.policy.buffers()]
-    known = [*weights, *training.average.weights.values(), *demos, *_plain(training)]
+    known = [*weights, *training.average.weights.values()]
+    known += [*training.demos.held, *_plain(training)]
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
     alive = _alive(training.policy.backbone.device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in others)

@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -82,9 +82,13 @@ def _differences(there: Trained, here: Trained) -> str:
     """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
-    return differences(
-        *({k: v for k, v in dataclasses.asdict(r).items() if k in names} for r in (there, here))
-    )
+    return differences(*(_shaping(r, names) for r in (there, here)))
+
+
+def _shaping(recipe: Trained, names: Collection[str]) -> dict[str, Any]:
+    """The sections of these names; of a policy's demonstrations, what is learned of them alone."""
+    found = {k: v for k, v in dataclasses.asdict(recipe).items() if k in names}
+    return found | ({"demos": recipes.drawn(recipe)} if isinstance(recipe, Recipe) else {})
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,8 +43,17 @@ class BatchOrder:
     An epoch's rest is carried into the next.
     """
 
-    def __init__(self, size: int, batch: int, seed: int) -> None:
+    def __init__(
+        self, size: int, batch: int, seed: int, shares: Sequence[tuple[int, int]] = ()
+    ) -> None:
+        """Deal each row once an epoch, or let sets that the rows consist of have shares of it.
+
+        Args:
+            shares: of each set, whose rows follow each other, how many it has and how many of an
+                epoch's rows are of it; both add up to `size`. None: each row comes once.
+        """
         self._size, self._batch, self._seed = size, batch, seed
+        self._shares = tuple(shares)
         self._epochs: dict[int, np.ndarray] = {}
 
     def rows(self, step: int) -> np.ndarray:
@@ -60,4 +70,21 @@ class BatchOrder:
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         # A generator of its own for each epoch: a resumed run starts in the middle of any.
-        return np.random.default_rng([self._seed, epoch]).permutation(self._size)
+        places = np.random.default_rng([self._seed, epoch]).permutation(self._size)
+        return self._drawn(epoch)[places] if self._shares else places
+
+    def _drawn(self, epoch: int) -> np.ndarray:
+        """The rows of an epoch in their order, of each set as many as its share is.
+
+        A set deals its own shuffled rounds, of which an epoch takes up where the last one ended: so
+        its rows come equally often, but for one time, whatever the share.
+        """
+        first, found = 0, list[np.ndarray]()
+        for number, (size, count) in enumerate(self._shares, start=1):
+            place = np.arange(epoch * count, (epoch + 1) * count)
+            for each in np.unique(place // size).tolist():
+                # The number keeps this generator apart from an epoch's.
+                order = np.random.default_rng([self._seed, each, number]).permutation(size)
+                found.append(first + order[place[place // size == each] % size])
+            first += size
+        return np.sort(np.concatenate(found))

@@ -24,6 +24,7 @@ from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import augment, demonstrations
 from aegis_cli.data.batch import RobotBatch
+from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models.policy import Policy
@@ -38,7 +39,7 @@ from aegis_cli.training import (
     track,
 )
 from aegis_cli.training.assemble import TrainingRun
-from aegis_cli.training.schedule import BatchOrder, moving_steps, rate_factor, rate_left
+from aegis_cli.training.schedule import moving_steps, rate_factor, rate_left
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
@@ -73,7 +74,7 @@ class TrainReport:
 def run(
     recipe: Recipe,
     method: str,
-    demos: Path,
+    demos: Paths,
     anchor: Path | None,
     out: Path,
     resume: bool = False,
@@ -88,6 +89,7 @@ def run(
     Where torchrun has started several processes, each calls this, and they share every step.
 
     Args:
+        demos: one set of demonstrations, or several to learn from together.
         resume: go on with the run that is there, if there is one; one that has ended goes on
             where `recipe` has more steps, as `longer` says.
         overwrite: remove the run that is there, once everything else has been checked.
@@ -109,7 +111,7 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
-        training = assemble.build(recipe, chosen, Path(demos), anchor, out, on_event, ranks)
+        training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
             restored = _restore(training)
             if ranks.first and longer.lengthens(out, recipe):
@@ -350,7 +352,7 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
     Several threads may call it.
     """
     settings, seed = run.recipe.train, run.recipe.seed
-    order = BatchOrder(len(run.demos.train), settings.batch_size, seed)
+    order = run.order
     waits = devices.reading_waits(run.policy.backbone.device)
 
     def fetch(index: int) -> RobotBatch:

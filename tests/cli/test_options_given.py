@@ -23,7 +23,7 @@ Bad = Callable[..., str]
     ("command", "option"),
     [
         (("inspect", "x", "--plot", "a.png", "--plot", "b.png"), "--plot"),
-        (("train", "reach", "--demos", "a", "--out", "x", "--demos=b"), "--demos"),
+        (("evaluate", "x", "--demos", "a", "--demos=b"), "--demos"),
         (("probe", "--max-drop", "1", "x", "--max-drop", "2"), "--max-drop"),
     ],
 )

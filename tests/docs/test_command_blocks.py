@@ -246,12 +246,15 @@ def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
     if command == "train" and kind == "stream":
         return [*words, "--demos", "none"], "--demos"
     if command == "train":
-        place = rest.index("--demos")
         if (
             recipe in NAMING_DEMOS
         ):  # the model, which is not there either, is the first to be missed
             return words, "no folder 'models/"
-        return [command, *rest[:place], *rest[place + 2 :]], "no --demos"
+        assert "--demos" in rest, words
+        while "--demos" in rest:
+            place = rest.index("--demos")
+            del rest[place : place + 2]
+        return [command, *rest], "no --demos"
     if kind == "policy":
         return [*words, "--workers", "2"], "--workers"
     return [*words, "--out", "a-file/runs"], "a-file"

@@ -136,6 +136,48 @@ def test_a_batch_larger_than_the_data_spans_epochs() -> None:
     assert len(rows) == 8 and np.bincount(rows).min() >= 2
 
 
+SHARES = [((4, 6), (4, 6)), ((4, 6), (7, 3)), ((3, 5, 2), (1, 1, 8))]
+
+
+def dealt(sizes: tuple[int, ...], counts: tuple[int, ...], batch: int, steps: int) -> np.ndarray:
+    order = schedule.BatchOrder(10, batch, 0, list(zip(sizes, counts, strict=True)))
+    return np.concatenate([order.rows(i) for i in range(steps)])
+
+
+@pytest.mark.parametrize(("sizes", "counts"), SHARES)
+def test_an_epoch_has_of_each_set_what_its_share_is(
+    sizes: tuple[int, ...], counts: tuple[int, ...]
+) -> None:
+    ends = np.cumsum(sizes)
+    for epoch in dealt(sizes, counts, 4, 25).reshape(10, 10):
+        assert np.bincount(np.searchsorted(ends, epoch, side="right")).tolist() == list(counts)
+
+
+@pytest.mark.parametrize(("sizes", "counts"), SHARES)
+def test_a_sets_frames_come_equally_often_but_for_one_time(
+    sizes: tuple[int, ...], counts: tuple[int, ...]
+) -> None:
+    rows = dealt(sizes, counts, 4, 25)
+    for own in np.split(np.bincount(rows, minlength=10), np.cumsum(sizes)[:-1]):
+        assert own.max() - own.min() <= 1
+
+
+def test_shares_that_are_the_sizes_change_nothing() -> None:
+    plain = schedule.BatchOrder(10, 4, 0)
+    assert np.array_equal(
+        dealt((4, 6), (4, 6), 4, 10), np.concatenate([plain.rows(i) for i in range(10)])
+    )
+
+
+def test_the_order_by_shares_depends_on_no_batch_before_it() -> None:
+    whole = dealt((4, 6), (7, 3), 4, 25)
+    assert np.array_equal(whole, dealt((4, 6), (7, 3), 10, 10))
+    late = schedule.BatchOrder(10, 4, 0, [(4, 7), (6, 3)]).rows(17)
+    assert np.array_equal(late, whole[68:72])
+    other = schedule.BatchOrder(10, 4, 1, [(4, 7), (6, 3)]).rows(17)
+    assert not np.array_equal(late, other)
+
+
 def test_no_warm_up_starts_at_the_peak() -> None:
     assert schedule.warmup_cosine(0, 10, 0, 0.1) == 1
     assert schedule.warmup_cosine(10, 10, 0, 0.1) == pytest.approx(0.1)

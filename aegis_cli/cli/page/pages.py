@@ -76,10 +76,15 @@ def _run(found: At, report: Any) -> tuple[str, list[Child]]:
 
 def _task(run: At) -> str:
     """What a run was trained on."""
-    given = run["recipe"]["demos"]["path"]
-    if given:
+    if given := _demonstrations(run["recipe"]):
         return f"the demonstrations in {given}"
     return f"demonstrations of {run['task']} ({run['recipe']['demos']['episodes']} episodes)"
+
+
+def _demonstrations(recipe: At) -> str:
+    """The sets of demonstrations that a recipe names; an empty text where it names none."""
+    given = recipe["demos"]["path"]
+    return " and ".join(map(str, given)) if isinstance(given.value, list) else str(given)
 
 
 def _trained(run: At) -> Markup:
@@ -89,7 +94,8 @@ def _trained(run: At) -> Markup:
     read = "robot frames" if anchor["source"].value == "demos" else f"questions of {anchor['vqa']}"
     shown = [
         ("Backbone", run["backbone"]),
-        ("Demonstrations", recipe["demos"]["path"] or f"{recipe['demos']['episodes']} episodes"),
+        ("Demonstrations", _demonstrations(recipe) or f"{recipe['demos']['episodes']} episodes"),
+        *_weights(recipe),
         ("Anchor", f"{anchor['samples']} {read}"),
         ("Steps", f"{run['facts']['steps']} of {train['batch_size']} frames"),
         ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
@@ -97,6 +103,14 @@ def _trained(run: At) -> Markup:
         ("Seed", run["facts"]["seed"]),
     ]
     return pairs([(name, str(value)) for name, value in shown])
+
+
+def _weights(recipe: At) -> list[tuple[str, str]]:
+    """A line on the shares of several sets, where they are not those of their frames."""
+    weights = recipe["demos"]["weights"]
+    return (
+        [("Their shares", " : ".join(f"{weight.value:g}" for weight in weights))] if weights else []
+    )
 
 
 def _measured(found: Sequence[At]) -> list[Child]:

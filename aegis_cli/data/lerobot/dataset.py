@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -98,6 +99,11 @@ class Dataset:
                 what, "a vector of numbers", "give a dataset whose frames have one vector of it"
             )
         return found.shape[0]
+
+    def names(self, features: Sequence[str]) -> tuple[str, ...]:
+        """What the numbers of features side by side are called; empty where one has no names."""
+        named = [self.info.features[feature].components for feature in features]
+        return tuple(itertools.chain(*named)) if all(map(any, named)) else ()
 
 
 def _list(cameras: tuple[str, ...]) -> str:

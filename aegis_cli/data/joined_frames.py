@@ -1,0 +1,41 @@
+"""A camera's frames of several sets of demonstrations, one set after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from aegis_cli.data.fitted import FittedFrames
+from aegis_cli.data.lerobot.on_demand import FramesOnDemand
+
+
+class JoinedFrames:
+    """Frames [N, H, W, 3] uint8 that stay where each set has them until they are asked for.
+
+    Several threads may ask.
+
+    Attributes:
+        parts: each set's own frames [n, H, W, 3], all of one size.
+        shape: (N, H, W, 3).
+    """
+
+    def __init__(self, parts: Sequence[Tensor | FramesOnDemand | FittedFrames]) -> None:
+        """Number the frames through, in the order of the sets."""
+        self.parts = tuple(parts)
+        self._ends = np.cumsum([len(part) for part in self.parts])
+        self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, numbers: Tensor) -> Tensor:
+        """Frames [B, H, W, 3] by their numbers [B] int64."""
+        found = torch.empty((len(numbers), *self.shape[1:]), dtype=torch.uint8)
+        of_part = np.searchsorted(self._ends, numbers.numpy(), side="right")
+        for index in np.unique(of_part).tolist():
+            part, own = self.parts[index], torch.from_numpy(of_part == index)
+            found[own] = part[numbers[own] - (int(self._ends[index]) - len(part))]
+        return found

@@ -1,0 +1,358 @@
+"""Several sets of demonstrations that one policy learns from together.
+
+They are of one robot: cameras, positions, actions and control rate have to agree. Each set holds
+out episodes of its own, as it would alone. One after the other they are one set, whose scale is
+that of all training frames.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.data import demonstrations, joints
+from aegis_cli.data.demonstrations import Demonstrations, Member
+from aegis_cli.data.joined_frames import JoinedFrames
+from aegis_cli.data.lerobot import dataset, layout
+from aegis_cli.data.selection import ALL, Paths, Selection, listed
+
+_INPUT = "demos"  # the name of the demonstrations' digest in an artifact's header
+
+
+def each(paths: str | Path | Sequence[Path]) -> tuple[Path, ...]:
+    """The sets by themselves."""
+    return (Path(paths),) if isinstance(paths, str | Path) else tuple(map(Path, paths))
+
+
+def said(paths: Paths) -> str:
+    """Their names in a sentence."""
+    return " and ".join(f"'{path}'" for path in each(paths))
+
+
+def at(named: str | Sequence[str]) -> Paths:
+    """The sets as `demos.path` names them, each as `demonstrations.at` reads it."""
+    if isinstance(named, str):
+        return demonstrations.at(named)
+    return tuple(demonstrations.at(name) for name in named)
+
+
+def load(
+    paths: Paths,
+    validation_share: float | None,
+    seed: int,
+    selection: Selection = ALL,
+    image_size: int | None = None,
+    workers: int | None = None,
+    on_event: OnEvent = ignore,
+    cache: bool = True,
+) -> Demonstrations:
+    """Read one set of demonstrations as `demonstrations.load` does, or several and join them.
+
+    Raises:
+        AegisError: besides what is wrong with one of them, sets that are not of one robot, one set
+            twice, or episodes that are chosen of several.
+    """
+    chosen = each(paths)
+    _check_each_once(chosen)
+    if len(chosen) > 1:
+        _check_selection(chosen, selection)
+        _check_alike(chosen, selection)
+    found = [
+        demonstrations.load(
+            path, validation_share, seed, selection, image_size, workers, on_event, cache
+        )
+        for path in chosen
+    ]
+    return joined(chosen, found, on_event)
+
+
+def joined(
+    paths: Sequence[Path], found: Sequence[Demonstrations], on_event: OnEvent = ignore
+) -> Demonstrations:
+    """The sets one after the other; a single one is itself.
+
+    Pictures of another size than the first set's are fitted into it, as they are where the policy
+    acts.
+
+    Args:
+        paths: what each is called.
+    """
+    first, *others = found
+    if not others:
+        return first
+    sizes = [tuple(frames.shape[1:3]) for frames in first.frames]
+    _warn_of_other_sizes(paths, found, on_event)
+    shown = [first, *(other.fitted(sizes) for other in others)]
+    counts = [len(own.episode_of) for own in shown]
+    starts = torch.tensor([0, *counts]).cumsum(0)[:-1].tolist()
+    episodes = [len(own.tensors["episode_starts"]) - 1 for own in shown]
+    first_episodes = torch.tensor([0, *episodes]).cumsum(0)[:-1].tolist()
+    texts = list(dict.fromkeys(text for own in shown for text in own.instructions))
+    ends = [
+        own.tensors["episode_starts"][1:] + start for own, start in zip(shown, starts, strict=True)
+    ]
+    numbered = list(zip(shown, starts, strict=True))
+    return Demonstrations(
+        next((own.task for own in shown if own.task is not None), None),
+        tuple(
+            JoinedFrames(cameras) for cameras in zip(*(own.frames for own in shown), strict=True)
+        ),
+        {
+            "proprio": torch.cat([own.tensors["proprio"] for own in shown]),
+            "actions": torch.cat([own.tensors["actions"] for own in shown]),
+            "episode_starts": torch.cat([torch.zeros(1, dtype=torch.int64), *ends]),
+        },
+        texts,
+        torch.cat([_renumbered(own, texts) for own in shown]),
+        torch.cat([own.episode_of + e for own, e in zip(shown, first_episodes, strict=True)]),
+        torch.cat([own.train + start for own, start in numbered]),
+        torch.cat([own.validation + start for own, start in numbered]),
+        joined_digest([own.sha256 for own in shown]),
+        next((own.cameras for own in shown if own.cameras), ()),
+        tuple(watched for own in shown for watched in own.watched),
+        next((own.action_names for own in shown if any(own.action_names)), ()),
+        next((own.proprio_names for own in shown if any(own.proprio_names)), ()),
+        next((own.fps for own in shown if own.fps is not None), None),
+        tuple(name for own in shown for name in own.datasets),
+        tuple(
+            Member(str(path), own.sha256, len(own.train))
+            for path, own in zip(paths, shown, strict=True)
+        ),
+    )
+
+
+def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
+    """The text of each of a set's frames, by its place among all sets' texts."""
+    places = {text: place for place, text in enumerate(texts)}
+    return torch.tensor([places[text] for text in own.instructions])[own.instruction_of]
+
+
+def playable_task(paths: Paths, camera: str | tuple[str, ...] | None) -> str | None:
+    """The simulated task that a policy of these can act in, as `demonstrations` knows it of one."""
+    tasks = (demonstrations.playable_task(path, camera) for path in each(paths))
+    return next((task for task in tasks if task is not None), None)
+
+
+# --- digests --------------------------------------------------------------------------------------
+
+
+def digest(paths: Paths, selection: Selection = ALL) -> str:
+    """sha256 of everything that `load` would read."""
+    return joined_digest([demonstrations.digest(path, selection) for path in each(paths)])
+
+
+def joined_digest(digests: Sequence[str]) -> str:
+    """sha256 of several sets together; a single set's own."""
+    if len(digests) == 1:
+        return digests[0]
+    return hashlib.sha256(files.canonical({"sets": list(digests)}).encode()).hexdigest()
+
+
+def inputs(found: Demonstrations) -> dict[str, str]:
+    """The digests that an artifact's header has: of all together, and of each of several sets."""
+    members = enumerate(found.members, start=1)
+    return {_INPUT: found.sha256} | {f"{_INPUT} {n}": member.sha256 for n, member in members}
+
+
+def digests(inputs: Mapping[str, str]) -> frozenset[str]:
+    """The digests of the demonstrations that a header's inputs name, each set's among them."""
+    return frozenset(x for name, x in inputs.items() if name.split(" ")[0] == _INPUT)
+
+
+# --- shares ---------------------------------------------------------------------------------------
+
+
+def check_weights(weights: Sequence[float] | None, sets: int) -> None:
+    """Raise AegisError unless there are as many weights as sets, or none at all."""
+    if weights is None or (sets > 1 and len(weights) == sets):
+        return
+    raise AegisError(
+        f"demos.weights: {_numbers(weights)} with {_counted(sets)} of demonstrations",
+        "a weight for each of several sets, in their order",
+        "correct demos.weights, or delete it and let each set have the share of its frames",
+    )
+
+
+def drawn(found: Demonstrations, weights: Sequence[float] | None) -> list[int]:
+    """How many of an epoch's frames come from each of several sets, by their weights.
+
+    An epoch has as many frames as there are to train on; without weights each comes once. What
+    rounding leaves goes to the largest remainders, and to the first of equal ones.
+
+    Raises:
+        AegisError: a weight that is less than a frame.
+    """
+    sizes = [member.train for member in found.members]
+    if weights is None:
+        return sizes
+    total, whole = sum(sizes), sum(weights)
+    exact = [total * weight / whole for weight in weights]
+    counts = [int(count) for count in exact]
+    by_rest = sorted(range(len(counts)), key=lambda i: counts[i] - exact[i])
+    for i in by_rest[: total - sum(counts)]:
+        counts[i] += 1
+    for member, count in zip(found.members, counts, strict=True):
+        if count == 0:
+            raise AegisError(
+                f"demos.weights: {_numbers(weights)}, by which none of an epoch's {total} frames "
+                f"is of '{member.name}'",
+                "weights by which every set has a frame in an epoch",
+                "raise its weight, or leave the set out",
+            )
+    return counts
+
+
+def _numbers(weights: Sequence[float]) -> str:
+    return ", ".join(f"{weight:g}" for weight in weights)
+
+
+def _counted(sets: int) -> str:
+    return "1 set" if sets == 1 else f"{sets} sets"
+
+
+# --- sets that do not go together -----------------------------------------------------------------
+
+
+def _check_each_once(paths: Sequence[Path]) -> None:
+    for place, path in enumerate(paths):
+        if path in paths[:place]:
+            raise AegisError(
+                f"the demonstrations '{path}' twice",
+                "each set once",
+                "name it once; demos.weights gives it a larger share",
+            )
+
+
+def _check_selection(paths: Sequence[Path], selection: Selection) -> None:
+    if selection.only is not None:
+        raise AegisError(
+            f"demos.only: {selection.only} with {_counted(len(paths))} of demonstrations",
+            "one set, to choose episodes of",
+            "leave demos.only out, or give one set",
+        )
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """What a set says of the robot that it was recorded with.
+
+    Attributes:
+        sizes: how many positions and how many actions there are.
+        names: `action_names` and `proprio_names`, as far as there are any.
+    """
+
+    cameras: tuple[str, ...]
+    sizes: tuple[int, int]
+    names: dict[str, tuple[str, ...]]
+    fps: float | None
+    task: str | None
+
+
+def _robot(path: Path, selection: Selection) -> _Robot:
+    """The robot of a set, of which no frame is decoded for that.
+
+    Raises:
+        AegisError: a set without the cameras or features that are to be learned from.
+    """
+    here = demonstrations.locate(path)
+    if not here.is_dir():
+        selection.check_file(here)
+        artifact = artifacts.load(here, "demos")
+        meta = artifact.header.meta
+        sizes = artifact.tensors["proprio"].shape[1], artifact.tensors["actions"].shape[1]
+        names = {name: tuple(meta.get(name, ())) for name in ("action_names", "proprio_names")}
+        fps = float(meta["control_hz"]) if "control_hz" in meta else None
+        return _Robot((), sizes, _complete(names, sizes), fps, meta["task"])
+    found = dataset.load(here)
+    cameras = tuple(layout.short(camera) for camera in found.cameras(selection.camera))
+    positions, actions = listed(selection.state), listed(selection.action)
+    sizes = sum(map(found.size, positions)), sum(map(found.size, actions))
+    names = {"action_names": found.names(actions), "proprio_names": found.names(positions)}
+    return _Robot(cameras, sizes, _complete(names, sizes), found.info.fps, found.info.task)
+
+
+def _complete(
+    names: Mapping[str, tuple[str, ...]], sizes: tuple[int, int]
+) -> dict[str, tuple[str, ...]]:
+    """The names of numbers each of which has one."""
+    counts = {"proprio_names": sizes[0], "action_names": sizes[1]}
+    return {kind: own for kind, own in names.items() if all(own) and len(own) == counts[kind] > 0}
+
+
+def _check_alike(paths: Sequence[Path], selection: Selection) -> None:
+    """Raise AegisError unless all sets are of one robot, before anything large is read."""
+    robots = [_robot(path, selection) for path in paths]
+    for place, (path, robot) in enumerate(zip(paths, robots, strict=True)):
+        for known_path, known in zip(paths[:place], robots[:place], strict=True):
+            _check_robot(path, robot, known_path, known)
+
+
+def _check_robot(path: Path, robot: _Robot, known_path: Path, known: _Robot) -> None:
+    """Raise AegisError unless two sets are of one robot, as far as both say it."""
+    if robot.sizes != known.sizes:
+        raise AegisError(
+            f"{robot.sizes[0]} positions and {robot.sizes[1]} actions in '{path}'",
+            f"{known.sizes[0]} and {known.sizes[1]}, as in '{known_path}'",
+            "give demonstrations of the same robot",
+        )
+    for other in joints.differences(known.names, robot.names):
+        _refuse_names(path, known_path, other)
+    if known.cameras and robot.cameras and robot.cameras != known.cameras:
+        raise AegisError(
+            f"the camera {', '.join(robot.cameras)} of '{path}'",
+            f"{', '.join(known.cameras)}, as in '{known_path}'",
+            "choose cameras that all sets have with demos.camera, or give a feature of "
+            f"'{path}' the name of the same camera there",
+        )
+    if None not in (robot.fps, known.fps) and robot.fps != known.fps:
+        raise AegisError(
+            f"{robot.fps:g} frames a second in '{path}'",
+            f"{known.fps:g}, as in '{known_path}'",
+            "give demonstrations of one control rate: actions are meant for steps of one length",
+        )
+    if None not in (robot.task, known.task) and robot.task != known.task:
+        raise AegisError(
+            f"demonstrations of '{robot.task}' in '{path}'",
+            f"those of '{known.task}', as in '{known_path}'",
+            "give demonstrations of one simulated task",
+        )
+
+
+def _refuse_names(path: Path, known_path: Path, other: joints.Difference) -> None:
+    """Raise AegisError for positions or actions that have other names or another order."""
+    known, found = ", ".join(other.known), ", ".join(other.found)
+    if other.moved is not None:
+        raise AegisError(
+            f"'{other.moved}' in another place in '{path}', with {other.what} {found}",
+            f"{known}, in this order, as in '{known_path}'",
+            "give demonstrations in one order",
+        )
+    raise AegisError(
+        f"{other.what} named {found} in '{path}'",
+        f"{known}, as in '{known_path}'",
+        "give demonstrations of the same robot; where these are the same joints in the same order, "
+        "give them the same names in the dataset's meta/info.json",
+    )
+
+
+def _warn_of_other_sizes(
+    paths: Sequence[Path], found: Sequence[Demonstrations], on_event: OnEvent
+) -> None:
+    """Warn of pictures that are shown in the size of the first set's."""
+    first, *others = found
+    for path, other in zip(paths[1:], others, strict=True):
+        for own, known in zip(other.frames, first.frames, strict=True):
+            if own.shape[1:3] == known.shape[1:3]:
+                continue
+            text = (
+                f"the pictures in '{path}' are {own.shape[1]} x {own.shape[2]}, and those in "
+                f"'{paths[0]}' {known.shape[1]} x {known.shape[2]}: they are fitted into that size"
+            )
+            on_event(Warned("train", text))
