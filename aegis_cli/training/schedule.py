@@ -50,7 +50,7 @@ class BatchOrder:
 
         Args:
             shares: of each set, whose rows follow each other, how many it has and how many of an
-                epoch's rows are of it; both add up to `size`. None: each row comes once.
+                epoch's rows are of it; both add up to `size`. Empty: each row comes once.
         """
         self._size, self._batch, self._seed = size, batch, seed
         self._shares = tuple(shares)
