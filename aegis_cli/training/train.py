@@ -477,11 +477,12 @@ def update(
         _move(run, factor, still=True)
     else:
         move = partial(_move, run, factor)
-        run.stepper.step(index + 1, move, result.anchor, rate_left(index, settings))
+        left, moves = rate_left(index, settings), run.unread.moves
+        run.stepper.step(index + 1, move, result.anchor, left, moves)
         if settle or index + 1 == moving:
             run.stepper.settle()
     if not run.stepper.pending:
-        run.average.follow(index + 1)
+        run.average.follow(run.unread.moved)
 
 
 def read(run: TrainingRun, window: Window) -> None:
