@@ -152,9 +152,8 @@ def _run_facts(
     metrics: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What a run is, or after `until` steps was."""
-    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
     which = (
-        {"checkpoints": checkpoints}
+        {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
         if until is None
         else {"run": str(path), "checkpoint": f"{until:06d}"}
     )
