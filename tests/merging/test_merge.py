@@ -19,6 +19,8 @@ from aegis_cli import load_policy
 from aegis_cli.anchors import curvature
 from aegis_cli.common import artifacts, locks
 from aegis_cli.merging.merge import MergePoint, _weakest
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGES
 
 Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
@@ -257,6 +259,43 @@ def test_two_models_of_ours(merge: Callable[..., Any], merge_place: Place, tmp_p
     for name, found in merged.items():
         wanted = 0.25 * base[name] + 0.75 * trained[name]
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def moved_norms(merge_place: Place, tmp_path: Path) -> Path:
+    """The base with normalisations that have moved, and no map that has."""
+    model: Backbone = backbones.load(str(merge_place.base))
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if "norm" in name:
+                parameter.add_(0.5)
+    model.save(tmp_path / "tuned")
+    return tmp_path / "tuned"
+
+
+@pytest.mark.parametrize("strength", [0.25, 1.0])
+def test_linear_moves_back_what_lies_beside_maps_that_have_not_moved(
+    strength: float, merge: Callable[..., Any], merge_place: Place, moved_norms: Path
+) -> None:
+    out = moved_norms.with_name("merged")
+    given = ("--base", merge_place.base, "--method", "linear", "--strength", strength)
+    report = merge(moved_norms, *given, "--out", out)
+    assert report["kept"] == pytest.approx(1 - strength, abs=1e-6)
+    base, merged = parameters(merge_place.base), parameters(out)
+    assert any("norm" in name for name in merged)
+    for name, found in merged.items():
+        wanted = base[name] + (0.5 * (1 - strength) if "norm" in name else 0)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("method", [m for m in MERGES if m != "linear"])
+def test_a_method_for_maps_refuses_a_model_of_which_none_has_moved(
+    method: str, aegis: Aegis, merge_place: Place, moved_norms: Path
+) -> None:
+    out = moved_norms.with_name("merged")
+    given = ("--base", merge_place.base, "--method", method, "--strength", 1, "--out", out)
+    bad(aegis, moved_norms, *given, says=("no linear map", f"'{method}'", "--method linear"))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("method", ["inputs", "factors"])
