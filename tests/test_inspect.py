@@ -237,6 +237,13 @@ def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):
     assert "000001" in shown(capsys, run / "checkpoints" / "000001")
 
 
+def test_checkpoints_are_listed_by_their_steps(tmp_path):
+    run, steps = save_run(tmp_path / "run"), ["000002", "999500", "1000000", "10000000"]
+    for name in (*steps, "000002.old"):
+        (run / "checkpoints" / name).mkdir(exist_ok=True)
+    assert inspection.run(run).facts["checkpoints"] == steps
+
+
 def refusal(path: Path) -> AegisError:
     with pytest.raises(AegisError) as caught:
         inspection.run(path)

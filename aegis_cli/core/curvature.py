@@ -79,17 +79,17 @@ class Curvature:
         """
         return replace(self, outputs=self.outputs[rows].clone(), total=total)
 
-    def excess(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
+    def excess(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
         """The part of a displacement that a proximal step takes away.
 
         Args:
             weight: displacement of the map's weight, [o, ...].
             bias: displacement of its bias, [o].
-            strength: the penalty's weight w.
+            strength: the penalty's weight w, a tensor [] where nobody may read it.
         """
         return self._weighed(weight, bias, strength, _taken)
 
-    def gradient(self, weight: Tensor, bias: Tensor | None, strength: float) -> Pair:
+    def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
         """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
         return self._weighed(weight, bias, strength, lambda wh: wh)
 
@@ -97,7 +97,7 @@ class Curvature:
         self,
         weight: Tensor,
         bias: Tensor | None,
-        strength: float,
+        strength: float | Tensor,
         factor: Callable[[Tensor], Tensor],
     ) -> Pair:
         """A displacement whose entries in the eigenbases are multiplied by `factor` of w h_ij."""
@@ -120,7 +120,7 @@ class Curvature:
         return found_weight, None if bias is None else found[..., width]
 
     def _along(
-        self, read: Tensor, strength: float, c: Tensor, factor: Callable[[Tensor], Tensor]
+        self, read: Tensor, strength: float | Tensor, c: Tensor, factor: Callable[[Tensor], Tensor]
     ) -> Tensor:
         """A displacement [o, k] along inputs of curvature c [k] or [1], weighed per output."""
         # Outputs outside the stored eigenvectors are damped too, so all of them have this share at

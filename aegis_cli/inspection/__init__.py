@@ -25,6 +25,7 @@ from aegis_cli.inspection.report import (
     StreamInspection,
     TensorInfo,
     UnknownFolder,
+    steps_taken,
 )
 from aegis_cli.models import shipped
 
@@ -40,6 +41,7 @@ __all__ = [
     "TensorInfo",
     "UnknownFolder",
     "run",
+    "steps_taken",
     "verify",
 ]
 

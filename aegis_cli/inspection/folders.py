@@ -117,8 +117,12 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         )
     until = None if at is None else checkpoint.step_of(at)
     header, metrics = artifacts.read_header(rows), _last_metrics(path, until)
+    which = path / "checkpoints" / checkpoint.LAST if at is None else at
+    if merged := _merged(which):
+        # The log is that of the training, before the weights were moved back.
+        metrics["validation_loss"] = merged.get("validation_loss")
     facts = _run_facts(path, until, header, settings, metrics)
-    if merged := _merged(path / "checkpoints" / checkpoint.LAST if at is None else at):
+    if merged:
         facts["merge"] = merged
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
@@ -156,9 +160,8 @@ def _run_facts(
     metrics: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What a run is, or after `until` steps was."""
-    checkpoints = sorted(p.name for p in (path / "checkpoints").glob("*") if p.name.isdigit())
     which = (
-        {"checkpoints": checkpoints}
+        {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
         if until is None
         else {"run": str(path), "checkpoint": f"{until:06d}"}
     )
@@ -167,12 +170,20 @@ def _run_facts(
         "task": header.meta.get("task", settings.task),
         "recipe": settings.name,
         "seed": settings.seed,
-        "steps": metrics.get("step") if until is None else until,
+        "steps": _steps(path, metrics) if until is None else until,
+        "planned_steps": settings.train.steps,
         "fingerprint": header.fingerprint,
         **which,
         "loss": metrics.get("loss"),
         "validation_loss": metrics.get("validation_loss"),
     }
+
+
+def _steps(path: Path, metrics: Mapping[str, Any]) -> int | None:
+    """The steps of a run's policy, or of its log where a study has removed the checkpoints."""
+    last = path / "checkpoints" / checkpoint.LAST
+    there = (last / checkpoint.EXPERT).is_file()
+    return checkpoint.step_of(last) if there else metrics.get("step")
 
 
 def _without_pictures(found: Result) -> Result:

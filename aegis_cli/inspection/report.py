@@ -126,8 +126,21 @@ class InspectReport:
     open_loops: tuple[Result, ...] = ()
     gate: bool | None = None
 
+    @property
+    def method(self) -> str:
+        """A run's method, and whether what it trained was merged afterwards."""
+        return f"{self.facts['method']}, merged" if "merge" in self.facts else self.facts["method"]
+
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
+
+
+def steps_taken(steps: int | None, planned: int | None) -> str:
+    """How many steps a run has taken in words, and of how many where some are left."""
+    if steps is None:
+        return "-"
+    left = planned is not None and steps < planned
+    return f"{steps:,} of {planned:,}" if left else f"{steps:,}"
 
 
 @dataclass(frozen=True)

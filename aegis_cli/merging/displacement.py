@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 
@@ -25,6 +25,8 @@ class Displacement:
     (normalisations, tables, lone rows) have no two factors to say what the task needs of them. They
     keep the maps' mean share <X, D> / <D, D>, X being what all maps together keep of their D: so
     they are where the maps are on the way back, and a linear merge treats all parameters alike.
+    Where no map has moved, they keep what the method says of each as of a map; only the linear one
+    does, and `rules.keep` refuses the others.
     """
 
     def __init__(self, backbone: Backbone, base: Backbone, keep: Keep) -> None:
@@ -43,36 +45,50 @@ class Displacement:
         """Give the backbone the weights of a merge of this strength; 0 gives the fine-tuned ones.
 
         Returns:
-            The maps' mean kept share of the displacement, from 0 to 1.
+            The maps' mean kept share of the displacement, from 0 to 1; that of all others where no
+            map has moved.
         """
         if strength == 0:
             self._backbone.load_state_dict(self._tuned.state_dict())
             return 1.0
-        share = self._move_maps(strength)
-        in_maps = {
-            id(tensor)
-            for site in self._sites
-            for tensor in weights(self._backbone, site)
-            if tensor is not None
-        }
-        named = zip(
-            self._backbone.parameters(),
-            self._base.parameters(),
-            self._tuned.parameters(),
-            strict=True,
-        )
-        for now, origin, tuned in named:
-            if id(now) not in in_maps:
-                now.copy_(torch.lerp(origin.float(), tuned.float(), share))
+        share = self._move(self._maps(), strength)
+        if share is None:
+            share = self._move(self._others(), strength)
+            assert share is not None, "nothing has moved"
+            return share
+        for _, (now, _), (origin, _), (tuned, _) in self._others():
+            now.copy_(torch.lerp(origin.float(), tuned.float(), share))
         return share
 
-    def _move_maps(self, strength: float) -> float:
-        """Set each map's weights, one map at a time; the mean kept share of the displacement."""
-        along, squared = 0.0, 0.0
+    def _maps(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
+        """Each map's site, and its weights of now, of before the fine-tuning and of after it."""
         for site in self._sites:
             now, origin, tuned = (
                 weights(model, site) for model in (self._backbone, self._base, self._tuned)
             )
+            yield site, now, origin, tuned
+
+    def _others(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
+        """The same of each parameter that is of no map, by its name."""
+        in_maps = {id(tensor) for _, now, _, _ in self._maps() for tensor in now}
+        named = zip(
+            self._backbone.named_parameters(),
+            self._base.parameters(),
+            self._tuned.parameters(),
+            strict=True,
+        )
+        for (name, now), origin, tuned in named:
+            if id(now) not in in_maps:
+                yield name, (now, None), (origin, None), (tuned, None)
+
+    def _move(self, parts: Iterable[tuple[str, Pair, Pair, Pair]], strength: float) -> float | None:
+        """Set the weights of each part in turn, as the method says.
+
+        Returns:
+            The mean kept share of their displacement; None where none has moved.
+        """
+        along, squared = 0.0, 0.0
+        for site, now, origin, tuned in parts:
             moved = minus(tuned, origin)
             left = self._keep(site, moved, strength)
             for parameter, start, way, part in zip(now, origin, moved, left, strict=True):
@@ -81,4 +97,4 @@ class Displacement:
                     along += float(dot(part, way))
                     squared += float(dot(way, way))
         # In bases that are not orthogonal, rounding can lead past either end.
-        return min(max(along / squared, 0.0), 1.0) if squared else 1.0
+        return min(max(along / squared, 0.0), 1.0) if squared else None

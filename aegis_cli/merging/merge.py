@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import locks
+from aegis_cli.common import files, locks
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.vqa import sets
@@ -130,7 +130,11 @@ def _run(
     if chosen is not None and out is not None:
         kept = displacement.keep(chosen)
         how = {"method": settings.method, "strength": chosen, "damping": settings.damping}
-        source.write(out, {**how, "base": source.base_name, "kept": kept})
+        losses = {point.strength: point.validation_loss for point in points}
+        result = {"kept": kept, "validation_loss": losses.get(chosen)}
+        source.write(
+            out, {**how, "base": source.base_name, **result, **_measured_on(source, settings)}
+        )
     return MergeReport(
         method=settings.method,
         damping=settings.damping,
@@ -145,6 +149,19 @@ def _run(
         baseline_accuracy=baseline,
         points=tuple(points),
     )
+
+
+def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, Any]:
+    """What the method has read of the task and of questions, for whoever merges so again."""
+    if settings.method == "linear":
+        return {}
+    found: dict[str, Any] = {}
+    if settings.method != "kfac-shrink" and isinstance(source, sources.PolicyRun):
+        found["frames"] = settings.frames
+    if settings.anchor is not None:
+        return found | {"anchor": files.sha256_file(settings.anchor)}
+    found |= {name: getattr(settings, name) for name in ("vqa", "ask", "samples", "temperature")}
+    return found | {"skip_bad": True} if settings.skip_bad else found
 
 
 class _Judge:

@@ -34,13 +34,20 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
     """What the method says, once all that it reads is measured.
 
     Raises:
-        AegisError: an anchor of another model or without the method's part, or nothing that says
-            what the task needs.
+        AegisError: no map that has moved, an anchor of another model or without the method's part,
+            or nothing that says what the task needs.
     """
     if settings.method == "linear":
         return lambda _, moved, strength: _scaled(moved, 1 - strength)
     part = MERGE_NEEDS[settings.method]
     sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
+    if not sites:
+        raise AegisError(
+            f"no linear map or convolution that has moved, of which '{settings.method}' says what "
+            "is kept",
+            "some that have: normalisations, tables and lone rows alone do not tell",
+            "--method linear, which moves all parameters back alike",
+        )
     given = None if settings.anchor is None else _given(settings.anchor, source, settings, part)
     if settings.method == "kfac-shrink":
         anchor = given or _measured(source.base, settings, part, on_event)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from aegis_cli import recipes
 from aegis_cli.anchors import curvature, inputs
-from aegis_cli.common import artifacts, devices, files
+from aegis_cli.common import artifacts, devices, files, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent
 from aegis_cli.core.ledger import Ledger
@@ -144,9 +144,11 @@ class PolicyRun:
         _write_whole(out, fill)
 
     def _copy_records(self, folder: Path, step: int) -> None:
-        """The training's recipe, and its log and ledger up to the step that is merged."""
-        for name in ("recipe.yaml", run_folder.METRICS):
-            shutil.copyfile(self._run / name, folder / name)
+        """The training's recipe and machine, and its log and ledger up to the step merged."""
+        for name in ("recipe.yaml", run_folder.METRICS, machine.NAME):
+            # An earlier Aegis did not say on which machine it trained.
+            if name != machine.NAME or (self._run / name).is_file():
+                shutil.copyfile(self._run / name, folder / name)
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header

@@ -145,15 +145,16 @@ class Update:
             by name; empty for a method that does not compare.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a
             penalty.
-        steps: how many these steps are.
+        steps: how many of these steps have moved anything. A tensor [] float64 where a step may
+            have moved nothing and reading that would wait; 0 of them change nothing.
         rate_left: share of the peak learning rate that the schedule had left at the last of them; 1
-            until it has reached the peak, and in a loop of somebody else's.
+            until it has reached the peak, and in a loop of somebody else's. A tensor like `steps`.
     """
 
     before: Mapping[str, Tensor]
     anchor_gradient: Mapping[str, Tensor]
-    steps: int = 1
-    rate_left: float = 1.0
+    steps: int | Tensor = 1
+    rate_left: float | Tensor = 1.0
 
 
 @dataclass(frozen=True)

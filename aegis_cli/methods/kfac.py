@@ -93,8 +93,7 @@ def start(setting: Setting) -> Parts:
         # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
-            # A schedule may end at a rate of 0.
-            strength /= max(update.rate_left, _LEAST_RATE) ** growth
+            strength = strength / _at_least(update.rate_left, _LEAST_RATE) ** growth
         for group in groups:
             joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
 
@@ -112,6 +111,11 @@ def start(setting: Setting) -> Parts:
         return Parts(shares=slowed, pull=pull)
     # It compares with the start, not with the step before, so no step's weights are copied.
     return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
+
+
+def _at_least(rate: float | Tensor, least: float) -> float | Tensor:
+    """A share of the peak learning rate that can be divided by: a schedule may end at 0."""
+    return rate.clamp(min=least) if isinstance(rate, Tensor) else max(rate, least)
 
 
 @dataclass(frozen=True)

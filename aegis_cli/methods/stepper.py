@@ -43,7 +43,8 @@ class Stepper:
         self._device = next(iter((*self._learning.values(), *model.parameters()))).device.type
         self._before: dict[str, Tensor] = {}
         self._anchor: Mapping[str, Tensor] = {}
-        self._rate_left = 1.0
+        self._rate_left: float | Tensor = 1.0
+        self._moved: int | Tensor = 0
         self.pending = 0
 
     def step(
@@ -52,6 +53,7 @@ class Stepper:
         move: Callable[[], None],
         anchor: Mapping[str, Tensor],
         rate_left: float = 1.0,
+        moves: Tensor | None = None,
     ) -> None:
         """Move the weights once; after every `parts.every`-th step the method constrains.
 
@@ -62,23 +64,35 @@ class Stepper:
             anchor: gradient of the method's penalty before the step, by the parameters' names; the
                 method is given that of the last step.
             rate_left: share of the peak learning rate that the schedule has left at this step; the
-                method is given that of the last step.
+                method is given that of the last step that moves the weights.
+            moves: 1, or 0 where `move` leaves all weights as they are, [] on their device, since to
+                read it would be to wait; None: it moves them.
 
         Raises:
             AegisError: parameters learn that the method does not know; nothing has moved.
         """
-        self.begin(anchor, rate_left)
+        self.begin(anchor, rate_left, moves)
         move()
         self.end(number)
 
-    def begin(self, anchor: Mapping[str, Tensor], rate_left: float = 1.0) -> None:
+    def begin(
+        self,
+        anchor: Mapping[str, Tensor],
+        rate_left: float = 1.0,
+        moves: Tensor | None = None,
+    ) -> None:
         """Prepare for a step that somebody else takes; `end` follows it, and both are as `step`."""
         self.known.check()
         if not self.pending and self._parts.copies:
             self._before = self._copies()
         if not self.pending and self._parts.begin is not None:
             self._parts.begin()
-        self._anchor, self._rate_left = anchor, rate_left
+        self._anchor = anchor
+        if moves is None:
+            self._moved, self._rate_left = self._moved + 1, rate_left
+        else:
+            self._moved = self._moved + moves
+            self._rate_left = moves * rate_left + (1 - moves) * self._rate_left
         self.pending += 1
 
     def end(self, number: int) -> None:
@@ -89,17 +103,22 @@ class Stepper:
     def take_none(self) -> None:
         """Forget that a step was begun, in which nothing has moved."""
         self.pending -= 1
+        self._moved = self._moved - 1
         if not self.pending:
             self._before, self._anchor = {}, {}
 
     def settle(self) -> None:
         """Let the method constrain the pending steps now; without one, nothing happens."""
-        update = Update(self._before, self._anchor, self.pending, self._rate_left)
-        self._before, self._anchor, self.pending = {}, {}, 0
-        if update.steps and self._parts.constrain is not None:
+        begun, update = self.pending, self._update()
+        self._before, self._anchor, self._moved, self.pending = {}, {}, 0, 0
+        if begun and self._parts.constrain is not None:
             # A loop may step inside an autocast of its own.
             with torch.autocast(self._device, enabled=False):
                 self._parts.constrain(update)
+
+    def _update(self) -> Update:
+        """What the pending steps have done."""
+        return Update(self._before, self._anchor, self._moved, self._rate_left)
 
     def _copies(self) -> dict[str, Tensor]:
         """The parameters' values by all their names, each copied once."""

@@ -47,8 +47,8 @@ fine-tuned by Aegis {version} with the method `{method}`:
 
 ## Training
 
-{steps:,} steps of {batch} frames, seed {seed}; learning rate {backbone_lr:g} for the backbone and
-{expert_lr:g} for the expert. Options of the method: `{options}`.{averaged}{merged}
+{steps} steps, of {batch} frames each, seed {seed}; learning rate {backbone_lr:g} for the backbone
+and {expert_lr:g} for the expert. Options of the method: `{options}`.{averaged}{merged}
 
 {stored}
 
@@ -122,14 +122,14 @@ def text(
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
-        title=f"{recipe.name}: {facts['task'] or 'a robot'} by {recipe.train.method}",
+        title=f"{recipe.name}: {facts['task'] or 'a robot'} by {found.method}",
         backbone=recipe.backbone,
         version=__version__,
         method=recipe.train.method,
         summary=methods.get(recipe.train.method).summary,
         knowledge="\n".join(_knowledge(found, recipe)),
         acting="\n".join(_acting(found)),
-        steps=checkpoint.step_of(at),
+        steps=inspection.steps_taken(checkpoint.step_of(at), recipe.train.steps),
         batch=recipe.train.batch_size,
         seed=recipe.seed,
         backbone_lr=recipe.train.backbone_lr,

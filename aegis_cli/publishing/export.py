@@ -18,8 +18,9 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import check_utf8, hidden, make_folder, write_text
+from aegis_cli.inspection import steps_taken
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
@@ -37,6 +38,8 @@ class ExportReport:
         pictures: LeRobot's names of them; empty in another layout.
         dtype: name of the type that the backbone's weights are in.
         rounded: whether they have lost digits by it.
+        steps: after which of its run the policy was; None where it has been taken out of one, as
+            `planned_steps` is then, which the run's recipe asks for.
     """
 
     out: str
@@ -49,6 +52,8 @@ class ExportReport:
     chunk: int
     replan: int
     parameters: int
+    steps: int | None
+    planned_steps: int | None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -90,6 +95,7 @@ def run(
             "leave --camera out, or give --format lerobot",
         )
     policy, meta = checkpoint.load_policy(run)
+    steps, planned = warn_of_steps_left(run, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
@@ -119,7 +125,34 @@ def run(
         policy.expert.shape.chunk,
         meta["replan"],
         sum(p.numel() for p in policy.parameters()),
+        steps,
+        planned,
     )
+
+
+def warn_of_steps_left(
+    run: Path, stage: str, on_event: OnEvent
+) -> tuple[int, int] | tuple[None, None]:
+    """Say so where the last policy of a run that is not finished is given to others.
+
+    An earlier checkpoint that a user names is what the user wants.
+
+    Returns:
+        The steps that the policy has behind it, and those that its run's recipe asks for; None for
+        each of a policy outside of its run.
+    """
+    if lerobot_folder.is_policy(run):
+        return None, None
+    at = checkpoint.chosen(run)
+    home = checkpoint.run_of(at)
+    if home is None:
+        return None, None
+    steps, planned = checkpoint.step_of(at), recipes.load(home / "recipe.yaml").train.steps
+    if steps < planned and at.resolve() == checkpoint.last(home).resolve():
+        taken = steps_taken(steps, planned)
+        text = f"'{home}' is not finished: {taken} steps; aegis train --resume goes on"
+        on_event(Warned(stage, text))
+    return steps, planned
 
 
 def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:

@@ -118,6 +118,7 @@ def run(
             "a run, whose recipe and results make the model card",
             "give the run's folder",
         )
+    export.warn_of_steps_left(run, "push", on_event)
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
         folder = Path(aside) / "policy"

@@ -26,6 +26,7 @@ _Named = tuple[Any, results.Result]  # by what two runs' results are compared
 class ComparedRun:
     """One run's figures; None for what was not measured of it.
 
+    `method` says whether what it trained was merged afterwards, as in `naive, merged`.
     Shares are in [0, 1], the drop in percentage points, times in seconds, W2^2 a mean over layers.
     The figures of VQA are those of one probe, on the question set `vqa`, and the open-loop error is
     that of one evaluation, on the episodes that `open_loop_on` says in words.
@@ -35,6 +36,7 @@ class ComparedRun:
     method: str
     task: str | None
     steps: int | None
+    planned_steps: int | None
     vqa: str | None
     accuracy: float | None
     baseline_accuracy: float | None
@@ -86,6 +88,7 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(one) for _, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
+    _warn_of_unfinished(rows, on_event)
     made = Comparison(rows, len({own[0] for own in evaluated if own is not None}) < 2)
     if len(made.question_sets) > 1:
         text = f"VQA is of different questions: {', '.join(made.question_sets)}"
@@ -95,6 +98,17 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
         text = f"open-loop errors are not of the same frames: {said}"
         on_event(Warned("compare", f"{text}; aegis evaluate --episodes measures each on the same"))
     return made
+
+
+def _warn_of_unfinished(rows: Sequence[ComparedRun], on_event: OnEvent) -> None:
+    """Say which runs have steps left, for the others may only have had more of them."""
+    left = []
+    for row in rows:
+        if None not in (row.steps, row.planned_steps) and row.steps < row.planned_steps:
+            left.append(f"{row.run}, {inspection.steps_taken(row.steps, row.planned_steps)} steps")
+    if left:
+        text = f"not finished: {'; '.join(left)}; aegis train --resume goes on"
+        on_event(Warned("compare", text))
 
 
 def _inspected(path: Path) -> InspectReport:
@@ -163,9 +177,10 @@ def _compared(
     layers = [layer["w2"] for layer in probed.get("layers", [])]
     return ComparedRun(
         run=str(path),
-        method=str(found.facts["method"]),
+        method=found.method,
         task=found.facts.get("task"),
         steps=found.facts.get("steps"),
+        planned_steps=found.facts.get("planned_steps"),
         vqa=vqa,
         accuracy=probed.get("accuracy"),
         baseline_accuracy=probed.get("baseline_accuracy"),

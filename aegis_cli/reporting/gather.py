@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,8 @@ class RunDocument:
     """One run.
 
     Attributes:
-        label: a name that tells it from the others of a job; its method.
+        label: a name that tells it from the others of a job; its method, and whether what that
+            trained was merged afterwards.
         recipe: every key with its value.
         facts: as `aegis inspect` tells them.
         metrics: the lines of metrics.jsonl.
@@ -186,7 +187,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     return RunDocument(
         kind="run",
         path=str(path),
-        label=str(found.facts["method"]),
+        label=found.method,
         method=str(found.facts["method"]),
         task=found.facts.get("task"),
         backbone=recipe.backbone,
@@ -203,23 +204,30 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         gate=found.gate,
         machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],
-        commands=_commands(path, recipe, str(found.facts["method"]), found.facts.get("task")),
+        commands=_commands(path, recipe, found.facts),
     )
 
 
-def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None) -> list[str]:
-    """Training, probe and rollout of a run; inputs lie beside it if `aegis run` made them.
+def _commands(path: Path, recipe: recipes.Recipe, facts: Mapping[str, Any]) -> list[str]:
+    """Training, merge, probe and rollout of a run; inputs lie beside it if `aegis run` made them.
 
-    Args:
-        task: a simulated one; None where nothing can be rolled out.
+    Without a simulated task, nothing can be rolled out.
     """
+    method, task, merge = str(facts["method"]), facts.get("task"), facts.get("merge")
     named = recipe.demos.path or _beside(path, "demos.safetensors")
-    demos = [("--demos", each) for each in ((named,) if isinstance(named, str) else named)]
+    sets = (named,) if isinstance(named, str) else named
+    demos = [word for each in sets for word in ("--demos", each)]
     anchor = _beside(path, "anchor.safetensors")
     again, new = path / "recipe.yaml", "NEW_FOLDER"
-    inputs = ("--method", method, *chain(*demos), "--anchor", anchor, "--out", new)
+    inputs = ("--method", method, *demos, "--anchor", anchor, "--out", new)
     asked = ("--baseline", recipe.backbone, "--anchor", anchor)
     commands = [_command("aegis", "train", again, *inputs)]
+    if merge is not None:
+        trained, new = new, "MERGED_FOLDER"
+        if facts["steps"] != recipe.train.steps:
+            trained = f"{trained}/checkpoints/{facts['steps']:06d}"
+        own = _merging(merge, recipe, demos, anchor)
+        commands.append(_command("aegis", "merge", trained, *own, "--out", new))
     for probe in recipe.probe.of_each_set():
         counted = (*probe.asking, "--questions", probe.questions, *_seed(probe.seed))
         commands.append(_command("aegis", "probe", new, *counted, *asked))
@@ -231,6 +239,34 @@ def _commands(path: Path, recipe: recipes.Recipe, method: str, task: str | None)
             for own in (colors if sim.has_colors(task) else [()])
         ]
     return commands
+
+
+def _merging(
+    merge: Mapping[str, Any], recipe: recipes.Recipe, demos: Sequence[str], anchor: str
+) -> Iterator[object]:
+    """The options of a merge, of which an earlier Aegis has not kept what was read for it.
+
+    Args:
+        demos: the option with the run's demonstrations, once for each set.
+    """
+    method = merge["method"]
+    yield from ("--method", method, "--strength", merge["strength"])
+    if merge["base"] != recipe.backbone:
+        yield from ("--base", merge["base"])
+    if method == "linear":
+        return
+    yield from ("--damping", merge["damping"])
+    if method != "kfac-shrink":
+        yield from demos
+    if "frames" in merge:
+        yield from ("--frames", merge["frames"])
+    if "anchor" in merge:
+        yield from ("--anchor", anchor)
+    elif "vqa" in merge:
+        for name, default in (("vqa", None), ("ask", "{}"), ("samples", None), ("temperature", 1)):
+            if merge[name] != default:
+                yield from (f"--{name}", merge[name])
+        yield from ["--skip-bad"] * ("skip_bad" in merge)
 
 
 def _seed(seed: int) -> tuple[object, ...]:

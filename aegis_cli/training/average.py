@@ -39,7 +39,8 @@ class Average:
             AegisError: weights that are narrower than float32, in which small steps are lost.
         """
         self._parameters = dict(parameters or {})
-        self._decay, self._step = decay, 0
+        self._decay = decay
+        self._step: int | Tensor = 0
         narrow = [name for name, p in self._parameters.items() if p.dtype != torch.float32]
         if narrow:
             raise AegisError(
@@ -51,19 +52,32 @@ class Average:
         self.weights = {name: p.detach().clone() for name, p in self._parameters.items()}
 
     @torch.no_grad()
-    def follow(self, step: int) -> None:
-        """Move towards the weights after `step` steps; nothing happens where that was done.
+    def follow(self, step: int | Tensor) -> None:
+        """Move towards the weights after `step` steps; nothing changes where that was done.
 
         Steps that a method constrains together count one by one, each with the constrained weights.
+
+        Args:
+            step: a tensor [] float64 where to read it would be to wait.
         """
         waited = step - self._step
-        if not self._parameters or waited <= 0:
+        if not self._parameters or (not isinstance(waited, Tensor) and waited <= 0):
             return
-        decay = min(self._decay, (1 + step) / (10 + step)) ** waited
+        decay = self._decay_after(step) ** waited
         means = [rows_here(mean) for mean in self.weights.values()]
         now = [rows_here(p) for p in self._parameters.values()]
-        get_ema_multi_avg_fn(decay)(means, now, None)
+        if isinstance(decay, Tensor):
+            torch._foreach_lerp_(means, now, [(1 - decay).float()] * len(means))
+        else:
+            get_ema_multi_avg_fn(decay)(means, now, None)
         self._step = step
+
+    def _decay_after(self, step: int | Tensor) -> float | Tensor:
+        """What one step leaves of the average, the last of `step` steps."""
+        early = (1 + step) / (10 + step)
+        if isinstance(early, Tensor):
+            return early.clamp(max=self._decay)
+        return min(self._decay, early)
 
     def check(self, tensors: Mapping[str, Tensor], source: str) -> None:
         """Raise AegisError for what cannot be put back, being no average of these weights."""

@@ -225,7 +225,16 @@ def writing(folder: Path) -> Iterator[None]:
 
 def whole(folder: Path) -> list[Path]:
     """The checkpoints of a run, oldest first."""
-    return sorted(path.parent for path in (Path(folder) / "checkpoints").glob(f"[0-9]*/{EXPERT}"))
+    return [path for path in numbered(folder) if (path / EXPERT).is_file()]
+
+
+def numbered(folder: Path) -> list[Path]:
+    """What lies in a run's checkpoints under the number of a step, in the steps' order.
+
+    The names of a millionth step and of those after it have more digits than those before.
+    """
+    named = (Path(folder) / "checkpoints").glob("[0-9]*")
+    return sorted((path for path in named if path.name.isdecimal()), key=lambda p: int(p.name))
 
 
 def begun(folder: Path) -> bool:
@@ -293,7 +302,7 @@ def step_of(path: Path) -> int:
     Where `last` was copied as a folder, its files say so.
     """
     name = path.resolve().name
-    return int(name) if name.isdigit() else int(artifacts.read_header(path / STATE).meta["step"])
+    return int(name) if name.isdecimal() else int(artifacts.read_header(path / STATE).meta["step"])
 
 
 def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:

@@ -307,6 +307,10 @@ def _backward(
         # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
             encoding, seen = encode(batch, prepared)
+        if method.stop_gradient:
+            # Before torch 2.11 autocast keeps weights that it has rounded without a graph for later
+            # passes with one, such as a method's own, and these then give the weights no gradient.
+            torch.clear_autocast_cache()
         loss = policy.flow_loss(
             batch, encoding, settings.flow_samples, generator, method.stop_gradient, of
         )

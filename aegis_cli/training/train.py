@@ -183,9 +183,11 @@ def _reading_state(out: Path) -> Iterator[None]:
         if error.fix != AS_WRITTEN and rewrite("training-state") not in error.fix:
             raise
         link = checkpoint.last(out)
-        older = [path for path in checkpoint.whole(out) if path.name < link.resolve().name]
+        known, name = checkpoint.whole(out), link.resolve().name
+        # A copy that followed links has a folder of the name 'last'.
+        older = [at for at in known if name.isdecimal() and int(at.name) < int(name)]
         fix = "bring back a copy of it, or begin anew with --overwrite instead of --resume"
-        if older and link.is_symlink():
+        if older:
             fix = f"go on from an earlier checkpoint: ln -sfn {older[-1].name} '{link}'; or {fix}"
         raise AegisError(error.found, error.expected, fix) from error
 
@@ -479,11 +481,12 @@ def update(
         _move(run, factor, still=True)
     else:
         move = partial(_move, run, factor)
-        run.stepper.step(index + 1, move, result.anchor, rate_left(index, settings))
+        left, moves = rate_left(index, settings), run.unread.moves
+        run.stepper.step(index + 1, move, result.anchor, left, moves)
         if settle or index + 1 == moving:
             run.stepper.settle()
     if not run.stepper.pending:
-        run.average.follow(index + 1)
+        run.average.follow(run.unread.moved)
 
 
 def read(run: TrainingRun, window: Window) -> None:

@@ -4,8 +4,8 @@ To read a number of a GPU is to wait until it has done all it was given, and the
 So there the figures of `train.log_every` steps are read at once. A step whose figures are not
 finite must not move the weights all the same: the optimizers are told so by a flag that stays on
 the device, and that step and those after it leave everything as it is, until the figures are read.
-Methods that draw back all that has moved since the start (`kfac`, `ewc` by its proximal step) may
-do so once more in the meantime.
+A method that constrains several steps at once and the average of the weights are told in the same
+way how many steps have moved anything.
 """
 
 from __future__ import annotations
@@ -49,9 +49,15 @@ class Unread:
 
     Attributes:
         waits: whether reading them is put off.
+        moves: 1 where the step that was noted last moves the weights, 0 from the first one on that
+            is not finite, [] float64; None where nothing is put off, for such a step ends the run.
+        moved: how many steps have moved the weights since the run began, once the optimizers have
+            taken the one that was noted last; [] float64 where reading is put off.
     """
 
     waits: bool = False
+    moves: Tensor | None = None
+    moved: int | Tensor = 0
     _steps: list[tuple[int, Tensor, list[int]]] = field(default_factory=list)
     _broken: Tensor | None = None
 
@@ -84,6 +90,11 @@ class Unread:
         if self.waits:
             broken = (~figures.isfinite().all()).float()
             self._broken = broken if self._broken is None else self._broken.maximum(broken)
+            before = index if self.moves is None else self.moved
+            self.moves = 1 - self._broken.double()
+            self.moved = self.moves * (index + 1) + (1 - self.moves) * before
+        else:
+            self.moved = index + 1
 
     def stop(self, optimizers: Sequence[Optimizer]) -> None:
         """Let the optimizers leave everything as it is from the first step that is not finite."""

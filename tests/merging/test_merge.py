@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,8 @@ from aegis_cli import load_policy
 from aegis_cli.anchors import curvature
 from aegis_cli.common import artifacts, locks
 from aegis_cli.merging.merge import MergePoint, _weakest
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGES
 
 Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
@@ -96,9 +99,63 @@ def test_the_expert_stays_and_the_files_say_what_they_were_made_from(
     assert merged.header.fingerprint != trained.header.fingerprint
     assert merged.header.inputs["tuned"] == trained.header.fingerprint
     assert trained.header.inputs.items() <= merged.header.inputs.items()
-    for name in ("recipe.yaml", "metrics.jsonl", "ledger.safetensors"):
+    for name in ("recipe.yaml", "metrics.jsonl", "ledger.safetensors", "machine.json"):
         copy = tmp_path / "merged" / name
         assert copy.read_bytes() == (merge_place.run / name).read_bytes()
+
+
+def test_a_merged_run_shows_what_it_is_and_not_what_it_was_made_of(
+    aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    """Its validation loss is the one that the sweep has measured of it."""
+    out, given = tmp_path / "merged", ("--method", "linear", "--sweep", "0.999")
+    report = merge(merge_place.run, *given, "--max-drop", 0, "--out", out)
+    (found,) = (p for p in report["points"] if p["strength"] == report["strength"])
+    said = json.loads(aegis("inspect", out, "--json")[1])
+    loss = found["validation_loss"]
+    assert said["validation_loss"] == said["facts"]["validation_loss"] == loss
+    assert loss != report["points"][0]["validation_loss"]
+    both = json.loads(aegis("compare", merge_place.run, out, "--json")[1])["rows"]
+    assert [row["method"] for row in both] == ["naive", "naive, merged"]
+    assert both[1]["validation_loss"] == loss != both[0]["validation_loss"]
+    assert "naive, merged" in aegis("compare", merge_place.run, out)[1]
+    document = json.loads(aegis("report", out, "--json")[1])
+    assert document["label"] == "naive, merged" and document["machine"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "naive, merged" in page and "linear, strength 0.999" in page
+    assert aegis("export", out, "--out", tmp_path / "policy")[0] == 0
+    assert "by naive, merged" in (tmp_path / "policy" / "README.md").read_text(encoding="utf-8")
+
+
+def test_a_merge_that_measures_nothing_shows_no_validation_loss(
+    aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    out = tmp_path / "merged"
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
+    said = json.loads(aegis("inspect", out, "--json")[1])
+    assert said["validation_loss"] is None is said["facts"]["validation_loss"]
+    assert json.loads(aegis("compare", out, "--json")[1])["rows"][0]["validation_loss"] is None
+
+
+@pytest.mark.parametrize("method", MERGES)
+def test_the_commands_of_a_merged_runs_report_merge_it_so_again(
+    method: str, aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    at, out = merge_place.run / "checkpoints" / "000004", tmp_path / "merged"
+    given = () if method == "linear" else ("--damping", 0.02)
+    merge(at, "--method", method, "--strength", 0.5, *given, "--out", out)
+    commands = json.loads(aegis("report", out, "--json")[1])["commands"]
+    assert [line.split()[1] for line in commands[:3]] == ["train", "merge", "probe"]
+    assert commands[2].split()[2] == "MERGED_FOLDER"
+    # As somebody types it who has trained again.
+    shutil.copytree(merge_place.run, tmp_path / "NEW_FOLDER", symlinks=True)
+    own = {"NEW_FOLDER": f"{tmp_path}/NEW_FOLDER", "MERGED_FOLDER": f"{tmp_path}/again"}
+    line = commands[1].replace("DEMOS", str(merge_place.demos))
+    for name, path in own.items():
+        line = line.replace(name, path)
+    assert aegis(*shlex.split(line)[1:])[0] == 0
+    again, merged = parameters(tmp_path / "again"), parameters(out)
+    assert all(torch.equal(again[name], found) for name, found in merged.items())
 
 
 @pytest.mark.parametrize("method", MERGES)
@@ -257,6 +314,43 @@ def test_two_models_of_ours(merge: Callable[..., Any], merge_place: Place, tmp_p
     for name, found in merged.items():
         wanted = 0.25 * base[name] + 0.75 * trained[name]
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def moved_norms(merge_place: Place, tmp_path: Path) -> Path:
+    """The base with normalisations that have moved, and no map that has."""
+    model: Backbone = backbones.load(str(merge_place.base))
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if "norm" in name:
+                parameter.add_(0.5)
+    model.save(tmp_path / "tuned")
+    return tmp_path / "tuned"
+
+
+@pytest.mark.parametrize("strength", [0.25, 1.0])
+def test_linear_moves_back_what_lies_beside_maps_that_have_not_moved(
+    strength: float, merge: Callable[..., Any], merge_place: Place, moved_norms: Path
+) -> None:
+    out = moved_norms.with_name("merged")
+    given = ("--base", merge_place.base, "--method", "linear", "--strength", strength)
+    report = merge(moved_norms, *given, "--out", out)
+    assert report["kept"] == pytest.approx(1 - strength, abs=1e-6)
+    base, merged = parameters(merge_place.base), parameters(out)
+    assert any("norm" in name for name in merged)
+    for name, found in merged.items():
+        wanted = base[name] + (0.5 * (1 - strength) if "norm" in name else 0)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("method", [m for m in MERGES if m != "linear"])
+def test_a_method_for_maps_refuses_a_model_of_which_none_has_moved(
+    method: str, aegis: Aegis, merge_place: Place, moved_norms: Path
+) -> None:
+    out = moved_norms.with_name("merged")
+    given = ("--base", merge_place.base, "--method", method, "--strength", 1, "--out", out)
+    bad(aegis, moved_norms, *given, says=("no linear map", f"'{method}'", "--method linear"))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("method", ["inputs", "factors"])

@@ -26,6 +26,7 @@ from samples.training import (
     start,
 )
 from torch import Tensor
+from torch.nn import functional as F
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.vqa import questions
@@ -80,6 +81,43 @@ def test_the_backbones_gradient_is_that_of_its_actions_as_text() -> None:
             torch.testing.assert_close(found[2.0][name], 2 * gradient)
     moved = [n for n, g in found[1.0].items() if n.startswith("backbone.") and g is not None]
     assert any(name.endswith("words.weight") for name in moved)
+
+
+@pytest.fixture
+def graphless_casts_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Autocast as it is before torch 2.11: a weight's cast is kept, made without a graph or not."""
+    casts: dict[int, Tensor] = {}
+    linear, clear = F.linear, torch.clear_autocast_cache
+
+    def cast(parameter: Tensor) -> Tensor:
+        if id(parameter) not in casts:
+            casts[id(parameter)] = parameter.to(torch.bfloat16)
+        return casts[id(parameter)]
+
+    def of_casts(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+        if not torch.is_autocast_enabled("cpu"):
+            return linear(x, weight, bias)
+        return linear(x, cast(weight), None if bias is None else cast(bias))
+
+    def cleared() -> None:
+        casts.clear()
+        clear()
+
+    monkeypatch.setattr(F, "linear", of_casts)
+    monkeypatch.setattr(torch, "clear_autocast_cache", cleared)
+
+
+def test_weights_that_a_pass_without_a_graph_has_rounded_get_their_gradient(
+    graphless_casts_are_kept: None,
+) -> None:
+    found = []
+    for precision in ("float32", "bf16"):
+        policy = adapt(INSULATE, make_policy())
+        gradients(policy, INSULATE, precision=precision)
+        learned = snapshot_gradients(policy, "backbone.").items()
+        found.append({name for name, gradient in learned if gradient is not None})
+    assert any("layers.0" in name for name in found[0])
+    assert found[0] == found[1]
 
 
 def test_without_weight_it_is_stop_gradient_bit_for_bit() -> None:

@@ -63,6 +63,18 @@ def test_it_is_told_what_the_last_step_had_left_of_the_rate() -> None:
     assert [update.rate_left for update in seen] == [0.5, 0.125]
 
 
+def test_steps_that_move_nothing_do_not_count() -> None:
+    """Nor is the rate that they had told."""
+    model, stepper, seen = make(every=2)
+    for number, (moves, left) in enumerate(
+        zip((1, 1, 1, 0, 0, 0), (1, 0.8, 0.6, 0.4, 0.2, 0.1)), 1
+    ):
+        flag = torch.tensor(float(moves), dtype=torch.float64)
+        stepper.step(number, moving(model) if moves else lambda: None, {}, left, flag)
+    assert [float(update.steps) for update in seen] == [2, 1, 0]
+    assert [float(update.rate_left) for update in seen[:2]] == [0.8, 0.6]
+
+
 def test_settling_moves_no_later_turn() -> None:
     """A checkpoint between two turns leaves the turns where they are."""
     model, stepper, seen = make(every=3)

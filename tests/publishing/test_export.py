@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +58,28 @@ def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) ->
     size = policy.backbone.image_size
     assert config["input_features"]["observation.images.top"]["shape"] == [3, size, size]
     assert config["output_features"] == {"action": {"type": "ACTION", "shape": [2]}}
+
+
+def test_a_run_that_is_not_finished_is_exported_with_a_word_on_it(
+    run_folder: Path, tmp_path: Path, aegis: Aegis
+) -> None:
+    run, told = tmp_path / "run", []
+    shutil.copytree(run_folder, run, symlinks=True)
+    whole = export.run(run, tmp_path / "whole", on_event=told.append)
+    assert (whole.steps, whole.planned_steps) == (2, 2) and not told
+    recipe = run / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace("steps: 2", "steps: 3000"))
+    found = export.run(run, tmp_path / "part", on_event=told.append)
+    assert (found.steps, found.planned_steps) == (2, 3000)
+    (warned,) = told
+    assert f"'{run}' is not finished: 2 of 3,000 steps" in warned.text
+    card = (tmp_path / "part" / "README.md").read_text(encoding="utf-8")
+    assert "2 of 3,000 steps" in card
+    code, _, err = aegis("push", run, "me/reach", "--dry-run")
+    assert code == 0 and "2 of 3,000 steps" in " ".join(err.split())
+    # A policy that has been taken out of its run has none.
+    alone = export.run(tmp_path / "part", tmp_path / "alone")
+    assert (alone.steps, alone.planned_steps) == (None, None)
 
 
 def test_every_step_that_lerobots_programs_override_is_there(exported: Path) -> None:

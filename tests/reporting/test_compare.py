@@ -37,6 +37,26 @@ def test_figures_are_those_of_the_jobs_table(job: Path) -> None:
     assert [row.gate for row in compare.run([job]).rows] == [True, False]
 
 
+def test_a_run_that_is_not_finished_says_of_how_many_steps(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    assert "not finished" not in aegis("compare", "naive", "aegis")[2]
+    recipe = Path("aegis", "recipe.yaml")
+    longer = recipe.read_text(encoding="utf-8").replace("steps: 6", "steps: 3000")
+    recipe.write_text(longer, encoding="utf-8")
+    code, out, err = aegis("compare", "naive", "aegis")
+    assert code == 0 and "not finished: aegis, 6 of 3,000 steps" in " ".join(err.split())
+    assert "6 of 3,000" in out
+    rows = json.loads(aegis("compare", "naive", "aegis", "--json")[1])["rows"]
+    assert [(row["steps"], row["planned_steps"]) for row in rows] == [(6, 6), (6, 3000)]
+    assert "6 of 3,000" in aegis("inspect", "aegis")[1]
+    facts = json.loads(aegis("inspect", "aegis", "--json")[1])["facts"]
+    assert (facts["steps"], facts["planned_steps"]) == (6, 3000)
+    assert aegis("report", "aegis")[0] == 0
+    assert "6 of 3,000 steps" in Path("aegis", "report.html").read_text(encoding="utf-8")
+
+
 def test_what_was_measured_by_hand_counts_where_aegis_run_measured_nothing(job: Path) -> None:
     run = job / "naive"
     for path in (*run.glob("probe*.json"), *run.glob("rollout*.json")):

@@ -11,7 +11,7 @@ import torch
 
 from aegis_cli.common import artifacts, files
 from aegis_cli.evaluation import wrong_answers
-from aegis_cli.recipes import Recipe, to_yaml
+from aegis_cli.recipes import Recipe, Train, to_yaml
 
 HOSTILE = "<script>alert('x')</script>\"&\x1b[2J"
 GROUPS = ["stem", "layers.0", "layers.1"]
@@ -45,7 +45,8 @@ def write_job(folder: Path, family: str = "color", **changes: Any) -> Path:
 def _write_run(run: Path, method: str, number: int, family: str, changes: dict[str, Any]) -> None:
     (run / "checkpoints" / "000006").mkdir(parents=True)
     (run / "checkpoints" / "last").symlink_to("000006")
-    recipe = Recipe(**{"name": "job", "task": "reach", "methods": METHODS, **changes})
+    finished = {"train": Train(steps=6)}
+    recipe = Recipe(**{"name": "job", "task": "reach", "methods": METHODS, **finished, **changes})
     (run / "recipe.yaml").write_text(to_yaml(recipe))
     lines = [
         {"step": step, "loss": 2.0 / step + number, "step_s": 0.5, "lr_backbone": 1e-4 / step}

@@ -73,6 +73,19 @@ def test_it_is_the_sum_that_its_definition_says(decay: float, waits: list[int], 
     torch.testing.assert_close(average.weights["w"].double(), wanted, rtol=1e-5, atol=1e-6)
 
 
+def test_a_count_that_nobody_reads_leads_to_the_same_average() -> None:
+    counts, found = (1, 2, 5, 5, 5), []
+    for unread in (False, True):
+        weight = nn.Parameter(torch.zeros(4))
+        average = Average({"w": weight}, DECAY)
+        for number, done in enumerate(counts, 1):
+            weight.data.copy_(number * torch.arange(4.0))
+            average.follow(torch.tensor(float(done), dtype=torch.float64) if unread else done)
+        average.follow(7)  # as of a checkpoint
+        found.append(average.weights["w"])
+    torch.testing.assert_close(found[1], found[0])
+
+
 def test_inside_its_block_the_parameters_are_the_average_and_after_it_themselves() -> None:
     weight = nn.Parameter(torch.zeros(4))
     average = Average({"w": weight}, 0.5)

@@ -23,7 +23,7 @@ from torch import nn
 from aegis_cli import recipes
 from aegis_cli.common.events import Progress
 from aegis_cli.models import backbones
-from aegis_cli.training import dry_run, train
+from aegis_cli.training import checkpoint, dry_run, train
 
 ROOT = Path(__file__).parent.parent.parent
 Made, Command = Callable[[str], Path], Callable[..., Any]
@@ -350,6 +350,14 @@ def test_a_dry_run_counts_the_checkpoints_to_come(
     assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 2
     train.run(settings, "naive", demos_file, None, run, resume=True)
     assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 0
+
+
+def test_as_many_steps_are_done_as_the_checkpoint_of_most_steps_says(tmp_path: Path) -> None:
+    for name in ("999500", "1000000"):
+        folder = tmp_path / "checkpoints" / name
+        folder.mkdir(parents=True)
+        (folder / checkpoint.EXPERT).touch()
+    assert dry_run._done(checkpoint.whole(tmp_path)) == 1_000_000
 
 
 def test_a_dry_run_refuses_what_a_training_would(

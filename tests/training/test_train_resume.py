@@ -87,6 +87,24 @@ def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_pat
     assert start("naive", tmp_path, resume=True).steps == STEPS
 
 
+def test_the_newest_checkpoint_is_that_of_most_steps_however_many_digits_it_has(
+    start: Start, tmp_path: Path
+) -> None:
+    start("naive", tmp_path)
+    folder = tmp_path / "checkpoints"
+    link, older, newer = folder / "last", folder / "999998", folder / "1000000"
+    (folder / "000004").rename(older)
+    (folder / "000006").rename(newer)
+    assert checkpoint.whole(tmp_path) == [folder / "000002", older, newer]
+    link.unlink()
+    error = refused("3 checkpoints", start, "naive", tmp_path, resume=True)
+    assert f"ln -sfn 1000000 '{link}'" in error.fix
+    link.symlink_to(newer.name)
+    (newer / checkpoint.STATE).write_bytes(b"")
+    error = refused("truncated", start, "naive", tmp_path, resume=True)
+    assert f"ln -sfn 999998 '{link}'" in error.fix
+
+
 # --- refusals -------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ from aegis_cli.cli.page.tables import pairs, table, verdict, view
 from aegis_cli.cli.render.output import document
 from aegis_cli.common import files
 from aegis_cli.common.version import __version__
+from aegis_cli.inspection import steps_taken
 
 # The page itself forbids what it never does, to load anything from elsewhere or to run a script.
 _POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
@@ -59,9 +60,8 @@ def _header(kind: str, title: str, lead: Child, *further: Child) -> Markup:
 
 def _run(found: At, report: Any) -> tuple[str, list[Child]]:
     title = f"{found['facts']['recipe']}: {found['label']}"
-    steps = found["facts"]["steps"]
     lead = f"Method {found['method']} fine-tuned {found['backbone']} on {_task(found)}, "
-    lead += f"{steps} steps, seed {found['facts']['seed']}."
+    lead += f"{_steps(found)} steps, seed {found['facts']['seed']}."
     parts = [
         _header("Run", title, lead, runs.at_a_glance(found)),
         _trained(found),
@@ -97,11 +97,13 @@ def _trained(run: At) -> Markup:
         ("Demonstrations", _demonstrations(recipe) or f"{recipe['demos']['episodes']} episodes"),
         *_weights(recipe),
         ("Anchor", f"{anchor['samples']} {read}"),
-        ("Steps", f"{run['facts']['steps']} of {train['batch_size']} frames"),
+        ("Steps", f"{_steps(run)}, of {train['batch_size']} frames each"),
         ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
         ("Precision", train["precision"]),
         ("Seed", run["facts"]["seed"]),
     ]
+    if "merge" in run["facts"].value:
+        shown.append(("Merged afterwards", _merge(run["facts"]["merge"])))
     return pairs([(name, str(value)) for name, value in shown])
 
 
@@ -111,6 +113,18 @@ def _weights(recipe: At) -> list[tuple[str, str]]:
     return (
         [("Their shares", " : ".join(f"{weight.value:g}" for weight in weights))] if weights else []
     )
+
+
+def _steps(run: At) -> str:
+    """How many steps a run has taken, and of how many where some are left."""
+    facts = run["facts"].value
+    return steps_taken(facts["steps"], facts["planned_steps"])
+
+
+def _merge(merge: At) -> str:
+    """How what was trained was moved back."""
+    how = f"{merge['method']}, strength {merge['strength']}, damping {merge['damping']}"
+    return f"{how}; {share(merge['kept'])} % of the maps' displacement are left"
 
 
 def _measured(found: Sequence[At]) -> list[Child]:
@@ -135,7 +149,7 @@ def _job(found: At, report: Any) -> tuple[str, list[Child]]:
     first = own[0]
     methods = "1 method" if len(own) == 1 else f"{len(own)} methods"
     lead = f"{methods} fine-tuned {first['backbone']} on {_task(first)}, "
-    lead += f"{first['facts']['steps']} steps each."
+    lead += f"{_steps(first)} steps each."
     parts = [
         _header("Job", title, [lead, " ", _verdict(compared)]),
         _trained(first),

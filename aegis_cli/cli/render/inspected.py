@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -12,13 +12,15 @@ from rich.text import Text
 
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.tables import pairs
+from aegis_cli.inspection import steps_taken
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
     """The facts, then the tables that there are; tensors are listed where they are asked for."""
     shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
+    facts = _with_steps_taken(report.facts)
     parts: list[RenderableType] = [
-        pairs({"kind": report.kind, "path": report.path, **report.facts, **shed})
+        pairs({"kind": report.kind, "path": report.path, **facts, **shed})
     ]
     if report.kind == "run":
         parts += _measured(report)
@@ -53,6 +55,15 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
     elif report.kind in ("run", "checkpoint", "ledger"):
         parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
     return Group(*parts)
+
+
+def _with_steps_taken(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The facts with one line on a run's steps, which says of how many where some are left."""
+    planned, steps = facts.get("planned_steps"), facts.get("steps")
+    left = {name: value for name, value in facts.items() if name != "planned_steps"}
+    if None in (planned, steps) or steps >= planned:
+        return left
+    return left | {"steps": steps_taken(steps, planned)}
 
 
 def _measured(report: Any) -> list[RenderableType]:
@@ -195,7 +206,7 @@ def compared(report: Any) -> RenderableType:
     apart = {*(_OF_QUESTIONS if several else ()), *([_OPEN_LOOP] if elsewhere else [])}
     better = {name: of for name, of in better.items() if name not in apart}
     columns: dict[str, Callable[[Any], str]] = {
-        "Steps": lambda r: "-" if r.steps is None else f"{r.steps:,}",
+        "Steps": lambda r: steps_taken(r.steps, r.planned_steps),
         "Questions": lambda r: (r.vqa or "-") if several else "-",
         "VQA %": lambda r: percent(r.accuracy),
         "Before %": lambda r: percent(r.baseline_accuracy),
