@@ -23,7 +23,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.joint import Pair
 from aegis_cli.guard import wide_step
 from aegis_cli.guard.options import load_anchor, method_options
-from aegis_cli.guard.stepper import take_slowed
+from aegis_cli.guard.stepper import SlowedStep, overflowed
 from aegis_cli.guard.wide_step import WideStep
 from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.methods.stepper import Stepper
@@ -114,10 +114,14 @@ class ProtectedAdamW(torch.optim.AdamW):
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
         """Take AdamW's step, and let the method constrain what it did to the VLM.
 
+        Where a scaler has found that the gradients overflowed, nothing is done.
+
         Raises:
             AegisError: at the first step, where none of the VLM's maps is among the parameters, or
                 they cannot be told.
         """
+        if overflowed(self):
+            return None
         if self._stepper is None:
             self._start()
         assert self._stepper is not None
@@ -129,7 +133,9 @@ class ProtectedAdamW(torch.optim.AdamW):
                 loss = closure()
 
         def move() -> None:
-            take_slowed(self._parts, super(ProtectedAdamW, self).step)
+            slowed = SlowedStep(self._parts)
+            super(ProtectedAdamW, self).step()
+            slowed.go_back()
 
         with self._wide.taken():
             self._stepper.step(self._count, move, {})

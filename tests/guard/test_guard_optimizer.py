@@ -204,6 +204,30 @@ def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path)
         make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
 
 
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_scaler_skips_the_step_of_an_overflow(
+    method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """It calls a fused optimizer all the same."""
+    model = Foreign(tiny_folder)
+    parameters = model.parameters()
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {}, fused=True, **ADAMW)
+    train(model, optimizer, range(3))
+    before = values(model)
+    scaler = torch.amp.GradScaler("cpu", init_scale=8.0)
+    scaler.scale(torch.zeros(()))  # as a loss would be, which begins its work
+    gradients(model, 5)
+    model.after.weight.grad.mul_(torch.inf)
+    scaler.step(optimizer)
+    scaler.update()
+    assert scaler.get_scale() == 4.0
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+    gradients(model, 5)
+    scaler.step(optimizer)
+    for name in ("after.weight", "inner.vlm.layers.0.up.weight"):
+        assert not torch.equal(before[name], model.get_parameter(name))
+
+
 # --- half precision -------------------------------------------------------------------------------
 
 
