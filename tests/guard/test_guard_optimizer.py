@@ -199,6 +199,137 @@ def test_a_vlm_that_has_learned_before_is_refused_before_anything_moves(
     assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
 
 
+def learned(module: nn.Module) -> None:
+    """Moves a module's weights as a training would have, by about a tenth of their size."""
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            noise = torch.randn(parameter.shape, generator=generator)
+            parameter.add_(noise, alpha=0.1 * float(parameter.std(correction=0) + 0.1))
+
+
+def refused_at_the_first_step(model: nn.Module, optimizer: ProtectedAdamW, match: str) -> None:
+    """Nothing has moved then."""
+    before = values(model)
+    gradients(model, 0)
+    with pytest.raises(AegisError, match=match):
+        optimizer.step()
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+
+
+@pytest.mark.parametrize("part", ["layers", "layers.1", "stem", "layers.0.up"])
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_vlm_of_which_a_part_has_learned_is_refused(
+    method: str, part: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """As after a training with the rest frozen: what has moved would go unprotected."""
+    model = Foreign(tiny_folder)
+    learned(model.inner["vlm"].get_submodule(part))
+    optimizer = make(model, method, anchor, base)
+    refused_at_the_first_step(model, optimizer, f"near {part}|with the values of layers.0.norm1")
+
+
+def test_norms_that_have_learned_are_refused(tmp_path: Path) -> None:
+    """Also where all maps are as they were."""
+    folder = tmp_path / "base"
+    trained = make_tiny()
+    for number, module in enumerate(trained.modules()):
+        if isinstance(module, nn.LayerNorm):
+            nn.init.normal_(module.weight, 1.0, 0.1 + number / 1000)
+    trained.save(folder)
+    own = backbones.load(str(folder))
+    path = measured(folder, tmp_path / "anchor.safetensors")
+    model = Foreign(folder)
+    train(model, make(model, "nullspace", path, own), range(1))
+    model = Foreign(folder)
+    learned(model.inner["vlm"].layers[0].norm1)
+    refused_at_the_first_step(model, make(model, "nullspace", path, own), "near layers.0.norm1")
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_what_is_missing_or_frozen_or_the_experts_own_is_no_vlm_that_has_learned(
+    method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """The optimizer lacks a tower, a layer has learned and is frozen, an expert has its shapes."""
+    model = Foreign(tiny_folder)
+    vlm = model.inner["vlm"]
+    learned(vlm.layers[1])
+    vlm.layers[1].requires_grad_(False)
+    model.expert = make_tiny(9).layers[1]
+    stem = {id(p) for p in vlm.stem.parameters()}
+    parameters = [p for p in model.parameters() if id(p) not in stem]
+    protect = ("maps",)  # the expert's norms are as new as those of this untrained VLM
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {"protect": protect}, **ADAMW)
+    before = values(model)
+    train(model, optimizer, range(2))
+    assert optimizer.protected and all(s.startswith("layers.0.") for s in optimizer.protected)
+    assert not torch.equal(before["expert.up.weight"], model.expert.up.weight)
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+@pytest.mark.parametrize("half", ["weight", "bias"])
+@pytest.mark.parametrize("given", [True, False])
+def test_a_map_that_is_half_frozen_is_refused(
+    given: bool, half: str, method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """Whether or not the optimizer is given the frozen half."""
+    model = Foreign(tiny_folder)
+    frozen = getattr(model.inner["vlm"].layers[0].up, half)
+    frozen.requires_grad_(False)
+    parameters = [p for p in model.parameters() if given or p is not frozen]
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {}, **ADAMW)
+    refused_at_the_first_step(model, optimizer, "layers.0.up")
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+@pytest.mark.parametrize("decays_apart", [False, True])
+@pytest.mark.parametrize("part", ["weight", "bias"])
+def test_a_training_resumes_where_a_half_of_a_map_never_had_a_gradient(
+    part: str,
+    decays_apart: bool,
+    method: str,
+    tiny_folder: Path,
+    base: Backbone,
+    anchor: Path,
+) -> None:
+    """It has no state of AdamW's, and what holds the other half has moved it all the same."""
+
+    def teach(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
+        for seed in steps:
+            gradients(model, seed)
+            getattr(model.inner["vlm"].layers[0].up, part).grad = None
+            model.inner["vlm"].layers[0].norm2.weight.grad = None
+            optimizer.step()
+            optimizer.zero_grad()
+
+    def made(model: Foreign) -> ProtectedAdamW:
+        if not decays_apart:
+            return make(model, method, anchor, base)
+        matrices = [p for p in model.parameters() if p.ndim > 1]
+        rest = [p for p in model.parameters() if p.ndim <= 1]
+        groups = [{"params": matrices}, {"params": rest, "weight_decay": 0.0}]
+        return ProtectedAdamW(groups, method, anchor, base, {}, **ADAMW)
+
+    one, other = interrupted_and_whole(lambda: Foreign(tiny_folder), teach, made)
+    assert set(one.protected) == set(other.protected) and "layers.0.up" in one.protected
+
+
+def test_weights_stay_where_a_method_cannot_start(
+    tiny_folder: Path, base: Backbone, tmp_path: Path
+) -> None:
+    """It starts from the base model's, which the weights of a resumed training are not."""
+    path = tmp_path / "anchor.safetensors"
+    measure.run(
+        str(tiny_folder), Anchor(samples=14, batch_size=14, parts=("inputs",), energy=0.5), path
+    )
+    model = Foreign(tiny_folder)
+    optimizer = make(model, "nullspace", path, base, energy=0.3)
+    train(model, optimizer, range(2))
+    again = make(model, "nullspace", path, base, energy=0.999)
+    again.load_state_dict(optimizer.state_dict())
+    refused_at_the_first_step(model, again, "eigenvectors of a map's inputs")
+
+
 def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path) -> None:
     with pytest.raises(AegisError, match="of other weights than those of the base model"):
         make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
