@@ -23,6 +23,7 @@ from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
+from aegis_cli.core import projection
 from aegis_cli.methods.backward import Groups
 
 
@@ -167,9 +168,9 @@ def _shift(total: Accumulation, groups: Groups, times: int) -> None:
             if weight == 0 or a is None:
                 continue
             if id(parameter) in total.idle:
-                parameter.grad = None if times < 0 else a * weight
+                parameter.grad = None if times < 0 else projection.scaled(a, weight)
             elif parameter.grad is not None:
-                parameter.grad.add_(a, alpha=times * weight)
+                projection.add_scaled([parameter.grad], [a], times * weight)
 
 
 def poison(total: Accumulation, groups: Groups) -> list[nn.Parameter]:
