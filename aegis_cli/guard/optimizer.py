@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +102,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         with contextlib.suppress(AegisError):
             self._found = _match(self._base, self._ordered())
         if method == "kfac" and self._options["weight"] > 0:
-            _freeze(base, self._base, self._ordered())
+            _freeze(base, self._base, self.param_groups)
         self._notes: dict[Tensor, dict[str, int]] = {}  # what each parameter's state remembers
         self._stepper: Stepper | None = None
         self._wide = WideStep(self, ())
@@ -386,13 +388,49 @@ def _values(tensor: Tensor) -> str:
     return digest({"": tensor})
 
 
-def _freeze(base: Backbone, protected: Mapping[str, Pair], ordered: Sequence[Tensor]) -> None:
-    """Let nothing learn that has the values of what the VLM has besides protected maps."""
-    held = {_values(t) for pair in protected.values() for t in pair if t is not None}
-    others = {_values(p) for p in base.parameters()} - held
-    for parameter in ordered:
-        if _values(parameter) in others:
-            parameter.requires_grad_(False)
+def _freeze(
+    base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
+) -> None:
+    """Let nothing learn of the VLM besides its protected maps.
+
+    Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
+    made, may be an expert's too; of these, what is frozen stands in the VLM's order.
+
+    Args:
+        protected: the sites that learn.
+        groups: the optimizer's.
+    """
+    held = {id(t) for site in protected for t in weights(base, site) if t is not None}
+    sequence = [(_values(p), id(p) in held) for p in base.parameters()]
+    others = Counter(value for value, is_held in sequence if not is_held)
+    in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
+    given = Counter(value for _, values in in_groups for value in values)
+    held_values = {value for value, is_held in sequence if is_held}
+    unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
+    for parameters, values in in_groups:
+        others_here = _in_order(sequence, values) if unclear & set(values) else set()
+        for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
+            if place in others_here if value in unclear else value in others:
+                parameter.requires_grad_(False)
+
+
+def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> set[int]:
+    """The places of the VLM's unprotected parameters in a group of the optimizer's.
+
+    Args:
+        sequence: the values of the VLM's parameters, and whether each is protected.
+        values: those of the group, which may have some of them, and others.
+    """
+    here = set(values)
+    expected = [pair for pair in sequence if pair[0] in here]
+    matcher = SequenceMatcher(None, [value for value, _ in expected], values, autojunk=False)
+    found = set()
+    for start, place, length in matcher.get_matching_blocks():
+        for i in range(length):
+            _, is_held = expected[start + i]
+            if not is_held:
+                found.add(place + i)
+    return found
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor
 
 ADAMW = {"lr": 3e-3, "weight_decay": 0.1}
+PARTS = ("weight", "bias")
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +129,7 @@ def test_the_applied_update_is_orthogonal_to_what_questions_span(
     )
     moved = {n: (after[n] - before[n]) for n in before}
     for site, protection in found.items():
-        update = [moved.get(f"inner.vlm.{site}.{part}") for part in ("weight", "bias")]
+        update = [moved.get(f"inner.vlm.{site}.{part}") for part in PARTS]
         inside = size(protection.removed(*update))
         assert inside <= 1e-10 * size(tuple(update)), site
     assert moved["after.weight"].abs().min() > 0  # the expert is free
@@ -160,6 +161,32 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
     }
     maps = {site for site, kind in base.sites().items() if kind in ("maps", "stem")}
     assert set(optimizer.protected) == maps - {"stem.position"}
+
+
+@pytest.mark.parametrize("decays_apart", [False, True])
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_an_experts_new_norms_learn_with_kfac(
+    place: str, decays_apart: bool, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """They have the values of the norms of this VLM, which is untrained and whose own do not."""
+    model = Foreign(tiny_folder)
+    expert = make_tiny(9).layers[0]
+    setattr(model, place, expert)
+    ProtectedAdamW(in_groups(model, decays_apart), "kfac", anchor, base, {}, **ADAMW)
+    assert all(p.requires_grad for p in expert.parameters())
+    still = {name for name, p in model.inner["vlm"].named_parameters() if not p.requires_grad}
+    assert {f"layers.{i}.norm{n}.{part}" for i in (0, 1) for n in (1, 2) for part in PARTS} <= still
+    assert not any(part in name for name in still for part in ("qkv", "out", "up", "down"))
+
+
+def in_groups(model: nn.Module, decays_apart: bool) -> list[dict[str, Any]]:
+    """The optimizer's groups: one, or as often one whose parameters decay and another one."""
+    parameters = list(model.parameters())
+    if not decays_apart:
+        return [{"params": parameters}]
+    matrices = [p for p in parameters if p.ndim > 1]
+    rest = [p for p in parameters if p.ndim <= 1]
+    return [{"params": matrices}, {"params": rest, "weight_decay": 0.0}]
 
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
@@ -303,11 +330,7 @@ def test_a_training_resumes_where_a_half_of_a_map_never_had_a_gradient(
             optimizer.zero_grad()
 
     def made(model: Foreign) -> ProtectedAdamW:
-        if not decays_apart:
-            return make(model, method, anchor, base)
-        matrices = [p for p in model.parameters() if p.ndim > 1]
-        rest = [p for p in model.parameters() if p.ndim <= 1]
-        groups = [{"params": matrices}, {"params": rest, "weight_decay": 0.0}]
+        groups = in_groups(model, decays_apart)
         return ProtectedAdamW(groups, method, anchor, base, {}, **ADAMW)
 
     one, other = interrupted_and_whole(lambda: Foreign(tiny_folder), teach, made)
