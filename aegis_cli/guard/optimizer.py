@@ -410,7 +410,8 @@ def _freeze(
     for parameters, values in in_groups:
         others_here = _in_order(sequence, values) if unclear & set(values) else set()
         for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
-            if place in others_here if value in unclear else value in others:
+            is_other = place in others_here if value in unclear else value in others
+            if is_other:
                 parameter.requires_grad_(False)
 
 
