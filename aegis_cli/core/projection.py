@@ -8,6 +8,7 @@ this file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
@@ -160,15 +161,36 @@ def apply(
     both = [(g, a) for g, a in zip(gs, as_, strict=True) if g is not None and a is not None]
     if both:
         add_scaled([g for g, _ in both], [a for _, a in both], wa)
-    return [a * wa if g is None and a is not None else g for g, a in zip(gs, as_, strict=True)]
+    return [
+        scaled(a, wa) if g is None and a is not None else g for g, a in zip(gs, as_, strict=True)
+    ]
 
 
 def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor) -> None:
     """x <- x + scale y in place, for each; a scale that is a tensor [] is not read."""
     if isinstance(scale, Tensor):
         torch._foreach_add_(list(xs), torch._foreach_mul(list(ys), _like(scale, ys[0])))
-    else:
+    elif all(_holds(y.dtype, scale) for y in ys):
         torch._foreach_add_(list(xs), list(ys), alpha=scale)
+    else:
+        for x, y in zip(xs, ys, strict=True):
+            x.add_(y.double(), alpha=scale)
+
+
+def scaled(y: Tensor, scale: float | Tensor) -> Tensor:
+    """scale y, a new tensor of y's type."""
+    if isinstance(scale, Tensor) or _holds(y.dtype, scale):
+        return y * scale
+    return (y.double() * scale).to(y.dtype)
+
+
+def _holds(dtype: torch.dtype, scale: float) -> bool:
+    """Whether a type has numbers as large as a finite scale.
+
+    A small anchor gradient has a large weight, beyond float16 easily, and their product is as small
+    as the task gradient. PyTorch refuses such a number.
+    """
+    return not math.isfinite(scale) or abs(scale) <= torch.finfo(dtype).max
 
 
 def _like(scale: float | Tensor, x: Tensor) -> float | Tensor:

@@ -23,6 +23,7 @@ from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
+from aegis_cli.core import projection
 from aegis_cli.methods.backward import Groups
 
 
@@ -106,15 +107,8 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
         return True
     if cleared(groups):
         return False
-    kept = sum(not cleared([[p]]) for p in parameters)
-    if kept < len(parameters) and _only_cleared(total, parameters):
-        raise AegisError(
-            f"gradients of which {len(parameters) - kept} were cleared since the last "
-            f"guard.backward and {kept} were not",
-            "all of them cleared, or none",
-            "model.zero_grad() clears those that the optimizer does not have, too; or freeze what "
-            "it does not have before the guard is made",
-        )
+    if _only_cleared(total, parameters):
+        refuse_partly_cleared(parameters)
     raise AegisError(
         "gradients that changed since the last guard.backward",
         "what it left, or zero_grad() before the next step's first",
@@ -122,6 +116,20 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
         "gradients after a step's last guard.backward, or add the losses: "
         "guard.backward(loss + other)",
     )
+
+
+def refuse_partly_cleared(parameters: Sequence[nn.Parameter]) -> None:
+    """Raise AegisError where some of the gradients are cleared, and others are not."""
+    parameters = [p for p in parameters if rows_here(p).numel()]  # else nothing can be told
+    kept = sum(not cleared([[p]]) for p in parameters)
+    if 0 < kept < len(parameters):
+        raise AegisError(
+            f"gradients of which {len(parameters) - kept} were cleared since the last "
+            f"guard.backward and {kept} were not",
+            "all of them cleared, or none",
+            "model.zero_grad() clears those that the optimizer does not have, too; or freeze what "
+            "it does not have before the guard is made",
+        )
 
 
 def _only_cleared(total: Accumulation, parameters: Sequence[nn.Parameter]) -> bool:
@@ -160,20 +168,30 @@ def _shift(total: Accumulation, groups: Groups, times: int) -> None:
             if weight == 0 or a is None:
                 continue
             if id(parameter) in total.idle:
-                parameter.grad = None if times < 0 else a * weight
+                parameter.grad = None if times < 0 else projection.scaled(a, weight)
             elif parameter.grad is not None:
-                parameter.grad.add_(a, alpha=times * weight)
+                projection.add_scaled([parameter.grad], [a], times * weight)
 
 
-def poison(groups: Groups) -> None:
+def poison(total: Accumulation, groups: Groups) -> list[nn.Parameter]:
     """Fill `.grad` with infinity, so that a scaler skips the step.
 
     It skips steps whose gradients are not finite; where only the anchor gradient overflowed,
     nothing else would tell it.
+
+    Returns:
+        The parameters whose gradient it is. Where the task left none, there is none: an optimizer
+        that leaves such a parameter out would never clear it.
     """
+    poisoned = []
     for group in groups:
         for parameter in group:
-            parameter.grad = torch.full_like(parameter, torch.inf)
+            if id(parameter) in total.idle:
+                parameter.grad = None
+            else:
+                parameter.grad = torch.full_like(parameter, torch.inf)
+                poisoned.append(parameter)
+    return poisoned
 
 
 # --- several processes ---------------------------------------------------------------------------

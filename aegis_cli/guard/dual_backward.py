@@ -60,7 +60,8 @@ class DualBackward:
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._looked = 0, False
-        self._overflowed = False  # whether `.grad` holds a step that a scaler is going to skip
+        # Those whose `.grad` tells a scaler to skip the step that it is of.
+        self._poisoned: list[nn.Parameter] = []
 
     @property
     def anchor(self) -> dict[int, Tensor | None]:
@@ -110,7 +111,7 @@ class DualBackward:
         total, self._sum = self._sum if continued else None, None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
-        self._see_whether_cleared(groups)
+        self._see_whether_cleared()
         # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
         # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
@@ -146,12 +147,18 @@ class DualBackward:
         self._reopened, self._sum = self._sum if self.continues() else None, None
         if self._reopened is not None:
             accumulation.take_back(self._reopened, self._learning())
-        self._see_whether_cleared(self._learning())
+        self._see_whether_cleared()
 
-    def _see_whether_cleared(self, groups: accumulation.Groups) -> None:
-        """Before a backward pass: whether a step that overflowed is over."""
-        if self._overflowed and accumulation.cleared(groups):
-            self._overflowed = False
+    def _see_whether_cleared(self) -> None:
+        """Before a backward pass: whether a step that overflowed is over.
+
+        Raises:
+            AegisError: it is for some of the parameters alone. The others' infinities would have
+                every step skipped from now on.
+        """
+        if accumulation.cleared([self._poisoned]):
+            self._poisoned = []
+        accumulation.refuse_partly_cleared(self._poisoned)
 
     def leave(self) -> None:
         """Project `.grad` as it was before `reopen`, for that pass has added nothing to it."""
@@ -192,7 +199,7 @@ class DualBackward:
             w2, *rest = accumulation.mean_over(numbers, processes)
             loss = next(iter(rest), None)
         if total is None:
-            if not self._overflowed:  # else it is a further micro-batch of that step
+            if not self._poisoned:  # else it is a further micro-batch of that step
                 self._step += 1
             total = accumulation.started(taken, w2)
         else:
@@ -206,8 +213,7 @@ class DualBackward:
         if not all(x.isfinite().all() for x in numbers):
             if not skips:
                 raise diverged(len(self._ledger))
-            accumulation.poison(groups)
-            self._overflowed = True
+            self._poisoned = accumulation.poison(total, groups)
             return
         check_row(gram, self._ledger.groups)
         self._ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.joint import Pair
 from aegis_cli.guard import wide_step
 from aegis_cli.guard.options import load_anchor, method_options
-from aegis_cli.guard.stepper import take_slowed
+from aegis_cli.guard.stepper import SlowedStep, overflowed
 from aegis_cli.guard.wide_step import WideStep
 from aegis_cli.methods.base import Parts, Setting, weights
 from aegis_cli.methods.stepper import Stepper
@@ -32,7 +34,12 @@ from aegis_cli.models.structure import digest
 
 CONSTRAINING = ("kfac", "nullspace")
 _PLACE = "aegis_place"  # in a parameter's state: the number of what it is in the base model
+# In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
+_PARTNER = "aegis_partner"
 _NAMED = 4  # maps that a warning names
+# How far a weight that has learned is from what it was, of its own size, at most. Weights that have
+# nothing to do with each other are farther apart than the size of either.
+_NEAR = 0.5
 _log = logging.getLogger(__name__)
 
 
@@ -88,19 +95,15 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._base = {site: _copied(weights(base, site)) for site in self._kinds}
         # Weight and bias of each site have a number, by which a resumed training knows them.
         self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
-        ordered = [p for group in self.param_groups for p in group["params"]]
         self._found: dict[str, Pair] = {}
-        self._unclear: AegisError | None = None
-        try:
-            self._found = _match(self._base, ordered)
-        except AegisError as problem:
-            # In half precision a resumed training has moved some weights, and others not past their
-            # rounding. Its state, which is still to come, tells what they are.
-            if not wide_step.any_half(ordered):
-                raise
-            self._unclear = problem
+        # A resumed training has moved some weights, and others not: those without a gradient, and
+        # in half precision those that stayed within their rounding. Its state, which is still to
+        # come, tells what they are; the first step asks again.
+        with contextlib.suppress(AegisError):
+            self._found = _match(self._base, self._ordered())
         if method == "kfac" and self._options["weight"] > 0:
-            _freeze(base, self._base, ordered)
+            _freeze(base, self._base, self.param_groups)
+        self._notes: dict[Tensor, dict[str, int]] = {}  # what each parameter's state remembers
         self._stepper: Stepper | None = None
         self._wide = WideStep(self, ())
         self._parts = Parts()
@@ -114,10 +117,14 @@ class ProtectedAdamW(torch.optim.AdamW):
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
         """Take AdamW's step, and let the method constrain what it did to the VLM.
 
+        Where a scaler has found that the gradients overflowed, nothing is done.
+
         Raises:
-            AegisError: at the first step, where none of the VLM's maps is among the parameters, or
-                they cannot be told.
+            AegisError: at the first step, where none of the VLM's maps is among the parameters,
+                they cannot be told, some have learned, or half of one is frozen.
         """
+        if overflowed(self):
+            return None
         if self._stepper is None:
             self._start()
         assert self._stepper is not None
@@ -129,7 +136,9 @@ class ProtectedAdamW(torch.optim.AdamW):
                 loss = closure()
 
         def move() -> None:
-            take_slowed(self._parts, super(ProtectedAdamW, self).step)
+            slowed = SlowedStep(self._parts)
+            super(ProtectedAdamW, self).step()
+            slowed.go_back()
 
         with self._wide.taken():
             self._stepper.step(self._count, move, {})
@@ -141,12 +150,17 @@ class ProtectedAdamW(torch.optim.AdamW):
         with wide_step.loading(self, state_dict):
             super().load_state_dict(state_dict)
 
+    def _ordered(self) -> list[Tensor]:
+        """The parameters in the order that their state is saved in."""
+        return [p for group in self.param_groups for p in group["params"]]
+
     def _start(self) -> None:
         """Start the method on the maps, with the VLM's weights as their origin."""
         known = self._known_again()
-        if self._unclear is not None and not known:
-            raise self._unclear
         found = self._found | known
+        absent = {site: pair for site, pair in self._base.items() if site not in found}
+        found |= _match(absent, self._ordered(), _ids(found))
+        _refuse_half_frozen(found)
         learning = {site: pair for site, pair in found.items() if pair[0].requires_grad}
         if not learning:
             raise AegisError(
@@ -155,6 +169,9 @@ class ProtectedAdamW(torch.optim.AdamW):
                 "let the VLM learn (of SmolVLA: --policy.train_expert_only=false), and name the "
                 "VLM that it begins with as the base",
             )
+        # Those of a resumed training have learned; it has been asked when it began.
+        if not known:
+            _refuse_strays(self._base, found, self._ordered())
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
@@ -166,6 +183,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         _report(self._method, learning, self._base.keys() - found.keys())
         self._stepper = Stepper(model, self._parts)
         self._found = learning
+        self._notes = self._to_remember()
         self._base.clear()
 
     def _known_again(self) -> dict[str, Pair]:
@@ -174,11 +192,19 @@ class ProtectedAdamW(torch.optim.AdamW):
         Raises:
             AegisError: one of another shape than the parameter.
         """
+        ordered = self._ordered()
+        at = {parameter: place for place, parameter in enumerate(ordered)}
         pairs: dict[str, list[Tensor | None]] = {}
         for parameter, state in self.state.items():
-            if _PLACE in state:
-                site, part = self._places[int(state[_PLACE])]
-                pairs.setdefault(site, [None, None])[part] = parameter
+            if _PLACE not in state:
+                continue
+            site, part = self._places[int(state[_PLACE])]
+            pair = pairs.setdefault(site, [None, None])
+            pair[part] = parameter
+            # The other has no state where it never had a gradient, and may have moved with this one
+            # all the same.
+            if _PARTNER in state:
+                pair[1 - part] = ordered[at[parameter] + int(state[_PARTNER])]
         for site, pair in pairs.items():
             for parameter, value in zip(pair, self._base[site], strict=True):
                 shapes = [None if t is None else tuple(t.shape) for t in (parameter, value)]
@@ -190,13 +216,27 @@ class ProtectedAdamW(torch.optim.AdamW):
                     )
         return {site: (weight, bias) for site, (weight, bias) in pairs.items()}  # type: ignore[misc]
 
-    def _remember(self) -> None:
-        """Note the number of each protected parameter in its state, once AdamW has made one."""
+    def _to_remember(self) -> dict[Tensor, dict[str, int]]:
+        """The numbers by which a resumed training knows each protected parameter again."""
+        at = {parameter: place for place, parameter in enumerate(self._ordered())}
+        notes = {}
         for number, (site, part) in enumerate(self._places):
-            parameter = self._found.get(site, (None, None))[part]
+            pair = self._found.get(site, (None, None))
+            parameter, partner = pair[part], pair[1 - part]
+            if parameter is None:
+                continue
+            notes[parameter] = {_PLACE: number}
+            if partner is not None:
+                notes[parameter][_PARTNER] = at[partner] - at[parameter]
+        return notes
+
+    def _remember(self) -> None:
+        """Note these numbers in each protected parameter's state, once AdamW has made one."""
+        for parameter, numbers in self._notes.items():
             # AdamW fills an empty state by itself, so nothing may be there before.
-            if parameter is not None and (state := self.state.get(parameter)):
-                state.setdefault(_PLACE, torch.tensor(float(number)))
+            if state := self.state.get(parameter):
+                for name, number in numbers.items():
+                    state.setdefault(name, torch.tensor(float(number)))
 
 
 def _kinds(
@@ -212,19 +252,30 @@ def _kinds(
 
 def _copied(pair: Pair) -> Pair:
     weight, bias = pair
-    return weight.detach().cpu().float(), None if bias is None else bias.detach().cpu().float()
+    return _on_cpu(weight), None if bias is None else _on_cpu(bias)
 
 
-def _match(base: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[str, Pair]:
+def _ids(found: Mapping[str, Pair]) -> set[int]:
+    return {id(tensor) for pair in found.values() for tensor in pair if tensor is not None}
+
+
+def _match(
+    base: Mapping[str, Pair], ordered: Sequence[Tensor], claimed: Collection[int] = ()
+) -> dict[str, Pair]:
     """The parameters that have the values of the base model's sites, by site.
+
+    Args:
+        claimed: ids of parameters that are known to be something else.
 
     Raises:
         AegisError: several sites of equal values, and not as many parameters; a weight without its
             bias.
     """
+    shapes = {tensor.shape for pair in base.values() for tensor in pair if tensor is not None}
     places: dict[str, list[int]] = {}
     for place, parameter in enumerate(ordered):
-        places.setdefault(_values(parameter), []).append(place)
+        if parameter.shape in shapes and id(parameter) not in claimed:
+            places.setdefault(_values(parameter), []).append(place)
     alike: dict[str, list[str]] = {}
     for site, (weight, _) in base.items():
         alike.setdefault(_values(weight), []).append(site)
@@ -262,8 +313,74 @@ def _bias(
     raise AegisError(
         f"a parameter with the values of {site}.weight, and {len(at)} that may be its bias",
         "the bias after its weight, as a model has them",
-        "give the optimizer the parameters in the model's order",
+        "give the optimizer the parameters in the model's order, and of a map both or none",
     )
+
+
+def _refuse_half_frozen(found: Mapping[str, Pair]) -> None:
+    """Refuse a map of which only one half learns: the other cannot make up for it.
+
+    Raises:
+        AegisError: there is one.
+    """
+    for site, (weight, bias) in found.items():
+        if bias is not None and weight.requires_grad != bias.requires_grad:
+            still = "bias" if weight.requires_grad else "weight"
+            raise AegisError(
+                f"{site} of the base model in the policy, of which only the {still} is frozen",
+                "all or nothing",
+                "freeze both or none",
+            )
+
+
+def _refuse_strays(
+    base: Mapping[str, Pair], found: Mapping[str, Pair], ordered: Sequence[Tensor]
+) -> None:
+    """Refuse learning parameters that belong to a map of the VLM which was not found.
+
+    A map may be missing, as in a VLM with fewer layers. One that is there with other values would
+    learn unprotected.
+
+    Raises:
+        AegisError: a map's weight that has moved, or its bias without its weight.
+    """
+    claimed = _ids(found)
+    free: dict[torch.Size, list[Tensor]] = {}
+    for parameter in ordered:
+        if parameter.requires_grad and id(parameter) not in claimed:
+            free.setdefault(parameter.shape, []).append(parameter)
+    for site in sorted(base.keys() - found.keys()):
+        weight, bias = base[site]
+        if any(_near(parameter, weight) for parameter in free.get(weight.shape, ())):
+            raise AegisError(
+                f"a parameter {list(weight.shape)} near {site} of the base model, and "
+                f"{len(found)} of its {len(base)} maps with their own values",
+                "a policy whose VLM still has the base model's weights, in a type that holds them",
+                "name the VLM that the policy begins with as the base, and measure its anchor; or "
+                "resume with the optimizer's state",
+            )
+        # Equal entries, as of biases that began at 0, may be anything's.
+        if bias is None or bool((bias == bias[0]).all()):
+            continue
+        if any(torch.equal(_on_cpu(p), bias) for p in free.get(bias.shape, ())):
+            raise AegisError(
+                f"the bias of {site} of the base model among what learns, and not its weight",
+                "all or nothing",
+                "freeze both or none",
+            )
+
+
+def _near(parameter: Tensor, weight: Tensor) -> bool:
+    """Whether a parameter may be this weight after it has learned, or was rounded."""
+    now = _on_cpu(parameter)
+    # Equal entries are those of a normalisation that is new.
+    if bool((now == now.flatten()[0]).all()):
+        return False
+    return bool((now - weight).norm() <= _NEAR * weight.norm())
+
+
+def _on_cpu(tensor: Tensor) -> Tensor:
+    return tensor.detach().cpu().float()
 
 
 def _values(tensor: Tensor) -> str:
@@ -271,13 +388,50 @@ def _values(tensor: Tensor) -> str:
     return digest({"": tensor})
 
 
-def _freeze(base: Backbone, protected: Mapping[str, Pair], ordered: Sequence[Tensor]) -> None:
-    """Let nothing learn that has the values of what the VLM has besides protected maps."""
-    held = {_values(t) for pair in protected.values() for t in pair if t is not None}
-    others = {_values(p) for p in base.parameters()} - held
-    for parameter in ordered:
-        if _values(parameter) in others:
-            parameter.requires_grad_(False)
+def _freeze(
+    base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
+) -> None:
+    """Let nothing learn of the VLM besides its protected maps.
+
+    Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
+    made, may be an expert's too; of these, what is frozen stands in the VLM's order.
+
+    Args:
+        protected: the sites that learn.
+        groups: the optimizer's.
+    """
+    held = {id(t) for site in protected for t in weights(base, site) if t is not None}
+    sequence = [(_values(p), id(p) in held) for p in base.parameters()]
+    others = Counter(value for value, is_held in sequence if not is_held)
+    in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
+    given = Counter(value for _, values in in_groups for value in values)
+    held_values = {value for value, is_held in sequence if is_held}
+    unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
+    for parameters, values in in_groups:
+        others_here = _in_order(sequence, values) if unclear & set(values) else set()
+        for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
+            is_other = place in others_here if value in unclear else value in others
+            if is_other:
+                parameter.requires_grad_(False)
+
+
+def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> set[int]:
+    """The places of the VLM's unprotected parameters in a group of the optimizer's.
+
+    Args:
+        sequence: the values of the VLM's parameters, and whether each is protected.
+        values: those of the group, which may have some of them, and others.
+    """
+    here = set(values)
+    expected = [pair for pair in sequence if pair[0] in here]
+    matcher = SequenceMatcher(None, [value for value, _ in expected], values, autojunk=False)
+    found = set()
+    for start, place, length in matcher.get_matching_blocks():
+        for i in range(length):
+            _, is_held = expected[start + i]
+            if not is_held:
+                found.add(place + i)
+    return found
 
 
 @contextlib.contextmanager
@@ -293,10 +447,12 @@ def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Iterator[
     with torch.no_grad():
         for parameter, value in pairs:
             parameter.copy_(value)
-    yield
-    with torch.no_grad():
-        for (parameter, _), value in zip(pairs, now, strict=True):
-            parameter.copy_(value)
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            for (parameter, _), value in zip(pairs, now, strict=True):
+                parameter.copy_(value)
 
 
 def _report(method: str, found: Collection[str], absent: Collection[str]) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -58,7 +57,8 @@ class GuardedStepper:
         self._slowed: SlowedStep | None = None  # of a step of the loop's own
         # Steps inside each other: of an optimizer that calls its base class's, or another one's.
         self._depth, self._in_closure = 0, False
-        self._moved = False  # whether an optimizer has stepped in `step`
+        # Whether an optimizer has moved the weights in `step`; None: no hook has told of any.
+        self._moved: bool | None = None
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
         self._stepped: set[int] | None = None
@@ -156,19 +156,32 @@ class GuardedStepper:
         self._refuse_second(optimizer)
         self._refuse_unreached()
         self._stepper.begin(self._by_name(anchor))
+        slowed = SlowedStep(self._parts)
         versions = self._versions()
-        self._stepping, self._moved = True, False
+        self._stepping, self._moved = True, None
         try:
-            take_slowed(self._parts, partial(_take, optimizer, scaler))
+            _take(optimizer, scaler)
         finally:
             self._stepping = False
         # A scaler leaves a step out that overflowed, and a trainer's optimizer those in between.
-        hooked = isinstance(optimizer, Optimizer)
-        if hooked and not self._moved and versions == self._versions():
+        # What is drawn back in such a step would be so without an update that asked for it.
+        if self._has_moved(optimizer, versions):
+            self._count += 1
+            slowed.go_back()
+            self._stepper.end(self._count)
+        else:
             self._stepper.take_none()
-            return
-        self._count += 1
-        self._stepper.end(self._count)
+
+    def _has_moved(self, optimizer: Optimizer, versions: Sequence[int]) -> bool:
+        """Whether the weights have moved in `step`.
+
+        Args:
+            versions: of the weights before it.
+        """
+        if self._moved is not None:
+            return self._moved
+        # One that is no optimizer of PyTorch's may write past its count.
+        return not isinstance(optimizer, Optimizer) or versions != self._versions()
 
     def _versions(self) -> list[int]:
         """How often each parameter was written to, as PyTorch counts it."""
@@ -272,17 +285,21 @@ class GuardedStepper:
         """The weights have moved, and go on to move where this step lies inside another one."""
         if not self._guards(optimizer):
             return
-        self._moved = True
+        moved = not overflowed(optimizer)
+        self._moved = moved or bool(self._moved)
         if self._stepped is not None:
             self._stepped.add(id(optimizer))
         self._depth = max(0, self._depth - 1)
         if self._slowed is not None and not self._depth:
-            self._end()
+            self._end(moved)
 
-    def _end(self) -> None:
-        """Constrain a step of the loop's own."""
+    def _end(self, moved: bool = True) -> None:
+        """Constrain a step of the loop's own, if it has moved the weights."""
         assert self._slowed is not None
         slowed, self._slowed = self._slowed, None
+        if not moved:
+            self._stepper.take_none()
+            return
         slowed.go_back()
         self._count += 1
         self._stepper.end(self._count)
@@ -328,12 +345,14 @@ class SlowedStep:
             parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
 
 
-def take_slowed(parts: Parts, take: Callable[[], None]) -> None:
-    """Take an optimizer's step, then go back to each parameter's share of it."""
-    slowed = SlowedStep(parts)
-    with torch.enable_grad():
-        take()
-    slowed.go_back()
+def overflowed(optimizer: Optimizer) -> bool:
+    """Whether a scaler has told this optimizer to leave out the step that it is in.
+
+    A scaler calls the step of a fused optimizer in any case. It gives it `found_inf` for that time,
+    and the kernel leaves the weights as they are, although PyTorch counts them as written to.
+    """
+    found = getattr(optimizer, "found_inf", None)
+    return found is not None and bool(found)
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:

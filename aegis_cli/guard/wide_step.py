@@ -23,11 +23,6 @@ MASTER = "aegis_master"  # in a parameter's state: its value in float32
 _WIDE = (torch.float32, torch.float64)
 
 
-def any_half(parameters: Iterable[Tensor]) -> bool:
-    """Whether one of the parameters is in half precision."""
-    return any(p.dtype not in _WIDE for p in parameters)
-
-
 class WideStep:
     """The parameters of an optimizer that have masters: those in half precision among some."""
 

@@ -119,6 +119,21 @@ def test_tiny_gradients_do_not_underflow() -> None:
     assert cosine(gs, as_) < 0 and cosine(project(gs, as_), as_).abs() < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("dtype", "size"), [(torch.float16, 1e-4), (torch.bfloat16, 1e-37), (torch.float32, 1e-37)]
+)
+def test_weights_beyond_the_gradients_type_are_applied(dtype: torch.dtype, size: float) -> None:
+    """A small anchor gradient has a large weight: so a pass in half precision with a scaler."""
+    g = torch.tensor([300.0, 20.0], dtype=dtype)
+    a = torch.tensor([-size, 0.0], dtype=dtype)
+    weight = float(projection.aegis(*projection.inner([g], [a]))[1])
+    assert weight > torch.finfo(dtype).max
+    (projected,) = projection.apply([g], [a], 1.0, weight)
+    assert projected is g and g.tolist() == pytest.approx([0.0, 20.0], abs=1e-9)
+    (alone,) = projection.apply([None], [a], 1.0, weight)
+    assert alone.dtype == dtype and float(alone[0]) == pytest.approx(-300.0)
+
+
 def test_missing_gradients_count_as_zero() -> None:
     (g1, g2, *_), (a1, a2, *_) = pair(1, conflict=True)
     sparse = projection.inner([g1, g2, None, None], [a1, None, a2, None])

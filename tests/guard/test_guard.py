@@ -527,6 +527,61 @@ def test_a_scaler_skips_the_step_of_an_overflow(at: str, anchor: Path) -> None:
     assert not torch.equal(vector(model), before) and len(guard.ledger) == 1
 
 
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_after_an_overflow_an_optimizer_that_clears_less_than_what_learns_is_refused(
+    is_automatic: bool, anchor: Path
+) -> None:
+    """The infinities that it leaves would have every later step skipped."""
+    model = make()
+    guard, scaler = Guard(model, anchor, LAYERS), torch.amp.GradScaler("cpu", init_scale=4.0)
+    if is_automatic:
+        guard.automatic(mask="mask", scaler=scaler)
+    optimizer = torch.optim.AdamW(model.text.parameters(), lr=1e-2)
+    before = vector(model)
+    scaled_step(model, guard, optimizer, scaler, torch.inf)
+    with pytest.raises(AegisError, match=r"(?s)of which 27 were cleared.*model\.zero_grad"):
+        scaled_step(model, guard, optimizer, scaler)
+    assert torch.equal(vector(model), before)
+    guard.discard()
+    model.zero_grad()
+    scaled_step(model, guard, optimizer, scaler)
+    assert not torch.equal(vector(model), before) and len(guard.ledger) == 1
+
+
+def scaled_step(
+    model: nn.Module,
+    guard: Guard,
+    optimizer: torch.optim.Optimizer,
+    scaler: torch.amp.GradScaler,
+    factor: float = 1.0,
+) -> None:
+    """One step of a loop with a scaler, which calls the guard unless that is automatic."""
+    if guard.is_automatic:
+        scaler.scale(task_loss(model, 0) * factor).backward()
+        scaler.step(optimizer)
+    else:
+        with guard.watch(batch(0)[2]):
+            loss = task_loss(model, 0) * factor
+        guard.backward(loss, scaler)
+        guard.step(optimizer, scaler)
+    scaler.update()
+    optimizer.zero_grad()
+
+
+def test_after_an_overflow_what_the_task_does_not_reach_has_no_gradient(tmp_path: Path) -> None:
+    """So training goes on where the optimizer does not have it, as if nothing had overflowed."""
+    model = make()
+    model.spare = nn.Linear(3, 3).double()
+    used = [p for name, p in model.named_parameters() if not name.startswith("spare")]
+    path = measured(model, tmp_path / "anchor.safetensors", parts=("moments",))
+    guard, scaler = Guard(model, path, LAYERS), torch.amp.GradScaler("cpu", init_scale=4.0)
+    optimizer, before = torch.optim.AdamW(used, lr=1e-2), vector(model)
+    scaled_step(model, guard, optimizer, scaler, torch.inf)
+    assert model.spare.weight.grad is None and torch.equal(vector(model), before)
+    scaled_step(model, guard, optimizer, scaler)
+    assert not torch.equal(vector(model), before) and scaler.get_scale() == 2.0
+
+
 def overflow_in_agreement() -> Callable[[Tensor], Tensor | None]:
     """Makes the first anchor gradient infinite in the task gradient's direction.
 

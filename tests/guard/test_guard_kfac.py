@@ -293,3 +293,40 @@ def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: P
     guard.step(optimizer, scaler)
     assert torch.equal(vector(model), ends[1])
     assert optimizer.state[model.vision[0].weight]["step"] == 2
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+@pytest.mark.parametrize("fused", [False, True])
+def test_an_overflow_in_one_map_moves_nothing(
+    fused: bool, is_automatic: bool, tmp_path: Path
+) -> None:
+    """A fused optimizer is called for such a step too, and leaves it out within its kernel."""
+    model, plain = only_maps(make()), only_maps(make())
+    path = measured(model, tmp_path / "anchor.safetensors")
+    ends = []
+    for each, overflows in ((model, True), (plain, False)):
+        guard = Guard(each, path, method="kfac", weight=1.0)
+        learning = [p for p in each.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(learning, lr=1e-2, fused=fused)
+        scaler = torch.amp.GradScaler("cpu", init_scale=8.0)
+        if is_automatic:
+            guard.automatic(scaler=scaler)
+        for seed, lost in ((0, False), (1, False), (2, True), (2, False)):
+            if lost and not overflows:
+                continue
+            before = vector(each)
+            up = each.text.layers[0].up.weight
+            hook = up.register_hook(lambda gradient: gradient * math.inf) if lost else None
+            if is_automatic:
+                scaler.scale(task_loss(each, seed)).backward()
+                scaler.step(optimizer)
+            else:
+                guard.backward(task_loss(each, seed), scaler)
+                guard.step(optimizer, scaler)
+            scaler.update()
+            optimizer.zero_grad()
+            if hook is not None:
+                hook.remove()
+                assert torch.equal(vector(each), before)
+        ends.append(vector(each))
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)

@@ -23,6 +23,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor
 
 ADAMW = {"lr": 3e-3, "weight_decay": 0.1}
+PARTS = ("weight", "bias")
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +129,7 @@ def test_the_applied_update_is_orthogonal_to_what_questions_span(
     )
     moved = {n: (after[n] - before[n]) for n in before}
     for site, protection in found.items():
-        update = [moved.get(f"inner.vlm.{site}.{part}") for part in ("weight", "bias")]
+        update = [moved.get(f"inner.vlm.{site}.{part}") for part in PARTS]
         inside = size(protection.removed(*update))
         assert inside <= 1e-10 * size(tuple(update)), site
     assert moved["after.weight"].abs().min() > 0  # the expert is free
@@ -160,6 +161,32 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
     }
     maps = {site for site, kind in base.sites().items() if kind in ("maps", "stem")}
     assert set(optimizer.protected) == maps - {"stem.position"}
+
+
+@pytest.mark.parametrize("decays_apart", [False, True])
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_an_experts_new_norms_learn_with_kfac(
+    place: str, decays_apart: bool, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """They have the values of the norms of this VLM, which is untrained and whose own do not."""
+    model = Foreign(tiny_folder)
+    expert = make_tiny(9).layers[0]
+    setattr(model, place, expert)
+    ProtectedAdamW(in_groups(model, decays_apart), "kfac", anchor, base, {}, **ADAMW)
+    assert all(p.requires_grad for p in expert.parameters())
+    still = {name for name, p in model.inner["vlm"].named_parameters() if not p.requires_grad}
+    assert {f"layers.{i}.norm{n}.{part}" for i in (0, 1) for n in (1, 2) for part in PARTS} <= still
+    assert not any(part in name for name in still for part in ("qkv", "out", "up", "down"))
+
+
+def in_groups(model: nn.Module, decays_apart: bool) -> list[dict[str, Any]]:
+    """The optimizer's groups: one, or as often one whose parameters decay and another one."""
+    parameters = list(model.parameters())
+    if not decays_apart:
+        return [{"params": parameters}]
+    matrices = [p for p in parameters if p.ndim > 1]
+    rest = [p for p in parameters if p.ndim <= 1]
+    return [{"params": matrices}, {"params": rest, "weight_decay": 0.0}]
 
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
@@ -199,9 +226,160 @@ def test_a_vlm_that_has_learned_before_is_refused_before_anything_moves(
     assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
 
 
+def learned(module: nn.Module) -> None:
+    """Moves a module's weights as a training would have, by about a tenth of their size."""
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            noise = torch.randn(parameter.shape, generator=generator)
+            parameter.add_(noise, alpha=0.1 * float(parameter.std(correction=0) + 0.1))
+
+
+def refused_at_the_first_step(model: nn.Module, optimizer: ProtectedAdamW, match: str) -> None:
+    """Nothing has moved then."""
+    before = values(model)
+    gradients(model, 0)
+    with pytest.raises(AegisError, match=match):
+        optimizer.step()
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+
+
+@pytest.mark.parametrize("part", ["layers", "layers.1", "stem", "layers.0.up"])
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_vlm_of_which_a_part_has_learned_is_refused(
+    method: str, part: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """As after a training with the rest frozen: what has moved would go unprotected."""
+    model = Foreign(tiny_folder)
+    learned(model.inner["vlm"].get_submodule(part))
+    optimizer = make(model, method, anchor, base)
+    refused_at_the_first_step(model, optimizer, f"near {part}|with the values of layers.0.norm1")
+
+
+def test_norms_that_have_learned_are_refused(tmp_path: Path) -> None:
+    """Also where all maps are as they were."""
+    folder = tmp_path / "base"
+    trained = make_tiny()
+    for number, module in enumerate(trained.modules()):
+        if isinstance(module, nn.LayerNorm):
+            nn.init.normal_(module.weight, 1.0, 0.1 + number / 1000)
+    trained.save(folder)
+    own = backbones.load(str(folder))
+    path = measured(folder, tmp_path / "anchor.safetensors")
+    model = Foreign(folder)
+    train(model, make(model, "nullspace", path, own), range(1))
+    model = Foreign(folder)
+    learned(model.inner["vlm"].layers[0].norm1)
+    refused_at_the_first_step(model, make(model, "nullspace", path, own), "near layers.0.norm1")
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_what_is_missing_or_frozen_or_the_experts_own_is_no_vlm_that_has_learned(
+    method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """The optimizer lacks a tower, a layer has learned and is frozen, an expert has its shapes."""
+    model = Foreign(tiny_folder)
+    vlm = model.inner["vlm"]
+    learned(vlm.layers[1])
+    vlm.layers[1].requires_grad_(False)
+    model.expert = make_tiny(9).layers[1]
+    stem = {id(p) for p in vlm.stem.parameters()}
+    parameters = [p for p in model.parameters() if id(p) not in stem]
+    protect = ("maps",)  # the expert's norms are as new as those of this untrained VLM
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {"protect": protect}, **ADAMW)
+    before = values(model)
+    train(model, optimizer, range(2))
+    assert optimizer.protected and all(s.startswith("layers.0.") for s in optimizer.protected)
+    assert not torch.equal(before["expert.up.weight"], model.expert.up.weight)
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+@pytest.mark.parametrize("half", ["weight", "bias"])
+@pytest.mark.parametrize("given", [True, False])
+def test_a_map_that_is_half_frozen_is_refused(
+    given: bool, half: str, method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """Whether or not the optimizer is given the frozen half."""
+    model = Foreign(tiny_folder)
+    frozen = getattr(model.inner["vlm"].layers[0].up, half)
+    frozen.requires_grad_(False)
+    parameters = [p for p in model.parameters() if given or p is not frozen]
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {}, **ADAMW)
+    refused_at_the_first_step(model, optimizer, "layers.0.up")
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+@pytest.mark.parametrize("decays_apart", [False, True])
+@pytest.mark.parametrize("part", ["weight", "bias"])
+def test_a_training_resumes_where_a_half_of_a_map_never_had_a_gradient(
+    part: str,
+    decays_apart: bool,
+    method: str,
+    tiny_folder: Path,
+    base: Backbone,
+    anchor: Path,
+) -> None:
+    """It has no state of AdamW's, and what holds the other half has moved it all the same."""
+
+    def teach(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
+        for seed in steps:
+            gradients(model, seed)
+            getattr(model.inner["vlm"].layers[0].up, part).grad = None
+            model.inner["vlm"].layers[0].norm2.weight.grad = None
+            optimizer.step()
+            optimizer.zero_grad()
+
+    def made(model: Foreign) -> ProtectedAdamW:
+        groups = in_groups(model, decays_apart)
+        return ProtectedAdamW(groups, method, anchor, base, {}, **ADAMW)
+
+    one, other = interrupted_and_whole(lambda: Foreign(tiny_folder), teach, made)
+    assert set(one.protected) == set(other.protected) and "layers.0.up" in one.protected
+
+
+def test_weights_stay_where_a_method_cannot_start(
+    tiny_folder: Path, base: Backbone, tmp_path: Path
+) -> None:
+    """It starts from the base model's, which the weights of a resumed training are not."""
+    path = tmp_path / "anchor.safetensors"
+    measure.run(
+        str(tiny_folder), Anchor(samples=14, batch_size=14, parts=("inputs",), energy=0.5), path
+    )
+    model = Foreign(tiny_folder)
+    optimizer = make(model, "nullspace", path, base, energy=0.3)
+    train(model, optimizer, range(2))
+    again = make(model, "nullspace", path, base, energy=0.999)
+    again.load_state_dict(optimizer.state_dict())
+    refused_at_the_first_step(model, again, "eigenvectors of a map's inputs")
+
+
 def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path) -> None:
     with pytest.raises(AegisError, match="of other weights than those of the base model"):
         make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_scaler_skips_the_step_of_an_overflow(
+    method: str, tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    """It calls a fused optimizer all the same."""
+    model = Foreign(tiny_folder)
+    parameters = model.parameters()
+    optimizer = ProtectedAdamW(parameters, method, anchor, base, {}, fused=True, **ADAMW)
+    train(model, optimizer, range(3))
+    before = values(model)
+    scaler = torch.amp.GradScaler("cpu", init_scale=8.0)
+    scaler.scale(torch.zeros(()))  # as a loss would be, which begins its work
+    gradients(model, 5)
+    model.after.weight.grad.mul_(torch.inf)
+    scaler.step(optimizer)
+    scaler.update()
+    assert scaler.get_scale() == 4.0
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+    gradients(model, 5)
+    scaler.step(optimizer)
+    for name in ("after.weight", "inner.vlm.layers.0.up.weight"):
+        assert not torch.equal(before[name], model.get_parameter(name))
 
 
 # --- half precision -------------------------------------------------------------------------------
