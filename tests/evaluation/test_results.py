@@ -40,6 +40,49 @@ def test_a_later_one_replaces_it_and_leaves_that_of_aegis_run(run: Path) -> None
     assert (run / "rollout-seen.json").read_bytes() == before
 
 
+def probe_of(drop: float | None, passed: bool | None = None, drift: bool = False):
+    """A probe that tells its drop, its gate's verdict and its drift, or not."""
+    layers = [{"layer": "layers.0", "w2": 12.5}] if drift else []
+    return probe("shape") | {"drop_points": drop, "passed": passed, "layers": layers}
+
+
+def test_a_probe_without_a_drop_is_kept_beside_an_earlier_gate_which_comes_first(run: Path) -> None:
+    told: list[Event] = []
+    results.keep_if_possible(run, "probe-scenes", probe_of(2.0, passed=False), {}, told.append)
+    assert not told
+    results.keep_if_possible(run, "probe-scenes", probe_of(None), {}, told.append)
+    _, first, second = results.probes(run)
+    assert (first.name, first.figures["drop_points"]) == ("probe-scenes", 2.0)
+    assert (second.name, second.figures["drop_points"]) == ("probe-scenes-with-accuracy", None)
+    assert results.gate([first, second], None) is False
+    (warned,) = told
+    assert isinstance(warned, Warned) and "which also tells the drop and the gate" in warned.text
+
+
+def test_probes_that_each_tell_what_the_other_does_not_are_both_kept(run: Path) -> None:
+    results.keep(run, "probe-scenes", probe_of(2.0, passed=True), {})
+    results.keep(run, "probe-scenes", probe_of(2.0, drift=True), {})
+    names = [found.name for found in results.probes(run)]
+    assert names == ["probe", "probe-scenes", "probe-scenes-with-drop-drift"]
+
+
+def test_a_probe_replaces_all_that_tell_no_more(run: Path) -> None:
+    for found in (probe_of(None), probe_of(2.0, passed=True), probe_of(3.0), probe_of(None)):
+        results.keep(run, "probe-scenes", found, {})
+    assert len(results.probes(run)) == 4
+    results.keep(run, "probe-scenes", probe_of(5.0, passed=False, drift=True), {})
+    assert [found.figures["drop_points"] for found in results.probes(run)[1:]] == [5.0]
+
+
+def test_a_probe_of_an_earlier_checkpoint_is_replaced_whatever_it_told(run: Path) -> None:
+    results.keep(run, "probe-scenes", probe_of(2.0, passed=True), {})
+    link = run / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to(checkpoint_at(run, 9).name)
+    path = results.keep(run, "probe-scenes", probe_of(None), {})
+    assert path is not None and path.name == "probe-scenes.json"
+
+
 def checkpoint_at(run: Path, step: int) -> Path:
     at = run / "checkpoints" / f"{step:06d}"
     (at / "backbone").mkdir(parents=True)
