@@ -678,7 +678,8 @@ class Probe:
     max_drop: float | None = key(
         NOT_NEGATIVE,
         None,
-        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
+        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1, and "
+        "`aegis probe` of the run.",
     )
 
     def of_each_set(self) -> tuple[Probe, ...]:
