@@ -768,3 +768,7 @@ class Recipe:
     merge: Merge = Merge()
     probe: Probe = Probe()
     rollout: Rollout = Rollout()
+
+    def reads_anchor(self, method: str) -> bool:
+        """Whether the weights come about with an anchor: by the method, or the merge after it."""
+        return method in NEEDS or self.merge.method in MERGE_NEEDS
