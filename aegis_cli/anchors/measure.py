@@ -173,7 +173,7 @@ class _Measured:
     skipped: int
     seconds: dict[str, float]
     inputs: Mapping[str, str]
-    meta: Mapping[str, str]
+    meta: Mapping[str, Any]
     entropy: float | None = None
 
 
@@ -229,6 +229,11 @@ def _on_frames(
         texts = [found.instructions[i] for i in found.instruction_of[rows].tolist()]
         return found.images(rows), texts
 
+    meta: dict[str, Any] = {"demos": demos.name}
+    if selection.only is not None:
+        meta["only"] = selection.only
+    if found.cameras:
+        meta["cameras"] = list(found.cameras)
     batches = frames.split(settings.batch_size)
     image, text = moments.measure_passes(model, batches, read, len(frames), on_event, ranks)
     return _Measured(
@@ -238,7 +243,7 @@ def _on_frames(
         0,
         {"moments": time.perf_counter() - start},
         {"demos": found.sha256},
-        {"demos": demos.name} | ({} if selection.only is None else {"only": selection.only}),
+        meta,
     )
 
 
