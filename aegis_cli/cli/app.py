@@ -17,7 +17,7 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, stages
-from aegis_cli.cli.exits import Commands
+from aegis_cli.cli.exits import Commands, ended_by
 from aegis_cli.cli.options import (
     AnchorIn,
     Ask,
@@ -1276,4 +1276,7 @@ def main() -> None:
     # threads go on meanwhile, and to walk through their frames may be a fault of its own.
     faulthandler.enable(all_threads=False)
     interrupts.leave_at_ctrl_c()
-    app(prog_name="aegis")
+    try:
+        app(prog_name="aegis")
+    except OSError as error:  # of a shell's completion, which begins no command
+        sys.exit(ended_by(error))

@@ -65,6 +65,7 @@ def keep(
     if found is None or not os.access(found[0], os.W_OK):
         return None
     run, step = found
+    figures, settings = _in_utf8(figures), _in_utf8(settings)
     # A file's name or a data set's path may hold anything.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
     of_last = step == _last_step(run)
@@ -75,7 +76,7 @@ def keep(
             path = path.with_name(f"{path.stem}-{told_apart}.json")
         if name.startswith("probe-"):
             path = _beside_what_tells_more(path, figures, step, on_event)
-        files.save_json(path, {**figures, "settings": dict(settings), "step": step})
+        files.save_json(path, {**figures, "settings": settings, "step": step})
     recipe = recipe_of(run)
     if recipe.train.track and step is not None:
         track.tell(recipe, run, plain, figures, step)
@@ -95,6 +96,15 @@ def keep_if_possible(
     except AegisError as problem:
         text = f"not kept in '{run_of(target)}': {problem.found}; {problem.fix}"
         on_event(Warned(name.partition("-")[0], text))
+
+
+def _in_utf8(value: Any) -> Any:
+    """A measurement whose texts can be read back: bytes of a path that are no UTF-8 written out."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, Mapping):
+        return {name: _in_utf8(inner) for name, inner in value.items()}
+    return [_in_utf8(inner) for inner in value] if isinstance(value, (list, tuple)) else value
 
 
 @contextlib.contextmanager

@@ -164,6 +164,17 @@ def test_it_is_said_which_episodes_an_error_is_of(changes: dict[str, object], sa
     assert results.evaluated_on({**open_loop(1, 2), **changes}) == said
 
 
+def test_paths_that_are_not_utf8_are_kept_and_read_back(run: Path) -> None:
+    name = os.fsdecode(b"caf\xe9")
+    for place, drop in (("home", 0), ("kitchen", 1), ("home", 2)):
+        settings = {"path": f"/{place}/{name}"}
+        results.keep(run, "probe-x", probe("shape", drop) | {"w2_between": name}, settings)
+    results.keep(run, "rollout-seen", rollout("seen", 0.5) | {"video": f"{name}.gif"}, {})
+    kept = {r.settings["path"]: r.figures["drop_points"] for r in results.probes(run)[1:]}
+    assert kept == {"/home/caf\\udce9": 30.0, "/kitchen/caf\\udce9": 20.0}
+    assert "caf\\udce9.gif" in [played.figures["video"] for played in results.rollouts(run)]
+
+
 @pytest.mark.parametrize("name", ["probe-okvqa_validation.jsonl", "probe-questions-validation"])
 def test_a_set_may_be_called_validation(run: Path, name: str) -> None:
     results.keep(run, name, probe("shape"), {})
