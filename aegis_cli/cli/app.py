@@ -18,7 +18,7 @@ import typer
 from typer import Argument, Option
 
 from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, stages
-from aegis_cli.cli.exits import Commands
+from aegis_cli.cli.exits import Commands, ended_by
 from aegis_cli.cli.options import (
     AnchorIn,
     Ask,
@@ -595,7 +595,7 @@ def probe(
     baseline: Annotated[
         str | None,
         Option(
-            help="Run or backbone to measure the drop against. With --max-drop or --anchor it "
+            help="Run or backbone to measure the drop against. With a gate or --anchor it "
             "defaults to the model that a run began from."
         ),
     ] = None,
@@ -613,7 +613,8 @@ def probe(
     max_drop: Annotated[
         float | None,
         Option(
-            help="Exit 1 if accuracy drops by more percentage points than this.",
+            help="Exit 1 if accuracy drops by more percentage points than this; default: a run's "
+            "own probe.max_drop, for the questions that its recipe names, else no gate.",
             callback=not_negative,
         ),
     ] = None,
@@ -642,12 +643,15 @@ def probe(
         stages.refuse_options(options, f"in '{target}'")
         stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
+    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
+    limit = "--max-drop"
+    if max_drop is None and asks.max_drop is not None:
+        limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
-    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
     advice.of_questions(target, asks.vqa)
     with stages.joined(device):
         report = stages.PROBE.run(
@@ -672,7 +676,7 @@ def probe(
             dropped = f"dropped {report.drop_points:.2f} points"
             if gate is Gate.upper:
                 dropped += f" or up to {report.drop_interval[1]:.2f}"
-            failed = f"{dropped}, more than --max-drop {max_drop:g}"
+            failed = f"{dropped}, more than {limit} {max_drop:g}"
         _say_gate(failed)
     _end_at_gate(failed)
 
@@ -1285,4 +1289,7 @@ def main() -> None:
     # threads go on meanwhile, and to walk through their frames may be a fault of its own.
     faulthandler.enable(all_threads=False)
     interrupts.leave_at_ctrl_c()
-    app(prog_name="aegis")
+    try:
+        app(prog_name="aegis")
+    except OSError as error:  # of a shell's completion, which begins no command
+        sys.exit(ended_by(error))

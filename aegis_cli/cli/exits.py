@@ -1,8 +1,9 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
 Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `merge --max-drop`, `probe.max_drop` of
-`run`, `train --dry-run` where memory or disk are too small), 2 a problem to act on, 3 a defect of
-Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the output, 143 SIGTERM.
+`run` and `probe`, `train --dry-run` where memory or disk are too small), 2 a problem to act on,
+3 a defect of Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the output, 143
+SIGTERM.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Commands(TyperGroup):
         try:
             return super().parse_args(ctx, args)
         except OSError as error:  # of --help, whose output may be a full disk
-            raise typer.Exit(_ended_by(error)) from None
+            raise typer.Exit(ended_by(error)) from None
         except Exception as error:
             if hasattr(error, "show"):
                 raise typer.Exit(_misused(error)) from None
@@ -64,7 +65,7 @@ class Commands(TyperGroup):
             _say(render.error, error)
             raise typer.Exit(2) from None
         except OSError as error:
-            raise typer.Exit(_ended_by(error)) from None
+            raise typer.Exit(ended_by(error)) from None
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             ended = "interrupted" if number == signal.SIGINT else signal.Signals(number).name
@@ -114,7 +115,7 @@ def _misused(error: Any) -> int:
     return error.exit_code
 
 
-def _ended_by(error: OSError) -> int:
+def ended_by(error: OSError) -> int:
     """Tell what the system would not do; the exit code."""
     if error.errno == errno.EPIPE:
         _close_output()

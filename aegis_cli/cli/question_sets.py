@@ -17,12 +17,15 @@ def chosen(
 
     Args:
         model: a run, one of its checkpoints, or a backbone.
-        vqa: the question set; of a recipe that names several, the first is asked.
+        vqa: the question set; of a recipe that names several, the first is asked. The recipe's
+            limit of the drop is one of its own sets.
         skip_bad: the recipe may ask for it too, of its own set.
     """
-    own = _of_run(model, warn=vqa is None)
+    named = _of_run(model, warn=vqa is None)
+    own = named[0]
     return dataclasses.replace(
         own,
+        max_drop=own.max_drop if vqa in (None, *(each.vqa for each in named)) else None,
         vqa=own.vqa if vqa is None else vqa,
         ask=own.ask if ask is None else ask,
         skip_bad=skip_bad or (vqa is None and own.skip_bad),
@@ -46,15 +49,15 @@ def baseline(model: str) -> str | None:
     return began_from
 
 
-def _of_run(model: str, warn: bool) -> Probe:
-    """The `probe` of a run's recipe, of its first set; the defaults for a model without a run."""
+def _of_run(model: str, warn: bool) -> tuple[Probe, ...]:
+    """The `probe` of a run's recipe, of each set; the defaults for a model without a run."""
     from aegis_cli.evaluation import results
 
     run = results.run_of(Path(model))
     if run is None:
-        return Probe()
-    first, *others = results.recipe_of(run).probe.of_each_set()
+        return (Probe(),)
+    first, *others = named = results.recipe_of(run).probe.of_each_set()
     if warn and others and launch.rank() == 0:
         left = ", ".join(f"--vqa {other.vqa}" for other in others)
         render.note(f"asked are the questions of {first.vqa}; the run's recipe also names {left}")
-    return first
+    return named

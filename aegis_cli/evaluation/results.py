@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import os
 import re
 import time
@@ -20,7 +21,7 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
@@ -31,15 +32,22 @@ OPEN_LOOP = "evaluate"  # what the names of its files begin with
 # Which episodes an open-loop evaluation is of.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 _PATIENCE_S = 5.0  # with others who write there
+# What one probe of a checkpoint tells and another of the same questions may not.
+_TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
 
 
 def keep(
-    target: Path, name: str, figures: Mapping[str, Any], settings: Mapping[str, Any]
+    target: Path,
+    name: str,
+    figures: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    on_event: OnEvent = ignore,
 ) -> Path | None:
     """Write a measurement of a run, or of one of its checkpoints, into the run's folder.
 
     A later one of the same name replaces it, if it is of the same question set or demonstrations:
-    two of them may be files of one name in different folders.
+    two of them may be files of one name in different folders. A probe that tells less than an
+    earlier one, such as no drop, is kept beside it, and `on_event` hears of that.
 
     Args:
         name: `probe-scenes`, `rollout-seen` or `evaluate-validation-arm`.
@@ -57,6 +65,7 @@ def keep(
     if found is None or not os.access(found[0], os.W_OK):
         return None
     run, step = found
+    figures, settings = _in_utf8(figures), _in_utf8(settings)
     # A file's name or a data set's path may hold anything.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
     of_last = step == _last_step(run)
@@ -65,7 +74,9 @@ def keep(
         if _is_of_other_data(path, settings):
             told_apart = hashlib.sha256(settings["path"].encode()).hexdigest()[:8]
             path = path.with_name(f"{path.stem}-{told_apart}.json")
-        files.save_json(path, {**figures, "settings": dict(settings), "step": step})
+        if name.startswith("probe-"):
+            path = _beside_what_tells_more(path, figures, step, on_event)
+        files.save_json(path, {**figures, "settings": settings, "step": step})
     recipe = recipe_of(run)
     if recipe.train.track and step is not None:
         track.tell(recipe, run, plain, figures, step)
@@ -81,10 +92,19 @@ def keep_if_possible(
 ) -> None:
     """The same; where it cannot be written, a warning says so, for the figures are known by now."""
     try:
-        keep(target, name, figures, settings)
+        keep(target, name, figures, settings, on_event)
     except AegisError as problem:
         text = f"not kept in '{run_of(target)}': {problem.found}; {problem.fix}"
         on_event(Warned(name.partition("-")[0], text))
+
+
+def _in_utf8(value: Any) -> Any:
+    """A measurement whose texts can be read back: bytes of a path that are no UTF-8 written out."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, Mapping):
+        return {name: _in_utf8(inner) for name, inner in value.items()}
+    return [_in_utf8(inner) for inner in value] if isinstance(value, (list, tuple)) else value
 
 
 @contextlib.contextmanager
@@ -115,6 +135,39 @@ def _is_of_other_data(path: Path, settings: Mapping[str, Any]) -> bool:
     found = files.load_json(path)
     there = (found.get("settings") or {}) if isinstance(found, dict) else {}
     return there.get("path", settings["path"]) != settings["path"]
+
+
+def _beside_what_tells_more(
+    path: Path, figures: Mapping[str, Any], step: int | None, on_event: OnEvent
+) -> Path:
+    """Where a probe is kept: beside an earlier one that tells what it does not, else in its place.
+
+    Those beside it that tell no more than the new one are removed, as if they had been replaced.
+    """
+    told = _told(figures)
+    by_told = {
+        path.with_name(f"{path.stem}-with-{'-'.join(some or ('accuracy',))}.json"): set(some)
+        for size in range(len(_TOLD))
+        for some in itertools.combinations(_TOLD.values(), size)
+    }
+    for other, theirs in by_told.items():
+        if theirs <= told:
+            other.unlink(missing_ok=True)
+    if not path.is_file():
+        return path
+    found = files.load_json(path)
+    earlier = found if isinstance(found, dict) else {}
+    more = [word for word in _TOLD.values() if word in _told(earlier) - told]
+    if not more or earlier.get("step", step) != step:
+        return path
+    text = f"kept beside the earlier '{path}', which also tells the {' and the '.join(more)}"
+    on_event(Warned("probe", text))
+    return next(other for other, theirs in by_told.items() if theirs == told)
+
+
+def _told(figures: Mapping[str, Any]) -> set[str]:
+    """The words of `_TOLD` for what a probe tells."""
+    return {word for key, word in _TOLD.items() if figures.get(key) not in (None, [])}
 
 
 def run_of(target: Path) -> Path | None:
@@ -189,7 +242,9 @@ def _read(
         if not re.match(rf"{kind}-validation(-|$)", path.stem):
             by_recipe.append(path)
     found, last = [], _last_step(run)
-    for path in [*by_recipe, *sorted((run / FOLDER).glob(f"{kind}-*.json"))]:
+    # A probe that tells less than another of the same questions comes after it.
+    apart = sorted((run / FOLDER).glob(f"{kind}-*.json"), key=lambda path: path.stem)
+    for path in [*by_recipe, *apart]:
         raw = kept_figures.read(path, figures)
         settings, step = raw.pop("settings", None) or {}, raw.pop("step", None)
         # A run that was trained further has forgotten what was measured of it before. Earlier

@@ -138,7 +138,7 @@ def text(
         averaged="" if decay is None else _AVERAGED.format(decay),
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
         stored=stored,
-        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at)),
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
         use=_use(form, repo, recipe, facts["task"], cameras),
     )
 
@@ -300,6 +300,11 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def _inputs(at: Path) -> list[tuple[str, str]]:
-    """sha256 of what the policy was made from, by a name for it."""
-    return sorted(artifacts.read_header(at / checkpoint.EXPERT).inputs.items())
+def _inputs(at: Path, recipe: Recipe) -> list[tuple[str, str]]:
+    """sha256 of what the policy was made from, by a name for it.
+
+    The anchor is left out where one was given to a method that reads none.
+    """
+    named = artifacts.read_header(at / checkpoint.EXPERT).inputs.items()
+    reads = recipe.reads_anchor(recipe.train.method)
+    return sorted((name, digest) for name, digest in named if name != "anchor" or reads)

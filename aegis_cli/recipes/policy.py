@@ -687,7 +687,8 @@ class Probe:
     max_drop: float | None = key(
         NOT_NEGATIVE,
         None,
-        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1.",
+        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1, and "
+        "`aegis probe` of the run.",
     )
 
     def of_each_set(self) -> tuple[Probe, ...]:
@@ -776,3 +777,7 @@ class Recipe:
     merge: Merge = Merge()
     probe: Probe = Probe()
     rollout: Rollout = Rollout()
+
+    def reads_anchor(self, method: str) -> bool:
+        """Whether the weights come about with an anchor: by the method, or the merge after it."""
+        return method in NEEDS or self.merge.method in MERGE_NEEDS

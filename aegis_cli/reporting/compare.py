@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import results
 from aegis_cli.inspection import InspectReport
+from aegis_cli.reporting import differences
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
@@ -60,10 +61,14 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The runs, in the order given; and whether all open-loop errors are of the same frames."""
+    """The runs, in the order given; and whether all open-loop errors are of the same frames.
+
+    `differs` has what the runs do not share beside their methods, with each run's value.
+    """
 
     rows: list[ComparedRun]
     same_open_loop: bool = True
+    differs: dict[str, list[differences.Value]] = field(default_factory=dict)
 
     @property
     def question_sets(self) -> list[str]:
@@ -89,7 +94,15 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     evaluated = _one_of_each([_by_episodes(one) for _, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
     _warn_of_unfinished(rows, on_event)
-    made = Comparison(rows, len({own[0] for own in evaluated if own is not None}) < 2)
+    facts = [
+        differences.of_run(path, row.steps, asked)
+        for (path, _), row, asked in zip(found, rows, probed, strict=True)
+    ]
+    same_frames = len({own[0] for own in evaluated if own is not None}) < 2
+    made = Comparison(rows, same_frames, differences.between(facts))
+    if made.differs:
+        text = f"the runs differ in {differences.said(made.differs)}"
+        on_event(Warned("compare", f"{text}: their figures tell more than their methods"))
     if len(made.question_sets) > 1:
         text = f"VQA is of different questions: {', '.join(made.question_sets)}"
         on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, recipes, sim
-from aegis_cli.common import machine
+from aegis_cli.common import artifacts, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import kept_figures, results
@@ -40,6 +40,19 @@ class Video:
 
 
 @dataclass(frozen=True)
+class AnchorUse:
+    """An anchor and what it was for.
+
+    Attributes:
+        measured_on: in words; of a file whose content is not known here, which file it is.
+        read: whether the weights came about with it; else the drift alone is measured against it.
+    """
+
+    measured_on: str
+    read: bool
+
+
+@dataclass(frozen=True)
 class RunDocument:
     """One run.
 
@@ -47,6 +60,7 @@ class RunDocument:
         label: a name that tells it from the others of a job; its method, and whether what that
             trained was merged afterwards.
         recipe: every key with its value.
+        anchor: None where neither the training has read it nor a drift was measured against it.
         facts: as `aegis inspect` tells them.
         metrics: the lines of metrics.jsonl.
         layers, over_time, energy_shed_mean: the energy that the projection shed; empty where no
@@ -66,6 +80,7 @@ class RunDocument:
     task: str | None
     backbone: str
     recipe: dict[str, Any]
+    anchor: AnchorUse | None
     facts: dict[str, Any]
     metrics: list[dict[str, Any]]
     layers: tuple[inspection.LayerEnergy, ...]
@@ -184,6 +199,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     found = inspection.run(path)
     train = path / "train.json"
     about = path / machine.NAME
+    anchor = _anchor(path, recipe, found)
     return RunDocument(
         kind="run",
         path=str(path),
@@ -192,6 +208,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         task=found.facts.get("task"),
         backbone=recipe.backbone,
         recipe=written_out(recipe),
+        anchor=anchor,
         facts=found.facts,
         metrics=folder.read_metrics(path, "step"),
         layers=found.layers,
@@ -204,11 +221,30 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         gate=found.gate,
         machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],
-        commands=_commands(path, recipe, found.facts),
+        commands=_commands(path, recipe, found.facts, anchor is not None),
     )
 
 
-def _commands(path: Path, recipe: recipes.Recipe, facts: Mapping[str, Any]) -> list[str]:
+def _anchor(
+    path: Path, recipe: recipes.Recipe, found: inspection.InspectReport
+) -> AnchorUse | None:
+    """What is said of a run's anchor; its file may have been given to a training in vain."""
+    read = recipe.reads_anchor(str(found.facts["method"]))
+    if not read and not any(probed.figures.get("layers") for probed in found.probes):
+        return None
+    if (path / "train.json").is_file():  # by `aegis run`, which measures the recipe's own
+        asked = f"questions of {recipe.anchor.vqa}"
+        what = "robot frames" if recipe.anchor.source == "demos" else asked
+        return AnchorUse(f"{recipe.anchor.samples} {what}", read)
+    if not read:
+        return AnchorUse("a file given to aegis probe", read)
+    digest = artifacts.read_header(path / "ledger.safetensors").inputs.get("anchor", "unknown")
+    return AnchorUse(f"a file with sha256 {digest[:12]}", read)
+
+
+def _commands(
+    path: Path, recipe: recipes.Recipe, facts: Mapping[str, Any], has_anchor: bool
+) -> list[str]:
     """Training, merge, probe and rollout of a run; inputs lie beside it if `aegis run` made them.
 
     Without a simulated task, nothing can be rolled out.
@@ -218,9 +254,11 @@ def _commands(path: Path, recipe: recipes.Recipe, facts: Mapping[str, Any]) -> l
     sets = (named,) if isinstance(named, str) else named
     demos = [word for each in sets for word in ("--demos", each)]
     anchor = _beside(path, "anchor.safetensors")
+    given = ("--anchor", anchor)
     again, new = path / "recipe.yaml", "NEW_FOLDER"
-    inputs = ("--method", method, *demos, "--anchor", anchor, "--out", new)
-    asked = ("--baseline", recipe.backbone, "--anchor", anchor)
+    read = given if recipe.reads_anchor(method) else ()
+    inputs = ("--method", method, *demos, *read, "--out", new)
+    asked = ("--baseline", recipe.backbone, *(given if has_anchor else ()))
     commands = [_command("aegis", "train", again, *inputs)]
     if merge is not None:
         trained, new = new, "MERGED_FOLDER"

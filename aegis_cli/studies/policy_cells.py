@@ -599,6 +599,7 @@ class PolicyRunner:
             between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
             report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
             probe.check_trained(report, recipe.train.steps)
+            probe.warn_of_few_questions(report, settings.max_drop, on_event)
             wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
             own = probe.by_image(after, before, asked.names)
             files.save_json(path, report.to_json() | own | wrong)

@@ -240,6 +240,7 @@ def build(
     _check_parts(method, measured, recipe)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
+        _warn_of_other_cameras(anchor, demos, recorded.cameras, on_event)
     # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
@@ -478,6 +479,28 @@ def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> No
             f"{own}; and probe with the same --ask"
         )
         on_event(Warned("train", text))
+
+
+def _warn_of_other_cameras(
+    path: Path, demos: Path, shown: Sequence[str], on_event: OnEvent
+) -> None:
+    """Warn of an anchor of robot frames from other cameras than those that are learned from.
+
+    Each camera's frame is an image of the prompt. Of frames of one camera that nobody has named
+    nothing is said, and nothing of questions, which have one image each.
+    """
+    meta = artifacts.read_header(path).meta
+    own = meta.get("cameras", [])
+    unnamed = not (own and shown) and max(len(own), len(shown)) < 2
+    if "demos" not in meta or own == list(shown) or unnamed:
+        return
+    names = shlex.join(word for camera in shown for word in ("--camera", camera))
+    text = (
+        f"the anchor '{path}' was measured on frames of {', '.join(own) or 'no camera by name'}, "
+        f"and the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "
+        f"anchor --demos {shlex.quote(str(demos))} {names}".rstrip()
+    )
+    on_event(Warned("train", text))
 
 
 def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:

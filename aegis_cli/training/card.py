@@ -87,6 +87,8 @@ def text(
     """
     settings, options = recipe.train, recipes.options(recipe)
     asks = method.trains_on_questions(options)
+    # A method that reads no anchor may have been given one all the same.
+    read = {name: digest for name, digest in inputs.items() if name != "anchor" or method.needs}
     cameras = ", then ".join(f"`{camera}`" for camera in data.cameras)
     return _CARD.format(
         name=recipe.name,
@@ -106,9 +108,9 @@ def text(
         validation=data.validation,
         cameras=f" seen by {cameras}" if cameras else "",
         except_own=", but for this method's own set" if asks else "",
-        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(inputs.items())),
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in sorted(read.items())),
         drift=_drift(ledger.tensors()),
-        anchor=" --anchor ANCHOR" if "anchor" in inputs else "",
+        anchor=" --anchor ANCHOR" if "anchor" in read else "",
     )
 
 

@@ -14,6 +14,7 @@ from samples.graphs import outputs_kept
 from aegis_cli.anchors import anchor_file, measure, moments
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments, merge
@@ -147,9 +148,8 @@ def test_artifact_and_report(
     assert report.out == str(tmp_path / "a.safetensors") and report.sha256 == artifacts.sha256_file(
         report.out
     )
-    assert [(e.done, e.total) for e in events if e.stage == "anchor"] == [
-        (n, 60) for n in (16, 32, 48, 60)
-    ]
+    passes = [e for e in events if e.stage == "anchor" and isinstance(e, Progress)]
+    assert [(e.done, e.total) for e in passes] == [(n, 60) for n in (16, 32, 48, 60)]
 
 
 def held(found: Anchor) -> list[str]:
@@ -174,6 +174,25 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     assert all(n is not None and n > 0 for n in of_moments) == (part == "moments")
     assert part == "moments" or of_moments == (None, None, None)
     assert (report.entropy is None) == (part != "curvature")
+
+
+@pytest.mark.parametrize(
+    ("samples", "parts", "warns"),
+    [
+        (4, ("moments",), "moments need at least 30"),
+        (30, ("moments",), ""),
+        (299, ("moments", "inputs"), "inputs need at least 300"),
+        (300, ("moments", "inputs"), ""),
+    ],
+)
+def test_an_anchor_of_few_samples_is_warned_of(
+    samples: int, parts: tuple[str, ...], warns: str, tiny_folder: Path, tmp_path: Path
+) -> None:
+    seen: list[Event] = []
+    settings = Settings(samples=samples, parts=parts)
+    measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=seen.append)
+    said = [event.text for event in seen if isinstance(event, Warned)]
+    assert len(said) == bool(warns) and all(warns in text for text in said)
 
 
 @pytest.mark.parametrize("part", ["curvature", "fisher"])

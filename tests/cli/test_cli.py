@@ -470,6 +470,42 @@ def test_a_full_disk_loses_no_report_without_a_word(
     assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"_AEGIS_COMPLETE": "source_bash"},
+        {"_AEGIS_COMPLETE": "complete_bash", "COMP_WORDS": "aegis tr", "COMP_CWORD": "1"},
+    ],
+)
+@pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), ("| true", 141)])
+def test_a_completion_that_cannot_be_written_ends_without_a_traceback(
+    asked: dict[str, str], output: str, code: int, tmp_path: Path
+):
+    program = "from aegis_cli.cli.app import main; main()"
+    command = f"'{sys.executable}' -c '{program}' {output}"
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(
+        shell, cwd=tmp_path, env=buffered() | asked, capture_output=True, text=True
+    )
+    assert done.returncode == code and "Traceback" not in done.stderr
+    assert ("No space left on device" in done.stderr) is (code == 2)
+
+
+def test_a_process_of_many_commands_wraps_its_output_once() -> None:
+    def full(*_: str) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    stream: Any = types.SimpleNamespace(write=full, flush=full)
+    render.name_errors(stream, "standard output")
+    wrapped = stream.write, stream.flush
+    render.name_errors(stream, "standard output")
+    assert (stream.write, stream.flush) == wrapped
+    for call in wrapped:
+        with pytest.raises(OSError) as caught:
+            call("x")
+        assert caught.value.filename == "standard output"
+
+
 @pytest.mark.parametrize("words", ["inspect embedded --json", "--help", "train --help"])
 def test_a_gone_reader_ends_gathered_output_alike(words: str, tmp_path: Path):
     command = f"'{sys.executable}' -m aegis_cli {words} | true"

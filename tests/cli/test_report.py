@@ -143,6 +143,31 @@ def _commands(aegis, run: Path) -> list[str]:
     return json.loads(aegis("report", run, "--json")[1])["commands"]
 
 
+def test_an_anchor_that_no_training_read_is_what_the_drift_is_measured_against(
+    aegis, job: Path
+) -> None:
+    naive, read = job / "naive", job / "aegis"
+    page, document = reported(aegis, naive)
+    assert document["anchor"] == {"measured_on": "a file given to aegis probe", "read": False}
+    assert "the drift is measured against it, no training read it" in page.said
+    train, asked, *_ = document["commands"]
+    assert "--anchor" not in train and "--anchor" in asked
+    page, document = reported(aegis, read)
+    assert document["anchor"]["read"] is True and "no training read it" not in page.said
+    assert "--anchor" in document["commands"][0]
+    files.save_json(naive / "train.json", {"method": "naive"})
+    _, document = reported(aegis, naive)
+    assert document["anchor"]["measured_on"] == "3000 questions of scenes"
+
+
+def test_an_anchor_that_nothing_used_is_not_told(aegis, job: Path) -> None:
+    naive = job / "naive"
+    (naive / "probe.json").unlink()
+    page, document = reported(aegis, naive)
+    assert document["anchor"] is None and "Anchor" not in page.said
+    assert not any("--anchor" in command for command in document["commands"])
+
+
 def test_a_page_loads_nothing_and_runs_nothing(aegis, job: Path) -> None:
     (job / "film.gif").write_bytes(b"GIF89a")
     page, _ = reported(aegis, job)

@@ -271,6 +271,38 @@ def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> N
     assert report.drop_points > 1.0 and report.passed is passed
 
 
+@pytest.mark.parametrize("gate", [probe.MEAN, probe.UPPER])
+@pytest.mark.parametrize(
+    ("before", "after", "max_drop", "warns"),
+    [
+        ("11", "11", 1.0, True),
+        ("1" * 2000, "1" * 2000, 1.0, False),
+        ("1" * 40, "1" * 40, 5.0, True),
+        ("1" * 40, "1" * 40, 20.0, False),
+        ("1" * 40, "0" * 40, 5.0, False),  # far past the gate
+        ("1" * 40, "1" * 40, 0.0, False),  # no number of questions would do
+        ("1" * 40, "1" * 40, None, False),
+    ],
+)
+def test_a_gate_that_the_questions_cannot_tell_is_warned_of(
+    before: str, after: str, max_drop: float | None, warns: bool, gate: str
+) -> None:
+    report = probe.compare(graded(after), graded(before), [], max_drop, gate=gate)
+    seen: list[Event] = []
+    probe.warn_of_few_questions(report, max_drop, seen.append)
+    assert bool(seen) is warns
+    if seen:
+        (warned,) = seen
+        assert isinstance(warned, Warned) and f"{len(before)} questions" in warned.text
+
+
+def test_a_gate_of_two_questions_is_warned_of(taught: Path) -> None:
+    seen: list[Event] = []
+    probe.run(str(taught), "scenes", 2, str(taught), None, 1.0, on_event=seen.append)
+    said = [event.text for event in seen if isinstance(event, Warned)]
+    assert any("2 questions tell the drop to ±65.76 points" in text for text in said)
+
+
 def test_a_gain_passes_any_gate() -> None:
     report = probe.compare(graded("11"), graded("01"), [], 0.0)
     assert report.drop_points == -50 and report.passed is True
@@ -410,6 +442,26 @@ def test_a_run_is_asked_the_questions_that_its_recipe_names(
     assert kept == ["probe-set.jsonl.json"]  # the last checkpoint is the run
     code, text, _ = aegis("probe", run, "--vqa", "scenes", "--questions", 8, "--json")
     assert code == 0 and json.loads(text)["questions"] == 8
+
+
+def test_a_run_is_held_to_the_gate_of_its_recipe_on_the_questions_that_it_names(
+    aegis, taught: Path, broken: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = recipe(broken)
+    settings = replace(settings, probe=replace(settings.probe, max_drop=0.0))
+    run = tmp_path / "run"
+    train.run(settings, "stop-gradient", demos_file, None, run)
+    given = ("probe", run, "--questions", 40, "--json")
+    code, text, err = aegis(*given)
+    assert code == 0 and f"the baseline is '{broken}'" in err
+    assert json.loads(text)["passed"] is True
+    worse = ("--baseline", taught)
+    code, text, err = aegis(*given, *worse)
+    assert code == 1 and "more than the recipe's probe.max_drop 0" in err
+    assert aegis(*given, *worse, "--max-drop", 100)[0] == 0
+    other = write_jsonl(tmp_path, 24)
+    code, text, _ = aegis(*given, "--vqa", other)
+    assert code == 0 and json.loads(text)["passed"] is None
 
 
 def test_predictions_do_not_replace_a_runs_own_files(

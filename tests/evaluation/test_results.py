@@ -40,6 +40,49 @@ def test_a_later_one_replaces_it_and_leaves_that_of_aegis_run(run: Path) -> None
     assert (run / "rollout-seen.json").read_bytes() == before
 
 
+def probe_of(drop: float | None, passed: bool | None = None, drift: bool = False):
+    """A probe that tells its drop, its gate's verdict and its drift, or not."""
+    layers = [{"layer": "layers.0", "w2": 12.5}] if drift else []
+    return probe("shape") | {"drop_points": drop, "passed": passed, "layers": layers}
+
+
+def test_a_probe_without_a_drop_is_kept_beside_an_earlier_gate_which_comes_first(run: Path) -> None:
+    told: list[Event] = []
+    results.keep_if_possible(run, "probe-scenes", probe_of(2.0, passed=False), {}, told.append)
+    assert not told
+    results.keep_if_possible(run, "probe-scenes", probe_of(None), {}, told.append)
+    _, first, second = results.probes(run)
+    assert (first.name, first.figures["drop_points"]) == ("probe-scenes", 2.0)
+    assert (second.name, second.figures["drop_points"]) == ("probe-scenes-with-accuracy", None)
+    assert results.gate([first, second], None) is False
+    (warned,) = told
+    assert isinstance(warned, Warned) and "which also tells the drop and the gate" in warned.text
+
+
+def test_probes_that_each_tell_what_the_other_does_not_are_both_kept(run: Path) -> None:
+    results.keep(run, "probe-scenes", probe_of(2.0, passed=True), {})
+    results.keep(run, "probe-scenes", probe_of(2.0, drift=True), {})
+    names = [found.name for found in results.probes(run)]
+    assert names == ["probe", "probe-scenes", "probe-scenes-with-drop-drift"]
+
+
+def test_a_probe_replaces_all_that_tell_no_more(run: Path) -> None:
+    for found in (probe_of(None), probe_of(2.0, passed=True), probe_of(3.0), probe_of(None)):
+        results.keep(run, "probe-scenes", found, {})
+    assert len(results.probes(run)) == 4
+    results.keep(run, "probe-scenes", probe_of(5.0, passed=False, drift=True), {})
+    assert [found.figures["drop_points"] for found in results.probes(run)[1:]] == [5.0]
+
+
+def test_a_probe_of_an_earlier_checkpoint_is_replaced_whatever_it_told(run: Path) -> None:
+    results.keep(run, "probe-scenes", probe_of(2.0, passed=True), {})
+    link = run / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to(checkpoint_at(run, 9).name)
+    path = results.keep(run, "probe-scenes", probe_of(None), {})
+    assert path is not None and path.name == "probe-scenes.json"
+
+
 def checkpoint_at(run: Path, step: int) -> Path:
     at = run / "checkpoints" / f"{step:06d}"
     (at / "backbone").mkdir(parents=True)
@@ -119,6 +162,17 @@ def test_errors_on_held_out_episodes_come_first_and_only_those_of_the_last_check
 )
 def test_it_is_said_which_episodes_an_error_is_of(changes: dict[str, object], said: str) -> None:
     assert results.evaluated_on({**open_loop(1, 2), **changes}) == said
+
+
+def test_paths_that_are_not_utf8_are_kept_and_read_back(run: Path) -> None:
+    name = os.fsdecode(b"caf\xe9")
+    for place, drop in (("home", 0), ("kitchen", 1), ("home", 2)):
+        settings = {"path": f"/{place}/{name}"}
+        results.keep(run, "probe-x", probe("shape", drop) | {"w2_between": name}, settings)
+    results.keep(run, "rollout-seen", rollout("seen", 0.5) | {"video": f"{name}.gif"}, {})
+    kept = {r.settings["path"]: r.figures["drop_points"] for r in results.probes(run)[1:]}
+    assert kept == {"/home/caf\\udce9": 30.0, "/kitchen/caf\\udce9": 20.0}
+    assert "caf\\udce9.gif" in [played.figures["video"] for played in results.rollouts(run)]
 
 
 @pytest.mark.parametrize("name", ["probe-okvqa_validation.jsonl", "probe-questions-validation"])

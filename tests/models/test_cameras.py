@@ -19,17 +19,19 @@ from samples.small_run import recipe as small
 from samples.training_runs import assert_same_run
 
 from aegis_cli import load_policy
+from aegis_cli.anchors import measure
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import dataset, source
 from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.recipes import Anchor, Demos, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import checkpoint, train
+from aegis_cli.training import assemble, checkpoint, train
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -250,6 +252,48 @@ def test_a_resumed_run_ends_in_the_same_bytes(
         train.run(turned, *given[1:], resume=True)
     train.run(*given, resume=True)
     assert_same_run(run, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("camera", "warns"),
+    [(BOTH, False), (BOTH[::-1], True), ("top", True)],
+)
+def test_an_anchor_of_other_cameras_frames_is_warned_of(
+    camera: str | tuple[str, ...], warns: bool, folder: Path, hf_folder: Made, tmp_path: Path
+) -> None:
+    model, anchor = hf_folder("smolvlm"), tmp_path / "anchor.safetensors"
+    frames = Anchor(samples=30, source="demos", parts=("moments",))
+    measure.run(str(model), frames, anchor, demos=folder, selection=Selection(camera))
+    told: list[Event] = []
+    given = (settings(model, folder, steps=1), "aegis", folder, anchor, tmp_path / "run")
+    train.run(*given, on_event=told.append)
+    said = [event.text for event in told if isinstance(event, Warned)]
+    asked = f"--demos {folder} --camera {FULL[0]} --camera {FULL[1]}"
+    assert len(said) == warns and all(asked in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("meta", "shown", "warns"),
+    [
+        ({"vqa": "scenes"}, FULL, False),  # a question has one image
+        ({"demos": "d"}, FULL, True),
+        ({"demos": "d"}, FULL[:1], False),
+        ({"demos": "d"}, (), False),
+        ({"demos": "d", "cameras": list(FULL)}, (), True),
+        ({"demos": "d", "cameras": [FULL[0]]}, (), False),
+        ({"demos": "d", "cameras": [FULL[0]]}, FULL[1:], True),
+    ],
+)
+def test_of_one_camera_that_nobody_has_named_nothing_is_said(
+    meta: dict[str, Any], shown: tuple[str, ...], warns: bool, tmp_path: Path
+) -> None:
+    anchor = tmp_path / "anchor.safetensors"
+    names = [f"layers.0.{of}.{what}" for of in ("image", "text") for what in ("mean", "var")]
+    moments = {name: torch.ones(3, dtype=torch.float64) for name in names}
+    artifacts.save(anchor, "anchor", moments | {"count": torch.tensor([5, 5])}, meta=meta)
+    told: list[Event] = []
+    assemble._warn_of_other_cameras(anchor, Path("demos"), shown, told.append)
+    assert bool(told) is warns
 
 
 def test_through_the_command_line(

@@ -210,6 +210,20 @@ def test_a_broken_sensor_is_refused_at_every_call(
     assert torch.isfinite(begun.select_action(seen())).all()
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_picture_that_is_not_finite_is_refused_at_every_call(value: float, plugin: Any) -> None:
+    broken = seen()
+    broken[IMAGE][0, 1, 5] = value
+    fresh, begun = acting(plugin), acting(plugin)
+    begun.select_action(seen())
+    for policy in (fresh, begun):
+        for act in (policy.select_action, policy.predict_action_chunk):
+            with pytest.raises(AegisError, match=f"picture {IMAGE} with 40 values.* not finite"):
+                act(broken)
+    as_bytes = torch.zeros(1, 3, 30, 40, dtype=torch.uint8)
+    assert torch.isfinite(fresh.select_action(seen() | {IMAGE: as_bytes})).all()
+
+
 def test_a_batch_without_a_state_is_refused(plugin: Any) -> None:
     batch = seen()
     del batch["observation.state"]

@@ -244,6 +244,21 @@ def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_wher
     assert both[both.index(lines[0]) - 1] == "" and lines[lines.index(line) + 1] == ""
 
 
+@pytest.mark.parametrize(("method", "reads"), [("naive", False), ("nullspace", True)])
+def test_a_card_names_an_anchor_only_where_the_weights_came_about_with_it(
+    method: str,
+    reads: bool,
+    recipe: recipes.Recipe,
+    demos_file: Path,
+    anchor_file: Path,
+    tmp_path: Path,
+) -> None:
+    train.run(recipe, method, demos_file, anchor_file, tmp_path / "run")
+    at, stored = checkpoint.last(tmp_path / "run"), card.Stored("float32", rounded=False)
+    said = card.text(tmp_path / "run", at, card.AEGIS, REPO, stored)
+    assert ("\n- anchor: " in said) is reads and "\n- demos: " in said
+
+
 def test_equal_runs_have_equal_cards(run_folder: Path) -> None:
     at, stored = checkpoint.last(run_folder), card.Stored("float32", rounded=False)
     one, other = (card.text(run_folder, at, card.LEROBOT, REPO, stored) for _ in range(2))

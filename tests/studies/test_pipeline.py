@@ -625,13 +625,14 @@ def test_an_anchor_of_answers_that_the_backbone_is_sure_of_is_warned_of(tmp_path
     events: list[Event] = []
     runner = policy_cells.PolicyRunner(tmp_path, events.append)
     runner.anchor(replace(recipe("embedded-easy", ("kfac",)), anchor=settings))
-    (warned,) = [event for event in events if isinstance(event, Warned)]
-    assert "anchor.temperature 4" in warned.text
+    said = [event.text for event in events if isinstance(event, Warned)]
+    assert any("anchor.temperature 4" in text for text in said)
 
 
 def test_a_method_that_ends_shows_its_figures(small: Recipe, tmp_path: Path) -> None:
-    events: list[Progress] = []
-    report = pipeline.run(small, tmp_path, events.append)
+    told: list[Event] = []
+    report = pipeline.run(small, tmp_path, told.append)
+    events = [event for event in told if isinstance(event, Progress)]
     ended = {e.stage: e.metrics for e in events if e.unit == "method" and e.done}
     assert list(ended) == list(small.methods)
     for row in report.rows:

@@ -64,7 +64,7 @@ def _run(found: At, report: Any) -> tuple[str, list[Child]]:
     lead += f"{_steps(found)} steps, seed {found['facts']['seed']}."
     parts = [
         _header("Run", title, lead, runs.at_a_glance(found)),
-        _trained(found),
+        _trained(found, _anchor([found])),
         *_measured([found]),
         about.videos(found["videos"], Path(report.path)),
         about.commands(found),
@@ -87,16 +87,27 @@ def _demonstrations(recipe: At) -> str:
     return " and ".join(map(str, given)) if isinstance(given.value, list) else str(given)
 
 
-def _trained(run: At) -> Markup:
+def _anchor(runs: Sequence[At]) -> str | None:
+    """What the anchor was and whether a training read it; None without an anchor."""
+    used = sorted(
+        (run["anchor"] for run in runs if run["anchor"]), key=lambda a: not a["read"].value
+    )
+    if not used:
+        return None
+    drift = (
+        "" if used[0]["read"].value else "; the drift is measured against it, no training read it"
+    )
+    return f"{used[0]['measured_on']}{drift}"
+
+
+def _trained(run: At, anchor: str | None) -> Markup:
     """What was trained on what, in a few words."""
     recipe, train = run["recipe"], run["recipe"]["train"]
-    anchor = recipe["anchor"]
-    read = "robot frames" if anchor["source"].value == "demos" else f"questions of {anchor['vqa']}"
     shown = [
         ("Backbone", run["backbone"]),
         ("Demonstrations", _demonstrations(recipe) or f"{recipe['demos']['episodes']} episodes"),
         *_weights(recipe),
-        ("Anchor", f"{anchor['samples']} {read}"),
+        *([("Anchor", anchor)] if anchor else []),
         ("Steps", f"{_steps(run)}, of {train['batch_size']} frames each"),
         ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
         ("Precision", train["precision"]),
@@ -152,7 +163,7 @@ def _job(found: At, report: Any) -> tuple[str, list[Child]]:
     lead += f"{_steps(first)} steps each."
     parts = [
         _header("Job", title, [lead, " ", _verdict(compared)]),
-        _trained(first),
+        _trained(first, _anchor(own)),
         _comparison(found, own),
         *_measured(own),
         about.videos(found["videos"], Path(report.path)),

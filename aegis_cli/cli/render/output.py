@@ -132,20 +132,29 @@ def _plainly(error: UnicodeError) -> tuple[str, int]:
 
 
 def name_errors(stream: TextIO, name: str) -> None:
-    """Let the errors of writing to a stream name it: the system has no path of it to tell."""
+    """Let the errors of writing to a stream name it: the system has no path of it to tell.
+
+    To do so again changes nothing, so that one process may run many commands.
+    """
     for method in ("write", "flush"):
-        setattr(stream, method, _naming(getattr(stream, method), name))
+        call = getattr(stream, method)
+        if not isinstance(call, _Naming):
+            setattr(stream, method, _Naming(call, name))
 
 
-def _naming(call: Callable[..., Any], name: str) -> Callable[..., Any]:
-    def naming(*args: Any) -> Any:
+@dataclasses.dataclass(frozen=True)
+class _Naming:
+    """A call whose errors name the stream that it is of."""
+
+    call: Callable[..., Any]
+    name: str
+
+    def __call__(self, *args: Any) -> Any:
         try:
-            return call(*args)
+            return self.call(*args)
         except OSError as error:
-            error.filename = name
+            error.filename = self.name
             raise
-
-    return naming
 
 
 class Terminal(Console):

@@ -92,11 +92,15 @@ class AegisPolicy(PreTrainedPolicy):
         Other texts than those of the chunk predict at once, and drop what is left of it.
 
         Raises:
-            AegisError: what `predict_action_chunk` finds wrong with texts and state, at each call:
-                a robot whose sensor fails does not move on by an older prediction.
+            AegisError: what `predict_action_chunk` finds wrong with texts and state, or a picture
+                that is not finite, at each call: a robot whose sensor fails does not move on by an
+                older prediction.
         """
         texts = _texts(batch)
         self._state(batch, len(texts))
+        for name in self._cameras:
+            if name in batch:
+                _check_picture(name, batch[name])
         if texts != self._follow:
             self._ahead.clear()
         if not self._ahead:
@@ -306,9 +310,14 @@ class AegisPolicy(PreTrainedPolicy):
         return list(zip(*pictures, strict=True))
 
     def _pictures(self, batch: Mapping[str, Any], name: str) -> list[Tensor]:
-        """B pictures [H, W, 3] uint8 of one camera, in the size that training showed."""
+        """B pictures [H, W, 3] uint8 of one camera, in the size that training showed.
+
+        Raises:
+            AegisError: numbers that are not finite, of which no byte could be made.
+        """
         found = batch[name]
         if found.is_floating_point():
+            _check_picture(name, found)
             found = (found * 255).round().clamp(0, 255).to(torch.uint8)
         rows = found.permute(0, 2, 3, 1).cpu().contiguous()
         side = self.model.backbone.image_size
@@ -317,6 +326,16 @@ class AegisPolicy(PreTrainedPolicy):
             return list(rows)
         fitted = [fit(row.numpy(), *size) for row in rows]
         return [torch.from_numpy(np.ascontiguousarray(row)) for row in fitted]
+
+
+def _check_picture(name: str, found: Tensor) -> None:
+    """Raise AegisError for a picture of numbers that are not finite: no byte is made of them."""
+    if bad := int((~found.isfinite()).sum()):
+        raise AegisError(
+            f"a picture {name} with {bad:,} values that are not finite",
+            "numbers from 0 to 1",
+            "see whether the camera has given a frame",
+        )
 
 
 def _texts(batch: Mapping[str, Any]) -> list[str]:

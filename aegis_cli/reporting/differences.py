@@ -1,0 +1,64 @@
+"""In what the runs of a comparison differ beside their methods: their figures mean less then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from aegis_cli.common import artifacts
+from aegis_cli.evaluation import results
+from aegis_cli.evaluation.results import Result
+
+Value = str | int | None
+_DIGITS = 12  # of a digest, which tell two files apart
+
+
+def of_run(path: Path, steps: int | None, asked: tuple[str, Result] | None) -> dict[str, Value]:
+    """What has to be alike for two runs to differ in their methods alone, by its name.
+
+    Args:
+        asked: the question set whose figures are compared, and its probe; None without any.
+    """
+    recipe = results.recipe_of(path)
+    inputs = artifacts.read_header(path / "ledger.safetensors").inputs
+    return {
+        "backbone": inputs.get("backbone", "")[:_DIGITS] or None,
+        "demonstrations": inputs.get("demos", "")[:_DIGITS] or None,
+        "seed": recipe.seed,
+        "steps": steps,
+        "batch size": recipe.train.batch_size,
+        "questions": None if asked is None else _questions(path, *asked),
+    }
+
+
+def _questions(path: Path, vqa: str, probed: Result) -> str:
+    """Which questions a probe asked, and how, as its run's recipe or its settings say."""
+    own = results.recipe_of(path).probe
+    words = [f"{probed.figures.get('questions', 0):,} of {vqa}"]
+    if (seed := probed.settings.get("seed", own.seed)) != 0:
+        words.append(f"seed {seed}")
+    if (ask := probed.settings.get("ask", own.ask)) != "{}":
+        words.append(f"asked as '{ask}'")
+    return ", ".join(words)
+
+
+def between(facts: Sequence[dict[str, Value]]) -> dict[str, list[Value]]:
+    """Each fact in which runs differ, with its value for every run.
+
+    A run of which one is not known differs from no other in it.
+    """
+    found = {}
+    for name in facts[0] if facts else ():
+        values = [own[name] for own in facts]
+        if len({value for value in values if value is not None}) > 1:
+            found[name] = values
+    return found
+
+
+def said(found: dict[str, list[Value]]) -> str:
+    """The differences in words; digests tell a reader nothing."""
+    words = []
+    for name, values in found.items():
+        listed = "; ".join("-" if value is None else str(value) for value in values)
+        words.append(name if name in ("backbone", "demonstrations") else f"{name} ({listed})")
+    return ", ".join(words)

@@ -1,0 +1,22 @@
+"""The card of a checkpoint's backbone: it names what the weights came about with, and no more."""
+
+from __future__ import annotations
+
+import pytest
+
+from aegis_cli import methods
+from aegis_cli.core.ledger import Ledger
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import card
+
+INPUTS = {"demos": "d" * 64, "backbone": "b" * 64, "anchor": "a" * 64}
+
+
+@pytest.mark.parametrize(
+    ("name", "reads"), [("naive", False), ("stop-gradient", False), ("ewc", True)]
+)
+def test_an_anchor_is_named_where_the_method_reads_one(name: str, reads: bool) -> None:
+    method, data = methods.get(name), card.Data("reach", (), 90, 10)
+    said = card.text(Recipe("x"), method, 3, data, INPUTS, Ledger(["layers.0"], ["layers.0"]))
+    assert ("- anchor: `aaa" in said) is reads and ("--anchor ANCHOR" in said) is reads
+    assert "- demos: `ddd" in said
