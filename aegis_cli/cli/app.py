@@ -783,7 +783,8 @@ def rollout(
     A folder that aegis export wrote, or LeRobot trained on, is taken like a run. The result is also
     written into a run's folder, below results.
 
-    A suite task is measured by its return. The success in each task of a set is shown too.
+    A suite task is measured by its return. The success in each task of a set, by the target's
+    colour and by instruction is shown too.
 
     \b
     Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
@@ -844,9 +845,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions and by steps ahead, relative to that of the training's
-    mean action, and beside that of the current position where actions are positions. The run keeps
-    the figures.
+    is given by dimension of the actions, by steps ahead and by instruction, relative to that of the
+    training's mean action, and beside that of the current position where actions are positions. The
+    run keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png

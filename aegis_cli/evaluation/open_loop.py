@@ -76,6 +76,21 @@ class StepError:
     hold_error: float | None
 
 
+@dataclass(frozen=True)
+class InstructionError:
+    """The error at the frames of one instruction, over all dimensions and steps of their chunks.
+
+    `relative_interval` is by Student's t over the episodes; None of a single one.
+    """
+
+    instruction: str
+    episodes: int
+    frames: int
+    relative_error: float | None
+    relative_interval: tuple[float, float] | None
+    hold_error: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """An episode as a plot shows it; `predicted` [T, A] is new every `replan` frames."""
@@ -100,6 +115,7 @@ class OpenLoopReport:
             the dimensions that varied there; 1 is the error of always predicting their mean.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
         hold_error: the same of repeating the current position, where actions are positions.
+        instructions: the same of each instruction that the frames have, the worst first.
         traces: what a plot shows; empty unless asked for.
     """
 
@@ -115,6 +131,7 @@ class OpenLoopReport:
     hold_error: float | None
     dimensions: list[DimensionError]
     horizon: list[StepError]
+    instructions: list[InstructionError] = dataclasses.field(default_factory=list)
     traces: list[Trace] = dataclasses.field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
@@ -124,7 +141,7 @@ class OpenLoopReport:
         return found
 
     def kept(self) -> dict[str, Any]:
-        """What a run keeps of it: the figures of all dimensions and steps together."""
+        """What a run keeps of it: figures of all dimensions and steps, and of each instruction."""
         found = self.to_json()
         return {name: value for name, value in found.items() if name not in _BY_PART}
 
@@ -455,6 +472,7 @@ def compare(
         hold_error=_mean(held, valid),
         dimensions=_dimensions(shown, recorded, error, hold, valid, spread),
         horizon=_horizon(relative, held, valid),
+        instructions=_instructions(shown, at, relative, held, valid),
     )
 
 
@@ -560,3 +578,36 @@ def _horizon(
             hold = None if held is None else float(held[rows, h].mean())
             found.append(StepError(h + 1, int(rows.sum()), own, hold))
     return found
+
+
+def _instructions(
+    shown: Demonstrations,
+    at: torch.Tensor,
+    relative: np.ndarray | None,
+    held: np.ndarray | None,
+    valid: np.ndarray,
+) -> list[InstructionError]:
+    """One entry per instruction, the worst first; a chunk counts for that of its first frame."""
+    rows_of: dict[str, list[int]] = {}
+    # A dataset may list one text as two tasks, so the text tells instructions apart.
+    for row, number in enumerate(shown.instruction_of[at].tolist()):
+        rows_of.setdefault(shown.instructions[number], []).append(row)
+    found = []
+    for text, rows in rows_of.items():
+        own = valid[rows]
+        episode_of = shown.episode_of[at[rows]].numpy()
+        interval = None
+        if relative is not None:
+            of_steps = np.broadcast_to(episode_of[:, None], own.shape)[own]
+            interval = _interval(relative[rows][own], of_steps)
+        found.append(
+            InstructionError(
+                instruction=text,
+                episodes=len(set(episode_of.tolist())),
+                frames=len(rows),
+                relative_error=_mean(None if relative is None else relative[rows], own),
+                relative_interval=interval,
+                hold_error=_mean(None if held is None else held[rows], own),
+            )
+        )
+    return sorted(found, key=lambda one: one.relative_error or 0.0, reverse=True)
