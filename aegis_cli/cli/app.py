@@ -35,6 +35,7 @@ from aegis_cli.cli.options import (
     OwnAsk,
     OwnBatchSize,
     OwnVqa,
+    PolicyArg,
     PolicyFormat,
     Precision,
     RecipeAction,
@@ -575,7 +576,8 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, 'embedded', or a policy's "
+            "or model's id on the hub.",
         ),
     ],
     vqa: OwnVqa = None,
@@ -760,9 +762,7 @@ def report(
 
 @app.command(short_help="Let a trained policy act, and count its successes.")
 def rollout(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     task: Annotated[
         str | None, Option(help=f"Task: {TASK.expected}; default: the run's task.")
     ] = None,
@@ -807,12 +807,7 @@ def rollout(
 
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
-    run: Annotated[
-        Path,
-        Argument(
-            metavar="RUN", help="A run's folder, one of its checkpoints', or an exported policy's."
-        ),
-    ],
+    run: PolicyArg,
     demos: Annotated[
         Path,
         Option(
@@ -885,9 +880,7 @@ def _warn_of(report: Any) -> None:
 
 @app.command(short_help="Let other programs ask a trained policy.")
 def serve(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     host: Annotated[
         str, Option(help="Address to listen at; 0.0.0.0 lets every machine connect.")
     ] = "127.0.0.1",
@@ -914,6 +907,7 @@ def serve(
     \b
     Example: aegis serve runs/x
     Example: aegis serve runs/x --port 8001 --prompt 'pick up the cup'
+    Example: aegis serve your-name/reach-aegis
     """
     from aegis_cli import serving
 
@@ -930,9 +924,7 @@ def serve(
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")
 def export(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
     form: Annotated[
         PolicyFormat,

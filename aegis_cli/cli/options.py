@@ -293,4 +293,12 @@ OwnBatchSize = Annotated[
     int | None,
     Option(help=f"{_SAMPLES}; default: a run's own probe.batch_size, else 64.", callback=positive),
 ]
+PolicyArg = Annotated[
+    Path,
+    Argument(
+        metavar="RUN",
+        help="A run's folder, one of its checkpoints', an exported policy's, or a policy's id on "
+        "the hub.",
+    ),
+]
 AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

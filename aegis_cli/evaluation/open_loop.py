@@ -27,7 +27,7 @@ from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
-from aegis_cli.models import lerobot_folder
+from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
 
@@ -160,7 +160,8 @@ def run(
     """Compare a run's predictions with demonstrations, frame by frame.
 
     Args:
-        run: the run of one policy, one of its checkpoints, or a folder in LeRobot's layout.
+        run: the run of one policy, one of its checkpoints, an exported policy, or the id of a
+            policy on the hub.
         data: demonstrations, a file or a LeRobot folder.
         episodes: numbers from 0; None: the run's validation episodes where it was trained on this
             data, else all.
@@ -229,8 +230,12 @@ class _Source:
     """A checkpoint, and what is known of its training.
 
     Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digest` either.
+
+    Attributes:
+        name: what the checkpoint is called in an error.
     """
 
+    name: str
     checkpoint: Path
     recipe: recipes.Recipe | None
     digest: str | None
@@ -243,13 +248,14 @@ class _Source:
                 "the run of one policy",
                 "evaluate a run that aegis train wrote from a recipe of kind policy",
             )
+        name, run = str(run), download.locate(run)
         if lerobot_folder.is_policy(run):
-            return cls(run, None, None)
+            return cls(name, run, None, None)
         chosen = checkpoint.chosen(run)
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
-        return cls(chosen, recipe, header.inputs.get("demos"))
+        return cls(name, chosen, recipe, header.inputs.get("demos"))
 
     def selection(self, meta: Mapping[str, Any], data: Path) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -294,7 +300,7 @@ class _Source:
             if asked is not None:
                 return CHOSEN, _existing(asked, count, data), []
             raise AegisError(
-                f"'{self.checkpoint}', a checkpoint outside its run, which was trained on '{data}'",
+                f"'{self.name}', a checkpoint outside its run, which was trained on '{data}'",
                 "the run, whose recipe says which episodes were held out",
                 "give the run's folder, choose the episodes (--episodes 6,7), or give "
                 "demonstrations that it was not trained on",
