@@ -10,14 +10,23 @@ import os
 import sys
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, stages
-from aegis_cli.cli.exits import Commands
+from aegis_cli.cli import (
+    advice,
+    inspecting,
+    question_sets,
+    render,
+    reporting,
+    resuming,
+    stages,
+)
+from aegis_cli.cli.exits import GOES_ON, Commands
 from aegis_cli.cli.options import (
     AnchorIn,
     Ask,
@@ -40,6 +49,7 @@ from aegis_cli.cli.options import (
     Precision,
     RecipeAction,
     RecipeArg,
+    RecipeOrRunArg,
     Resume,
     Set,
     SkipBad,
@@ -313,8 +323,12 @@ def anchor(
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
 def train(
-    recipe: RecipeArg,
-    out: Annotated[Path, Option(metavar="FOLDER", help="Run folder to write.")],
+    ctx: typer.Context,
+    recipe: RecipeOrRunArg,
+    out: Annotated[
+        Path | None,
+        Option(metavar="FOLDER", help="Run folder to write; none for a run, which has its own."),
+    ] = None,
     demos: Annotated[
         Path | None,
         Option(
@@ -354,22 +368,36 @@ def train(
     Example: aegis train reach --method aegis --demos reach.safetensors \\
                  --anchor anchor.safetensors --out runs/x
     Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
+    Example: aegis train runs/x
     """
     if resume and overwrite:
         raise AegisError("--resume with --overwrite", "one of them", "leave one out")
+    run = recipe if recipe.is_dir() else None
+    if run is not None:
+        recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
+    if out is None:
+        fix = f"aegis train {recipe} --out runs/NAME"
+        raise AegisError("no --out", "a folder for the run", fix)
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
+    if run is not None and isinstance(resolved, Recipe):
+        demos, anchor = resuming.inputs_of(run, resolved, demos, anchor)
+    as_they_are = [] if device is None else ["--device", device]
+    as_they_are += ["--json"] if as_json else []
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )
         return
     demos, resolved = _learned_from(resolved, recipe, demos)
     advice.of_training(resolved, anchor)
+    if not dry_run:
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, demos, anchor, as_they_are)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     with stages.joined(device):
         report = stage.run(

@@ -197,6 +197,15 @@ RecipeArg = Annotated[
         callback=recipe_file,
     ),
 ]
+RecipeOrRunArg = Annotated[
+    Path,
+    Argument(
+        metavar="RECIPE_OR_RUN",
+        help="Recipe file, or the name of one that ships, e.g. quickstart; or the folder of a run, "
+        "which goes on by its own recipe, demonstrations and anchor.",
+        callback=recipe_file,
+    ),
+]
 Set = Annotated[
     list[str] | None,
     Option(
