@@ -239,7 +239,8 @@ def load_policy(
     """The policy of a run, on the GPU where there is one.
 
     Args:
-        run: what `aegis train` wrote.
+        run: what `aegis train` or `aegis export` wrote, or the id on the hub of a policy that
+            `aegis push` sent.
         task: which one, if the run is a stream of robot tasks.
         seed: seeds the noise that the flow begins with.
         precision: of matrix products, bf16 or float32; auto is bf16 on a GPU that multiplies in it,

@@ -309,7 +309,7 @@ def test_a_folder_of_runs_names_one_of_them(tmp_path):
 def test_an_unfinished_run_is_named_as_such(tmp_path):
     (save_run(tmp_path / "run") / "ledger.safetensors").unlink()
     assert "no ledger.safetensors" in refusal(tmp_path / "run").found
-    assert "--resume" in refusal(tmp_path / "run").fix
+    assert refusal(tmp_path / "run").fix == f"continue it: aegis train {tmp_path / 'run'}"
 
 
 def test_a_metrics_line_still_being_written_is_left_out_and_a_damaged_one_refused(tmp_path):

@@ -11,14 +11,23 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from aegis_cli.cli import advice, inspecting, question_sets, render, reporting, stages
-from aegis_cli.cli.exits import Commands, ended_by
+from aegis_cli.cli import (
+    advice,
+    inspecting,
+    question_sets,
+    render,
+    reporting,
+    resuming,
+    stages,
+)
+from aegis_cli.cli.exits import GOES_ON, Commands, ended_by
 from aegis_cli.cli.options import (
     AnchorIn,
     Ask,
@@ -36,10 +45,12 @@ from aegis_cli.cli.options import (
     OwnAsk,
     OwnBatchSize,
     OwnVqa,
+    PolicyArg,
     PolicyFormat,
     Precision,
     RecipeAction,
     RecipeArg,
+    RecipeOrRunArg,
     Resume,
     Set,
     SkipBad,
@@ -313,8 +324,12 @@ def anchor(
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
 def train(
-    recipe: RecipeArg,
-    out: Annotated[Path, Option(metavar="FOLDER", help="Run folder to write.")],
+    ctx: typer.Context,
+    recipe: RecipeOrRunArg,
+    out: Annotated[
+        Path | None,
+        Option(metavar="FOLDER", help="Run folder to write; none for a run, which has its own."),
+    ] = None,
     demos: Annotated[
         list[Path] | None,
         Option(
@@ -355,22 +370,36 @@ def train(
     Example: aegis train reach --method aegis --demos reach.safetensors \\
                  --anchor anchor.safetensors --out runs/x
     Example: aegis train recipes/igsp-stream.yaml --method igsp --out runs/y
+    Example: aegis train runs/x
     """
     if resume and overwrite:
         raise AegisError("--resume with --overwrite", "one of them", "leave one out")
+    run = recipe if recipe.is_dir() else None
+    if run is not None:
+        recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
+    if out is None:
+        fix = f"aegis train {recipe} --out runs/NAME"
+        raise AegisError("no --out", "a folder for the run", fix)
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
+    if run is not None and isinstance(resolved, Recipe):
+        demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
+    as_they_are = [] if device is None else ["--device", device]
+    as_they_are += ["--json"] if as_json else []
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )
         return
     paths, resolved = _learned_from(resolved, recipe, demos or [])
     advice.of_training(resolved, anchor)
+    if not dry_run:
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, paths, anchor, as_they_are)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     with stages.joined(device):
         report = stage.run(
@@ -588,7 +617,8 @@ def probe(
         str,
         Argument(
             metavar="RUN_OR_BACKBONE",
-            help="A run's, checkpoint's or exported folder, a backbone, or 'embedded'.",
+            help="A run's, checkpoint's or exported folder, a backbone, 'embedded', or a policy's "
+            "or model's id on the hub.",
         ),
     ],
     vqa: OwnVqa = None,
@@ -777,9 +807,7 @@ def report(
 
 @app.command(short_help="Let a trained policy act, and count its successes.")
 def rollout(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     task: Annotated[
         str | None, Option(help=f"Task: {TASK.expected}; default: the run's task.")
     ] = None,
@@ -800,7 +828,8 @@ def rollout(
     A folder that aegis export wrote, or LeRobot trained on, is taken like a run. The result is also
     written into a run's folder, below results.
 
-    A suite task is measured by its return. The success in each task of a set is shown too.
+    A suite task is measured by its return. The success in each task of a set, by the target's
+    colour and by instruction is shown too.
 
     \b
     Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
@@ -823,12 +852,7 @@ def rollout(
 
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
-    run: Annotated[
-        Path,
-        Argument(
-            metavar="RUN", help="A run's folder, one of its checkpoints', or an exported policy's."
-        ),
-    ],
+    run: PolicyArg,
     demos: Annotated[
         Path,
         Option(
@@ -861,9 +885,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions and by steps ahead, relative to that of the training's
-    mean action, and beside that of the current position where actions are positions. The run keeps
-    the figures.
+    is given by dimension of the actions, by steps ahead and by instruction, relative to that of the
+    training's mean action, and beside that of the current position where actions are positions. The
+    run keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
@@ -901,9 +925,7 @@ def _warn_of(report: Any) -> None:
 
 @app.command(short_help="Let other programs ask a trained policy.")
 def serve(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     host: Annotated[
         str, Option(help="Address to listen at; 0.0.0.0 lets every machine connect.")
     ] = "127.0.0.1",
@@ -930,6 +952,7 @@ def serve(
     \b
     Example: aegis serve runs/x
     Example: aegis serve runs/x --port 8001 --prompt 'pick up the cup'
+    Example: aegis serve your-name/reach-aegis
     """
     from aegis_cli import serving
 
@@ -946,9 +969,7 @@ def serve(
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")
 def export(
-    run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
-    ],
+    run: PolicyArg,
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
     form: Annotated[
         PolicyFormat,

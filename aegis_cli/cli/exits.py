@@ -16,7 +16,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import typer
@@ -31,6 +31,7 @@ _WITH_RESUME = {
     "pretrain": " --resume",
     "run": "",
 }  # `run` skips what is up to date
+GOES_ON = "aegis.goes_on"  # what finds the words by which a run goes on by itself, or None
 
 
 class Commands(TyperGroup):
@@ -69,7 +70,7 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             ended = "interrupted" if number == signal.SIGINT else signal.Signals(number).name
-            _say(render.note, ended + _resume_hint(ctx.meta["aegis.args"]))
+            _say(render.note, ended + _resume_hint(ctx.meta))
             raise typer.Exit(128 + number) from None
         except (typer.Exit, typer.Abort):
             raise
@@ -194,13 +195,27 @@ def _refused(error: OSError) -> AegisError:
     return AegisError(found, "a path that can be used", fix)
 
 
-def _resume_hint(args: list[str]) -> str:
+def _resume_hint(meta: Mapping[str, Any]) -> str:
+    args = meta["aegis.args"]
     flag = _WITH_RESUME.get(args[0])
     if flag is None:
         return ""
+    alone = _alone(meta.get(GOES_ON))
+    if alone is not None:
+        return f"; resume with: {_program()} {shlex.join(alone)}"
     args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
     command = f"{_program()} {shlex.join(args)}" + ("" if flag.strip() in args else flag)
     return f"; resume with: {command}"
+
+
+def _alone(goes_on: Callable[[], list[str] | None] | None) -> list[str] | None:
+    """The words by which a run goes on by what its folder says; None where it does not say all."""
+    if goes_on is None:
+        return None
+    try:
+        return goes_on()
+    except AegisError:  # what lies in the folder is not this run; the same command will say so
+        return None
 
 
 def _program() -> str:

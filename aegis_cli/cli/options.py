@@ -197,6 +197,15 @@ RecipeArg = Annotated[
         callback=recipe_file,
     ),
 ]
+RecipeOrRunArg = Annotated[
+    Path,
+    Argument(
+        metavar="RECIPE_OR_RUN",
+        help="Recipe file, or the name of one that ships, e.g. quickstart; or the folder of a run, "
+        "which goes on by its own recipe, demonstrations and anchor.",
+        callback=recipe_file,
+    ),
+]
 Set = Annotated[
     list[str] | None,
     Option(
@@ -292,5 +301,13 @@ BatchSize = Annotated[int, Option(help=f"{_SAMPLES}.", callback=positive)]
 OwnBatchSize = Annotated[
     int | None,
     Option(help=f"{_SAMPLES}; default: a run's own probe.batch_size, else 64.", callback=positive),
+]
+PolicyArg = Annotated[
+    Path,
+    Argument(
+        metavar="RUN",
+        help="A run's folder, one of its checkpoints', an exported policy's, or a policy's id on "
+        "the hub.",
+    ),
 ]
 AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

@@ -59,7 +59,7 @@ def read(path: Path) -> StreamReport:
         raise AegisError(
             f"{path} has no {REPORT}: the stream is not learned to its end",
             "a finished run of a stream",
-            f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume",
+            f"continue it: aegis train {path}",
         )
     raw = files.load_json(path / REPORT)
     kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport

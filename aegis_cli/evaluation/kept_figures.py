@@ -78,8 +78,8 @@ class ProbeFigures:
 
 
 @dataclass(frozen=True)
-class TaskFigures:
-    """One task of a set in a rollout."""
+class PartFigures:
+    """Some of the episodes of a rollout, as those of one task of a set."""
 
     success: Number | None = None
     interval: Interval = None
@@ -98,7 +98,9 @@ class RolloutFigures:
     outcomes: str | None = None
     wrong_target: Number | None = None
     final_distance_m: Number | None = None
-    tasks: dict[str, TaskFigures] | None = None
+    tasks: dict[str, PartFigures] | None = None
+    target_colors: dict[str, PartFigures] | None = None
+    instructions: dict[str, PartFigures] | None = None
     mean_return: Number | None = None
     return_interval: Interval = None
     return_share: Number | None = None
@@ -106,6 +108,18 @@ class RolloutFigures:
     video: str | None = None
     settings: dict[str, Any] | None = None
     step: int | None = None
+
+
+@dataclass(frozen=True)
+class InstructionFigures:
+    """One instruction of an open-loop evaluation."""
+
+    instruction: str
+    episodes: int
+    frames: int
+    relative_error: Number | None = None
+    relative_interval: Interval = None
+    hold_error: Number | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +134,7 @@ class OpenLoopFigures:
     relative_error: Number | None = None
     relative_interval: Interval = None
     hold_error: Number | None = None
+    instructions: list[InstructionFigures] | None = None
     chunk: int | None = None
     seed: int | None = None
     settings: dict[str, Any] | None = None

@@ -27,7 +27,7 @@ from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
-from aegis_cli.models import lerobot_folder
+from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
 
@@ -76,6 +76,21 @@ class StepError:
     hold_error: float | None
 
 
+@dataclass(frozen=True)
+class InstructionError:
+    """The error at the frames of one instruction, over all dimensions and steps of their chunks.
+
+    `relative_interval` is by Student's t over the episodes; None of a single one.
+    """
+
+    instruction: str
+    episodes: int
+    frames: int
+    relative_error: float | None
+    relative_interval: tuple[float, float] | None
+    hold_error: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """An episode as a plot shows it; `predicted` [T, A] is new every `replan` frames."""
@@ -100,6 +115,7 @@ class OpenLoopReport:
             the dimensions that varied there; 1 is the error of always predicting their mean.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
         hold_error: the same of repeating the current position, where actions are positions.
+        instructions: the same of each instruction that the frames have, the worst first.
         traces: what a plot shows; empty unless asked for.
     """
 
@@ -115,6 +131,7 @@ class OpenLoopReport:
     hold_error: float | None
     dimensions: list[DimensionError]
     horizon: list[StepError]
+    instructions: list[InstructionError] = dataclasses.field(default_factory=list)
     traces: list[Trace] = dataclasses.field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
@@ -124,7 +141,7 @@ class OpenLoopReport:
         return found
 
     def kept(self) -> dict[str, Any]:
-        """What a run keeps of it: the figures of all dimensions and steps together."""
+        """What a run keeps of it: figures of all dimensions and steps, and of each instruction."""
         found = self.to_json()
         return {name: value for name, value in found.items() if name not in _BY_PART}
 
@@ -143,7 +160,8 @@ def run(
     """Compare a run's predictions with demonstrations, frame by frame.
 
     Args:
-        run: the run of one policy, one of its checkpoints, or a folder in LeRobot's layout.
+        run: the run of one policy, one of its checkpoints, an exported policy, or the id of a
+            policy on the hub.
         data: demonstrations, a file or a LeRobot folder.
         episodes: numbers from 0; None: the run's validation episodes where it was trained on this
             data, else all.
@@ -213,8 +231,12 @@ class _Source:
 
     Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digests` of the
     demonstrations either.
+
+    Attributes:
+        name: what the checkpoint is called in an error.
     """
 
+    name: str
     checkpoint: Path
     recipe: recipes.Recipe | None
     digests: frozenset[str]
@@ -227,13 +249,14 @@ class _Source:
                 "the run of one policy",
                 "evaluate a run that aegis train wrote from a recipe of kind policy",
             )
+        name, run = str(run), download.locate(run)
         if lerobot_folder.is_policy(run):
-            return cls(run, None, frozenset())
+            return cls(name, run, None, frozenset())
         chosen = checkpoint.chosen(run)
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
-        return cls(chosen, recipe, mixture.digests(header.inputs))
+        return cls(name, chosen, recipe, mixture.digests(header.inputs))
 
     def selection(self, meta: Mapping[str, Any], data: Path) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -278,7 +301,7 @@ class _Source:
             if asked is not None:
                 return CHOSEN, _existing(asked, count, data), []
             raise AegisError(
-                f"'{self.checkpoint}', a checkpoint outside its run, which was trained on '{data}'",
+                f"'{self.name}', a checkpoint outside its run, which was trained on '{data}'",
                 "the run, whose recipe says which episodes were held out",
                 "give the run's folder, choose the episodes (--episodes 6,7), or give "
                 "demonstrations that it was not trained on",
@@ -456,6 +479,7 @@ def compare(
         hold_error=_mean(held, valid),
         dimensions=_dimensions(shown, recorded, error, hold, valid, spread),
         horizon=_horizon(relative, held, valid),
+        instructions=_instructions(shown, at, relative, held, valid),
     )
 
 
@@ -561,3 +585,36 @@ def _horizon(
             hold = None if held is None else float(held[rows, h].mean())
             found.append(StepError(h + 1, int(rows.sum()), own, hold))
     return found
+
+
+def _instructions(
+    shown: Demonstrations,
+    at: torch.Tensor,
+    relative: np.ndarray | None,
+    held: np.ndarray | None,
+    valid: np.ndarray,
+) -> list[InstructionError]:
+    """One entry per instruction, the worst first; a chunk counts for that of its first frame."""
+    rows_of: dict[str, list[int]] = {}
+    # A dataset may list one text as two tasks, so the text tells instructions apart.
+    for row, number in enumerate(shown.instruction_of[at].tolist()):
+        rows_of.setdefault(shown.instructions[number], []).append(row)
+    found = []
+    for text, rows in rows_of.items():
+        own = valid[rows]
+        episode_of = shown.episode_of[at[rows]].numpy()
+        interval = None
+        if relative is not None:
+            of_steps = np.broadcast_to(episode_of[:, None], own.shape)[own]
+            interval = _interval(relative[rows][own], of_steps)
+        found.append(
+            InstructionError(
+                instruction=text,
+                episodes=len(set(episode_of.tolist())),
+                frames=len(rows),
+                relative_error=_mean(None if relative is None else relative[rows], own),
+                relative_interval=interval,
+                hold_error=_mean(None if held is None else held[rows], own),
+            )
+        )
+    return sorted(found, key=lambda one: one.relative_error or 0.0, reverse=True)

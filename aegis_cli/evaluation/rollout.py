@@ -32,8 +32,8 @@ _MOST = 10_000_000  # episodes
 
 
 @dataclass(frozen=True)
-class TaskSuccess:
-    """What a policy did in one task of a set."""
+class PartSuccess:
+    """What a policy did in some of the episodes."""
 
     success: float
     interval: tuple[float, float]
@@ -45,7 +45,9 @@ class RolloutReport:
     """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
     The distance is the mean at the episodes' ends; only a task with coloured targets has one.
-    `tasks` has the success in each task of a set.
+    `tasks` has the success in each task of a set. Where the episodes differ in them,
+    `target_colors` has that by the target's colour, and `instructions` that by the instruction, in
+    which `{color}` stands for the colour.
 
     `outcomes` has one character per episode, 1 for a success and 0 otherwise.
 
@@ -60,7 +62,9 @@ class RolloutReport:
     outcomes: str | None = None
     wrong_target: float | None = None
     final_distance_m: float | None = None
-    tasks: dict[str, TaskSuccess] | None = None
+    tasks: dict[str, PartSuccess] | None = None
+    target_colors: dict[str, PartSuccess] | None = None
+    instructions: dict[str, PartSuccess] | None = None
     mean_return: float | None = None
     return_interval: tuple[float, float] | None = None
     return_share: float | None = None
@@ -230,13 +234,32 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
         # The tasks take turns; with few episodes, not every one has its turn.
         turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
         found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
+    found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
+    found["instructions"] = _apart(finished, _instruction)
     return found
 
 
-def _success(finished: Sequence[_PlayedEpisode]) -> TaskSuccess:
+def _apart(
+    finished: Sequence[_PlayedEpisode], part_of: Callable[[_PlayedEpisode], str | None]
+) -> dict[str, PartSuccess] | None:
+    """The success in each part of the episodes; None where they are all of one."""
+    parts: dict[str, list[_PlayedEpisode]] = {}
+    for episode in finished:
+        if (name := part_of(episode)) is not None:
+            parts.setdefault(name, []).append(episode)
+    return {name: _success(parts[name]) for name in sorted(parts)} if len(parts) > 1 else None
+
+
+def _instruction(episode: _PlayedEpisode) -> str:
+    """The instruction of an episode, without the colour of its target."""
+    color, said = episode.env.target_color, episode.observation.instruction
+    return said if color is None else said.replace(color, "{color}")
+
+
+def _success(finished: Sequence[_PlayedEpisode]) -> PartSuccess:
     successes = sum(bool(e.last.success) for e in finished)
     interval = wilson_interval(successes, len(finished))
-    return TaskSuccess(successes / len(finished), interval, len(finished))
+    return PartSuccess(successes / len(finished), interval, len(finished))
 
 
 def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:

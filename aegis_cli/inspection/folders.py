@@ -111,7 +111,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     settings = recipes.load(path / "recipe.yaml")
     rows = path / "ledger.safetensors"
     if not rows.is_file():
-        fix = f"continue it: aegis train {path / 'recipe.yaml'} --out {path} --resume ..."
+        fix = f"continue it: aegis train {path}"
         raise AegisError(
             f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix
         )

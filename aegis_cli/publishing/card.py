@@ -63,7 +63,6 @@ By sha256:
 
 _USE = {
     AEGIS: """```sh
-hf download {repo} --local-dir {folder}
 {probe}
 {act}
 ```
@@ -73,13 +72,12 @@ hf download {repo} --local-dir {folder}
 ```python
 from aegis_cli import load_policy
 
-policy = load_policy("{folder}")
+policy = load_policy("{repo}")
 ```""",
     LEROBOT: """LeRobot loads it with {plugins}, Aegis without LeRobot:
 
 ```sh
 {lerobot}
-hf download {repo} --local-dir {folder}
 {probe}
 {act}
 ```""",
@@ -147,23 +145,21 @@ def _use(
     form: str, repo: str, recipe: recipes.Recipe, task: str | None, cameras: Sequence[str] = ()
 ) -> str:
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
-    folder = f"policies/{repo.split('/')[-1]}"
-    act = f"aegis rollout {folder}" if task else f"aegis evaluate {folder} --demos DEMONSTRATIONS"
+    act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
     plugins = ["lerobot_policy_aegis", *(["lerobot_env_aegis"] if task else [])]
     return _USE[form].format(
         repo=repo,
-        folder=folder,
-        probe=_probe_command(folder, recipe),
+        probe=_probe_command(repo, recipe),
         act=act,
         plugins=" and ".join(f"`{name}`" for name in plugins),
         lerobot=_lerobot_command(repo, task, cameras),
     )
 
 
-def _probe_command(folder: str, recipe: Recipe) -> str:
+def _probe_command(repo: str, recipe: Recipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
-    return shlex.join(["aegis", "probe", folder, "--baseline", recipe.backbone, *probe.asking])
+    return shlex.join(["aegis", "probe", repo, "--baseline", recipe.backbone, *probe.asking])
 
 
 def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str:

@@ -21,7 +21,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import check_utf8, hidden, make_folder, write_text
 from aegis_cli.inspection import steps_taken
-from aegis_cli.models import lerobot_folder
+from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import card
@@ -94,6 +94,7 @@ def run(
             "a name for LeRobot",
             "leave --camera out, or give --format lerobot",
         )
+    run = download.locate(run)
     policy, meta = checkpoint.load_policy(run)
     steps, planned = warn_of_steps_left(run, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)

@@ -320,6 +320,14 @@ class Train:
     )
     validate_every: int = key(POSITIVE, 250, doc="Steps between two validation losses.")
     checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
+    keep_checkpoints: int | None = key(
+        POSITIVE,
+        None,
+        shapes=False,
+        doc="How many of the last checkpoints stay, beside the one with the least validation loss; "
+        "others are removed. Null keeps all. A validation loss counts for a checkpoint of the same "
+        "step.",
+    )
     log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
     # They belonged to a figure that is no longer measured.
     leak_every: int = key(POSITIVE, 10, retired=True)

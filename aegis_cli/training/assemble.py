@@ -37,7 +37,14 @@ from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, Train
-from aegis_cli.training import card, checkpoint, eight_bit, optimizers, parallel
+from aegis_cli.training import (
+    card,
+    checkpoint,
+    eight_bit,
+    optimizers,
+    parallel,
+    retention,
+)
 from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
@@ -206,6 +213,10 @@ class TrainingRun:
         if self.temporary not in (None, saved):
             shutil.rmtree(self.temporary, ignore_errors=True)
             self.temporary = None
+        kept = self.recipe.train.keep_checkpoints
+        # That of an interruption goes with the next one, and takes the place of none until then.
+        if kept is not None and not going_on:
+            retention.prune(self.out, steps, kept)
 
 
 def build(

@@ -26,7 +26,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, files, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
@@ -34,7 +34,7 @@ from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.methods.base import Method
-from aegis_cli.models import backbones, lerobot_folder
+from aegis_cli.models import backbones, download, lerobot_folder
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -266,10 +266,16 @@ def last(folder: Path) -> Path:
     if not (path / EXPERT).is_file():
         raise AegisError(
             f"no checkpoint in '{folder}'",
-            "a run folder with checkpoints/last, or the folder of one of its checkpoints",
-            "train one with aegis train … --out RUN",
+            "a run folder with checkpoints/last, the folder of one of its checkpoints, or a "
+            "policy's id on the hub",
+            f"train one with aegis train … --out RUN{_not_asked(folder)}",
         )
     return path
+
+
+def _not_asked(folder: Path) -> str:
+    """What to add to the advice for a folder that may have been meant as an id on the hub."""
+    return "" if Path(folder).exists() else hub.not_asked(str(folder))
 
 
 def chosen(folder: Path) -> Path:
@@ -305,18 +311,22 @@ def step_of(path: Path) -> int:
     return int(name) if name.isdecimal() else int(artifacts.read_header(path / STATE).meta["step"])
 
 
-def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
+def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
     """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
     Its meta holds the task, the method and what else a user has to know.
 
+    Args:
+        folder: such a folder, or the id on the hub of a policy that was pushed.
+
     Raises:
         AegisError: files that are missing, broken, or not of one checkpoint.
     """
-    if lerobot_folder.is_policy(Path(folder)):
-        policy, meta = lerobot_folder.load(Path(folder))
+    folder = download.locate(folder)
+    if lerobot_folder.is_policy(folder):
+        policy, meta = lerobot_folder.load(folder)
         sizes = len(policy.action_scale.mean), len(policy.proprio_scale.mean)
-        with reading_meta(Path(folder) / lerobot_folder.MODEL):
+        with reading_meta(folder / lerobot_folder.MODEL):
             _check_user_meta(meta)
             _check_recorded(meta, *sizes)
         return policy, meta
@@ -329,8 +339,9 @@ def load_policy(folder: Path) -> tuple[Policy, dict[str, Any]]:
 
 def load_expert(folder: str | Path) -> tuple[ActionExpert, dict[str, Any]]:
     """The expert alone of what `load_policy` takes, and the meta."""
-    if lerobot_folder.is_policy(Path(folder)):
-        policy, meta = lerobot_folder.load(Path(folder))
+    folder = download.locate(folder)
+    if lerobot_folder.is_policy(folder):
+        policy, meta = lerobot_folder.load(folder)
         return policy.expert, meta
     return _load_expert(_expert_file(folder))[:2]
 
@@ -341,7 +352,7 @@ def expert_sha256(folder: str | Path) -> str:
 
 
 def _expert_file(folder: str | Path) -> Path:
-    path = Path(folder)
+    path = download.locate(folder)
     return path / lerobot_folder.MODEL if lerobot_folder.is_policy(path) else chosen(path) / EXPERT
 
 

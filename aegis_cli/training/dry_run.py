@@ -30,6 +30,7 @@ from aegis_cli.training import (
     longer,
     optimizers,
     parallel,
+    retention,
     track,
     train,
 )
@@ -68,7 +69,8 @@ class DryRunReport:
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
             gradient serves; None where memory does not suffice to take them.
         hours: of the steps still to be taken, without validation losses and checkpoints.
-        checkpoints, disk_mb: those still to be written, at most; disk_free_mb: where they would be.
+        checkpoints, disk_mb: those still to be written, as many as lie there at one time;
+            disk_free_mb: where they would be.
     """
 
     method: str
@@ -159,7 +161,8 @@ def _planned(
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks))
     parts = _memory(training, held, activations)
     written = [] if overwrite else checkpoint.whole(out)
-    checkpoints = _to_come(recipe, written)
+    to_come, kept = _to_come(recipe, written), recipe.train.keep_checkpoints
+    checkpoints = retention.most_at_once(to_come, len(written), kept)
     disk = checkpoints * _checkpoint_bytes(training)
     # What is free changes meanwhile: all report what the first, which writes, has seen.
     room = ranks.agree(_free_disk(out))
@@ -298,7 +301,7 @@ def shortage(report: DryRunReport) -> str | None:
         missing.append(
             f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
             f"{report.disk_free_mb:,.0f} MB are free: free some, choose another --out, or set "
-            "train.checkpoint_every higher"
+            "train.keep_checkpoints, or train.checkpoint_every higher"
         )
     return "; ".join(missing) or None
 

@@ -16,7 +16,7 @@ from aegis_cli import recipes
 from aegis_cli.common import files, locks, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, inputs
 
 METRICS = "metrics.jsonl"
 JOBS_REPORT = "train.json"  # in a run that `aegis run` has trained
@@ -25,7 +25,7 @@ _FILES = (
     "recipe.yaml",
     METRICS,
     "*.safetensors",
-    *(JOBS_REPORT, "probe*.json", "rollout*.json", machine.NAME, "report.html"),
+    *(JOBS_REPORT, "probe*.json", "rollout*.json", machine.NAME, inputs.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )
 _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
@@ -54,14 +54,16 @@ def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> 
         raise AegisError(
             f"an existing run in '{out}'",
             "a new folder",
-            "add --resume to continue it or --overwrite to begin anew, or choose another --out",
+            f"continue it: aegis train {out}, or the same command with --resume; begin anew with "
+            "--overwrite, or choose another --out",
         )
     if not goes_on(out, recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings: "
             f"{_differences(_begun(out, recipe), recipe)}",
             "the recipe and overrides it began with",
-            f"compare with {saved}, or start anew in another --out",
+            f"go on with its own: aegis train {out}; compare with {saved}, or start anew in "
+            "another --out",
         )
 
 

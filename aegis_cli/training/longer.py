@@ -23,9 +23,12 @@ def plan(out: Path, recipe: Recipe) -> Recipe:
     Nothing is changed where no run is there, or where more than the number of steps differs.
     """
     saved = out / "recipe.yaml"
-    if not saved.exists() or recipe.train.extended_from:
+    if not saved.exists():
         return recipe
     there, steps = recipes.load(saved, kind=Recipe).train, recipe.train.steps
+    # The run's own recipe has its earlier plans already.
+    if recipe.train.extended_from not in (None, there.extended_from):
+        return recipe
     plans = there.plans if there.steps == steps else (*there.plans, steps)
     if plans != tuple(sorted(plans)):
         return recipe

@@ -23,7 +23,8 @@ from aegis_cli.recipes import Recipe
 
 PROJECT = "aegis"
 Log = Callable[[Mapping[str, float]], None]  # one line of metrics.jsonl, its step included
-_TABLES = ("families", "tasks")  # of a probe, and of a rollout of a set of tasks
+# Of a probe, of a rollout of a set of tasks or of one with colours.
+_TABLES = ("families", "tasks", "target_colors")
 
 
 @dataclass(frozen=True)

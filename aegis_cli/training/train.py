@@ -34,6 +34,7 @@ from aegis_cli.training import (
     checkpoint,
     eight_bit,
     folder,
+    inputs,
     longer,
     step,
     track,
@@ -103,7 +104,7 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
-    out = Path(out)
+    out, places = Path(out), inputs.Inputs.given(demos, anchor)
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if resume:
@@ -114,13 +115,16 @@ def run(
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
             restored = _restore(training)
-            if ranks.first and longer.lengthens(out, recipe):
-                folder.write_recipe(out, recipe)
+            if ranks.first:
+                if longer.lengthens(out, recipe):
+                    folder.write_recipe(out, recipe)
+                inputs.keep(out, places)
             return _train(training, *restored, on_event)
         if ranks.first:
             if overwrite:
                 folder.remove(out)
             folder.begin(out, recipe)
+            inputs.keep(out, places)
             files.save_json(out / machine.NAME, machine.describe())
         return _train(training, 0, Window(), on_event)
 

@@ -126,6 +126,7 @@ def test_a_full_disk_leaves_no_half_checkpoint_and_the_run_goes_on(
         assert "free" in refused(aegis(*TRAIN))
     assert not leftovers(place) and sorted(p.name for p in (place / "runs").iterdir()) == [
         "checkpoints",
+        "inputs.json",
         "ledger.safetensors",
         "machine.json",
         "metrics.jsonl",
@@ -229,7 +230,7 @@ def test_a_signal_leaves_a_run_that_goes_on(place: Path, number: signal.Signals)
         lambda *_: (place / "runs/checkpoints/last/expert.safetensors").exists(),
         number,
     )
-    assert f"resume with: aegis {' '.join(args)} --resume" in err
+    assert "resume with: aegis train runs\n" in err
     assert not leftovers(place)
     last = (place / "runs/checkpoints/last").resolve()
     assert all(artifacts.load(path) for path in last.rglob("*.safetensors"))

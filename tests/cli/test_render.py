@@ -29,8 +29,14 @@ from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
-from aegis_cli.evaluation.open_loop import DimensionError, OpenLoopReport, StepError
+from aegis_cli.evaluation.open_loop import (
+    DimensionError,
+    InstructionError,
+    OpenLoopReport,
+    StepError,
+)
 from aegis_cli.evaluation.results import Result
+from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection import InspectReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
@@ -462,6 +468,41 @@ def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
     assert re.search(r"pan +0\.5 +0\.75 +1\.25 +0\.360 +0\.875", shown)
     steps = [int(m[1]) for m in re.finditer(r"^ +(\d+) +\d+ +\d\.\d+ +\d\.\d+ *$", shown, re.M)]
     assert len(steps) == 8 and (steps[0], steps[-1]) == (1, 30)
+
+
+def instruction_errors(count: int) -> list[InstructionError]:
+    return [
+        InstructionError(f"put {i}", 2, 30, 1.0 - i / 100, (0.5, 1.5), 0.25) for i in range(count)
+    ]
+
+
+def test_open_loop_errors_of_the_worst_instructions_where_there_are_several() -> None:
+    one = text_of(open_loop(open_loop_report(instructions=instruction_errors(1))))
+    assert "Instruction" not in one
+    few = text_of(open_loop(open_loop_report(instructions=instruction_errors(2))))
+    assert re.search(r"put 1 +2 +30 +0\.990 +0\.500 to 1\.500 +0\.250", few)
+    assert "the worst" not in few
+    many = text_of(open_loop(open_loop_report(instructions=instruction_errors(43))))
+    assert re.findall(r"put (\d+)", many) == [str(i) for i in range(10)]
+    assert "the worst 10 of 43 instructions; --json has all" in many
+
+
+def test_a_rollouts_colours_and_instructions_are_shown_the_worst_first() -> None:
+    parts = {f"go {i}": PartSuccess(i / 12, (0.0, 1.0), 4) for i in range(12, 0, -1)}
+    colors = {"blue": PartSuccess(0.75, (0.5, 1.0), 8), "red": PartSuccess(0.25, (0.0, 0.5), 8)}
+    report = RolloutReport(
+        task="reach",
+        success=0.5,
+        interval=(0.25, 0.75),
+        target_colors=colors,
+        instructions=parts,
+        episodes=16,
+        episodes_per_s=1.0,
+    )
+    shown = text_of(render.measured(report))
+    assert re.search(r"Target.*\n.*\n +red +25\.0.*\n +blue +75\.0", shown)
+    assert re.findall(r"^ go (\d+) ", shown, re.M) == [str(i) for i in range(1, 11)]
+    assert "the worst 10 of 12 instructions" in shown
 
 
 def test_what_an_open_loop_report_lacks_has_no_column() -> None:

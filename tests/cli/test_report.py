@@ -108,6 +108,24 @@ def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path
     assert said in reported(aegis, job / "naive")[0].said
 
 
+def test_the_worst_instructions_of_an_open_loop_error_are_on_the_page(aegis, job: Path) -> None:
+    entry = {"episodes": 2, "frames": 30, "relative_interval": [0.5, 1.5], "hold_error": 0.25}
+    many = [
+        {"instruction": f"put {HOSTILE} {i}", "relative_error": 1.0 - i / 100, **entry}
+        for i in range(12)
+    ]
+    evaluated = open_loop(1, 2, instructions=many)
+    results.keep(job / "naive", "evaluate-validation-arm", evaluated, {})
+    page, document = reported(aegis, job / "naive")
+    check_figures(page, document)
+    assert document["open_loops"][0]["figures"]["instructions"] == many
+    place = "/open_loops/0/figures/instructions"
+    shown = {path for path, _, _ in page.figures}
+    assert {f"{place}/0/relative_error", f"{place}/9/relative_interval/1"} <= shown
+    assert f"{place}/10/relative_error" not in shown
+    assert "the worst 10 of 12 instructions" in page.said
+
+
 def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:
     page, document = reported(aegis, job / "aegis")
     assert document["kind"] == "run" and document["label"] == "aegis"

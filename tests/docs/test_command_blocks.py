@@ -150,9 +150,9 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
         # A block that begins with another run's policy names its backbone itself.
         own = any(word.startswith("backbone=runs/") for word in rest)
         settings += (f"backbone={backbone}",) if kind == "policy" and not own else ()
-        # It is resumed because it is to take more steps.
-        settings += ("train.steps=5",) if kind == "policy" and "--resume" in rest else ()
         rest += [word for setting in settings for word in ("--set", setting)]
+    elif command == "train":
+        rest += ["--set", "train.steps=5"]  # a run that has ended, which is to take more steps
     return [command, *rest]
 
 

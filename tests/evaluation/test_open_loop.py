@@ -162,6 +162,60 @@ def test_dimensions_without_a_name_have_a_number() -> None:
     assert open_loop.action_names(recorded(("only",))) == ["action 0", "action 1"]
 
 
+def of_instructions(texts: list[str], of_episodes: list[int]) -> Demonstrations:
+    """The three episodes, each with the instruction of that number among the texts."""
+    text_of = torch.repeat_interleave(torch.tensor(of_episodes), torch.tensor(LENGTHS))
+    return dataclasses.replace(recorded(), instructions=texts, instruction_of=text_of)
+
+
+def test_each_instruction_has_its_own_error_and_the_worst_comes_first() -> None:
+    shown = of_instructions(["lift", "push"], [0, 1, 0])
+    actions, _ = shown.chunks(EVERY, CHUNK)
+    pushed = shown.episode_of == 1
+    off = torch.where(pushed[:, None, None], torch.tensor(2.0), torch.tensor(1.0))
+    found = open_loop.compare(shown, EVERY, actions + off, SPREAD)
+    worst, best = found.instructions
+    assert (worst.instruction, worst.episodes, worst.frames) == ("push", 1, 2)
+    assert (best.instruction, best.episodes, best.frames) == ("lift", 2, 9)
+    assert worst.relative_error == pytest.approx(1) and best.relative_error == pytest.approx(0.25)
+    assert worst.relative_interval is None and best.relative_interval is not None
+    # Entries of the chunks: 3 of `push` and 12 + 9 of `lift`, in which no step is padding.
+    assert found.relative_error == pytest.approx((3 * 1 + 21 * 0.25) / 24)
+
+
+def test_one_instruction_has_the_figures_of_all_frames() -> None:
+    shown = recorded(("a", "b"), ("a", "b"))
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0] + 0.5, SPREAD)
+    (only,) = found.instructions
+    for figure in ("frames", "relative_error", "relative_interval", "hold_error"):
+        assert getattr(only, figure) == getattr(found, figure) is not None
+
+
+def test_a_text_that_is_listed_twice_is_one_instruction() -> None:
+    shown = of_instructions(["go", "go"], [0, 1, 0])
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0], SPREAD)
+    assert [(one.instruction, one.episodes) for one in found.instructions] == [("go", 3)]
+
+
+def test_instructions_without_an_error_are_in_the_order_of_their_frames() -> None:
+    shown = of_instructions(["b", "a"], [0, 1, 0])
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0], np.zeros(2))
+    assert [(one.instruction, one.relative_error) for one in found.instructions] == [
+        ("b", None),
+        ("a", None),
+    ]
+
+
+def test_a_run_keeps_the_error_of_each_instruction(own_run: Path, demos_file: Path) -> None:
+    found = open_loop.run(own_run, demos_file, range(8), keep=True)
+    assert len(found.instructions) > 1
+    assert sum(one.frames for one in found.instructions) == found.frames
+    errors = [one.relative_error for one in found.instructions]
+    assert errors == sorted(errors, reverse=True)
+    (kept,) = results.open_loops(own_run)
+    assert kept.figures["instructions"] == found.to_json()["instructions"]
+
+
 # --- which episodes -------------------------------------------------------------------------------
 
 

@@ -45,6 +45,10 @@ class Seen:
         self.shown.append(step.observation)
         return step if look else dataclasses.replace(step, observation=None)
 
+    @property
+    def target_color(self) -> str:
+        return self.env.target_color
+
     def distance(self) -> float:
         return self.env.distance()
 
@@ -145,6 +149,36 @@ def test_the_wrong_disc_is_counted_as_such(puppet: Callable[..., Puppet]) -> Non
     puppet(to_a_distractor)
     report = rollout.run(Path("any"), None, 8, "seen")
     assert report.success == 0 and report.wrong_target >= 7 / 8
+
+
+def test_successes_are_told_by_colour_and_by_instruction(
+    puppet: Callable[..., Puppet], envs: list[Seen]
+) -> None:
+    def to_red_alone(seen: Seen) -> np.ndarray:
+        return expert(seen) if seen.env.target_color == "red" else rest(seen)
+
+    puppet(to_red_alone)
+    report = rollout.run(Path("any"), None, 24, "seen")
+    asked = [(env.env.target_color, env.shown[0].instruction) for env in envs[-24:]]
+    assert set(report.target_colors) == {color for color, _ in asked}
+    for color, found in report.target_colors.items():
+        assert found.episodes == sum(color == own for own, _ in asked)
+        assert found.success == (color == "red")
+        assert found.interval == wilson_interval(found.episodes * (color == "red"), found.episodes)
+    assert set(report.instructions) <= set(sim.make("point").env.spec.templates)
+    for text, found in report.instructions.items():
+        own = [color for color, said in asked if text.format(color=color) == said]
+        assert found.episodes == len(own) > 0
+        assert found.success == pytest.approx(own.count("red") / len(own))
+    assert sum(found.episodes for found in report.instructions.values()) == 24
+
+
+def test_episodes_that_are_all_of_one_kind_are_not_told_apart(
+    puppet: Callable[..., Puppet],
+) -> None:
+    puppet(rest, chunk=40)
+    report = rollout.run(Path("any"), None, 1, "seen")
+    assert report.target_colors is None and report.instructions is None
 
 
 @pytest.mark.parametrize(("replan", "calls"), [(None, 10), (2, 20), (40, 1)])

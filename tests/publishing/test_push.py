@@ -169,7 +169,7 @@ def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
     assert "Gate (a drop of at most 100 points): **passed**." in body
     success = files.load_json(run_folder / results.FOLDER / "rollout-seen.json")["success"]
     assert f"| reach | seen | 2 | {100 * success:.1f} % (" in body
-    assert f"hf download {REPO}" in body and "policies/reach-naive" in body
+    assert f"aegis probe {REPO} --baseline" in body and "hf download" not in body
 
 
 @pytest.mark.parametrize("hosted", [True, False])
@@ -267,7 +267,7 @@ def test_equal_runs_have_equal_cards(run_folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("task", "line"),
-    [("reach", "aegis rollout policies/x\n"), (None, "aegis evaluate policies/x --demos")],
+    [("reach", "aegis rollout somebody/x\n"), (None, "aegis evaluate somebody/x --demos")],
 )
 def test_a_card_says_what_a_policy_of_its_kind_can_be_used_for(
     task: str | None, line: str, run_folder: Path

@@ -1,4 +1,4 @@
-"""Which tests belong to `pytest -m fast`: about 1,400 that run in about a minute on two cores.
+"""Which tests belong to `pytest -m fast`: about 1,200 that run in about a minute on two cores.
 
 The rule: all of the rooms whose tests are pure computation, less the files that repeat it over many
 draws, and of each other room one or more files that neither train nor render. A file belongs as a

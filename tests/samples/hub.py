@@ -1,4 +1,4 @@
-"""A stand-in of the Hugging Face hub's HTTP interface, as far as a commit needs it."""
+"""A stand-in of the Hugging Face hub's HTTP interface, for commits and downloads."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 TOKEN = "hf_valid"
+COMMIT = "0" * 40
 
 
 class Hub:
@@ -23,15 +24,17 @@ class Hub:
         committed: the files by their paths, after all commits.
         created: what a repository was asked for with; None before that.
         public: whether the repository is there already, and public.
+        downloaded: the paths of the files that were sent, in their order.
     """
 
     def __init__(self) -> None:
         self.committed: dict[str, bytes] = {}
         self.created: dict[str, Any] | None = None
         self.public = False
+        self.downloaded: list[str] = []
         self.url = ""
 
-    def answer(self, path: str, body: bytes) -> tuple[int, dict[str, Any]]:
+    def answer(self, path: str, body: bytes) -> tuple[int, Any]:
         """Status and JSON for a request."""
         if path == "/api/repos/create":
             self.created = json.loads(body)
@@ -44,14 +47,20 @@ class Hub:
         if "/commit/" in path:
             repo = path.removeprefix("/api/models/").split("/commit/")[0]
             return 200, self._commit(body, repo)
-        found: dict[str, Any] = {"id": path.removeprefix("/api/models/")}
+        if "/tree/" in path:
+            return 200, [
+                {"type": "file", "path": name, "size": len(content), "oid": COMMIT}
+                for name, content in sorted(self.committed.items())
+            ]
+        name = path.removeprefix("/api/models/").partition("/revision/")[0]
+        found: dict[str, Any] = {"id": name, "sha": COMMIT}
         files = [{"rfilename": name} for name in sorted(self.committed)]
         return 200, found | {"private": not self.public, "siblings": files}
 
     def file(self, path: str) -> bytes | None:
         """What is downloaded under a path; None: no file's."""
-        _, resolve, name = path.partition("/resolve/main/")
-        return self.committed.get(name) if resolve else None
+        _, resolve, name = path.partition("/resolve/")
+        return self.committed.get(name.partition("/")[2]) if resolve else None
 
     def _commit(self, body: bytes, repo: str) -> dict[str, Any]:
         for line in body.splitlines():
@@ -61,8 +70,8 @@ class Hub:
                 self.committed[value["path"]] = base64.b64decode(value["content"])
             if entry["key"] == "deletedFile":
                 del self.committed[entry["value"]["path"]]
-        oid = "0" * 40
-        return {"success": True, "commitOid": oid, "commitUrl": f"{self.url}/{repo}/commit/{oid}"}
+        url = f"{self.url}/{repo}/commit/{COMMIT}"
+        return {"success": True, "commitOid": COMMIT, "commitUrl": url}
 
 
 def _handler(hub: Hub) -> type[BaseHTTPRequestHandler]:
@@ -81,11 +90,12 @@ def _handler(hub: Hub) -> type[BaseHTTPRequestHandler]:
         def _file(self, content: bytes) -> None:
             self.send_response(200)
             self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
-            self.send_header("X-Repo-Commit", "0" * 40)
+            self.send_header("X-Repo-Commit", COMMIT)
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
             if self.command == "GET":
                 self.wfile.write(content)
+                hub.downloaded.append(self.path.partition("/resolve/")[2].partition("/")[2])
 
         def _body(self) -> bytes:
             if self.headers.get("Transfer-Encoding") != "chunked":

@@ -132,6 +132,7 @@ def test_files_stand_where_the_recipe_says(finished: Path) -> None:
         "ledger.safetensors",
         "metrics.jsonl",
         "machine.json",
+        "inputs.json",
         "checkpoints",
         "train.json",
         "probe.json",

@@ -166,7 +166,7 @@ def test_tuning_uses_the_validation_split_and_its_choice_is_compared(
     for label in TUNED:
         names = {p.name for p in (folder / label).glob("*.json")}
         measured = {"train.json", "probe-validation.json", "rollout-validation-seen.json"}
-        assert names == measured | {"machine.json"}
+        assert names == measured | {"machine.json", "inputs.json"}
 
 
 def test_a_finished_study_is_told_from_its_cells_alone(

@@ -54,6 +54,7 @@ def test_the_run_folder(finished: tuple[str, Path]) -> None:
     expected = {f"checkpoints/{n}/{part}" for n in steps for part in parts}
     assert contents(out).keys() == expected | {
         "checkpoints/last",
+        "inputs.json",
         "ledger.safetensors",
         "machine.json",
         "recipe.yaml",

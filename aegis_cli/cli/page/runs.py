@@ -14,6 +14,7 @@ from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
 from aegis_cli.evaluation.results import evaluated_on
 
 _TICKS = 5  # below a heat map
+_INSTRUCTIONS = 10  # rows of a table by instruction
 
 
 def section(title: str, *children: Child) -> Markup:
@@ -142,7 +143,28 @@ def open_loops(runs: Sequence[At]) -> Markup | None:
             "interval (Student's t) over episodes."
         ),
         table(("Run", "Episodes", "Frames", "Relative error", "Hold's"), rows, left=2),
+        *(_by_instruction(run, result["figures"]) for run in runs for result in run["open_loops"]),
     )
+
+
+def _by_instruction(run: At, found: At) -> Markup | None:
+    """The worst instructions of an open-loop evaluation, where it has several."""
+    every = list(found["instructions"])
+    if len(every) < 2:
+        return None
+    rows = [
+        (
+            str(one["instruction"]) or "(none)",
+            whole(one["episodes"]),
+            whole(one["frames"]),
+            _off(one),
+            decimal(one["hold_error"], 3),
+        )
+        for one in every[:_INSTRUCTIONS]
+    ]
+    which = "" if len(every) <= _INSTRUCTIONS else f"the worst {_INSTRUCTIONS} of "
+    title = f"{run['label']}, {evaluated_on(found.value)}: {which}{len(every):,} instructions"
+    return table(("Instruction", "Episodes", "Frames", "Relative error", "Hold's"), rows, 1, title)
 
 
 def families(runs: Sequence[At]) -> Iterator[Markup]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from aegis_cli.cli.render.tables import pairs
 
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
 _ROWS = 8  # of the table by steps ahead
+_INSTRUCTIONS = 10  # rows of the table by instruction
 _SPLITS = {
     "validation": "the run's validation episodes",
     "other data": "all of data that the run was not trained on",
@@ -24,7 +26,7 @@ _SPLITS = {
 
 
 def open_loop(report: Any) -> RenderableType:
-    """The error over all, by dimension and by steps ahead."""
+    """The error over all, by dimension, by steps ahead and by instruction."""
     error = fixed(report.relative_error, 3)
     if report.relative_interval is not None:
         low, high = (fixed(end, 3) for end in report.relative_interval)
@@ -42,7 +44,8 @@ def open_loop(report: Any) -> RenderableType:
     scale = "relative error: squared error over that of the training's mean action, which has 1"
     if report.hold_error is not None:
         scale += "\nhold: the current position, repeated"
-    return Group(pairs(facts), _by_dimension(report), _by_step(report), Text(scale))
+    parts = [pairs(facts), _by_dimension(report), _by_step(report), *_by_instruction(report)]
+    return Group(*parts, Text(scale))
 
 
 def _by_dimension(report: Any) -> Table:
@@ -77,6 +80,27 @@ def _by_step(report: Any) -> Table:
         line = (str(step.step), f"{step.frames:,}", fixed(step.relative_error, 3))
         lines.append(line if report.hold_error is None else (*line, fixed(step.hold_error, 3)))
     return plain_table(header, lines, left=0)
+
+
+def _by_instruction(report: Any) -> Iterator[RenderableType]:
+    """The worst instructions, where there are several."""
+    every = report.instructions
+    if len(every) < 2:
+        return
+    header = ("Instruction", "Episodes", "Frames", "Relative error", "95 % interval")
+    if report.hold_error is not None:
+        header = (*header, "Hold's")
+    lines = []
+    for one in every[:_INSTRUCTIONS]:
+        ends = "-"
+        if one.relative_interval is not None:
+            ends = " to ".join(fixed(end, 3) for end in one.relative_interval)
+        error = fixed(one.relative_error, 3)
+        line = (one.instruction or "(none)", f"{one.episodes:,}", f"{one.frames:,}", error, ends)
+        lines.append(line if report.hold_error is None else (*line, fixed(one.hold_error, 3)))
+    yield plain_table(header, lines)
+    if len(every) > _INSTRUCTIONS:
+        yield Text(f"the worst {_INSTRUCTIONS} of {len(every):,} instructions; --json has all")
 
 
 def open_loop_plot(report: Any, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -23,6 +24,7 @@ from aegis_cli.cli.render.layout import (
 )
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
+_INSTRUCTIONS = 10  # lines of a rollout's table by instruction
 _SHARES = {
     "accuracy",
     "success",
@@ -102,23 +104,36 @@ def _accuracies(families: dict[str, float]) -> Table:
 def measured(report: Any) -> RenderableType:
     """The figures of demonstrations or rollouts that there are.
 
-    A task has a success or a return, and what it has not is left out. Of a set, a table has the
-    figures of each task.
+    A task has a success or a return, and what it has not is left out. Tables have the figures of
+    each task of a set, each target colour and each instruction, where there are several.
     """
     found = {name: value for name, value in _scalars(report).items() if value is not None}
-    tasks = found.pop("tasks", None)
-    return pairs(found) if tasks is None else Group(pairs(found), _by_task(tasks))
+    tables: list[RenderableType] = []
+    if tasks := found.pop("tasks", None):
+        tables.append(_by_part("Task", tasks))
+    if colors := found.pop("target_colors", None):
+        tables.append(_by_part("Target", _worst_first(colors)))
+    if instructions := _worst_first(found.pop("instructions", {})):
+        shown = dict(itertools.islice(instructions.items(), _INSTRUCTIONS))
+        tables.append(_by_part("Instruction", shown))
+        if len(shown) < (count := len(instructions)):
+            tables.append(Text(f"the worst {len(shown)} of {count:,} instructions; --json has all"))
+    return Group(pairs(found), *tables)
 
 
-def _by_task(tasks: dict[str, Any]) -> Table:
-    """A line per task of a set: all the figures of its entry."""
-    names = [field.name for field in dataclasses.fields(next(iter(tasks.values())))]
+def _worst_first(parts: dict[str, Any]) -> dict[str, Any]:
+    return dict(sorted(parts.items(), key=lambda part: part[1].success))
+
+
+def _by_part(what: str, parts: dict[str, Any]) -> Table:
+    """A line per part of the episodes: all the figures of its entry."""
+    names = [field.name for field in dataclasses.fields(next(iter(parts.values())))]
     header = [(_label(name) + _unit(name, 0.0)).capitalize() for name in names]
     rows = [
-        (task, *(_cell(getattr(entry, name), name) for name in names))
-        for task, entry in tasks.items()
+        (part, *(_cell(getattr(entry, name), name) for name in names))
+        for part, entry in parts.items()
     ]
-    return plain_table(("Task", *header), rows)
+    return plain_table((what, *header), rows)
 
 
 def dual(report: Any) -> RenderableType:

@@ -25,8 +25,8 @@ def locate(name: str) -> Path:
 
     Args:
         name: one of `SHIPPED`, a model file, a backbone folder, the folder of a run, of one of its
-            checkpoints or of a policy in LeRobot's layout, or the id of a model on the hub, which
-            is downloaded if it is not there; what follows a '#' is left out.
+            checkpoints or of a policy in LeRobot's layout, or the id of a model or a policy on the
+            hub, which is downloaded if it is not there; what follows a '#' is left out.
 
     Raises:
         AegisError: no such model, or one whose path is no text, which no reader of it takes.
@@ -36,8 +36,15 @@ def locate(name: str) -> Path:
         files.check_utf8(here, files.RENAME)
         return here
     if not hub.is_local(name) and _has_transformers():
-        return model_folder.fetch(name)
+        return _of_repository(model_folder.fetch(name))
     raise _no_backbone(name)
+
+
+def _of_repository(folder: Path) -> Path:
+    """The model in the copy of a repository, which is its folder unless it is a policy's."""
+    if model_folder.is_policy(folder) or (folder / "expert.safetensors").is_file():
+        return _on_disk(str(folder)) or folder
+    return folder
 
 
 def _on_disk(name: str) -> Path | None:

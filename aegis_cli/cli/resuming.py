@@ -1,0 +1,134 @@
+"""`aegis train RUN`: a run that goes on by what its own folder says, and the command for it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.selection import Paths
+from aegis_cli.recipes import Recipe
+
+RECIPE = "recipe.yaml"
+
+
+def recipe_of(run: Path, out: Path | None) -> Path:
+    """The recipe that a run was begun with.
+
+    Raises:
+        AegisError: no run, or an `out` beside it, for a run goes on in its own folder.
+    """
+    if not (run / RECIPE).is_file():
+        raise AegisError(
+            f"no {RECIPE} in '{run}'",
+            "a recipe, or the folder of a run that aegis train has begun",
+            _instead(run),
+        )
+    if out is not None:
+        raise AegisError(
+            f"--out {out} with the run '{run}'",
+            "a run alone, which goes on in its own folder",
+            f"leave --out out, or train anew by its recipe: aegis train {run / RECIPE} --out {out}",
+        )
+    return run / RECIPE
+
+
+def _instead(folder: Path) -> str:
+    """What may have been meant by a folder that is no run."""
+    from aegis_cli.training import checkpoint
+
+    if checkpoint.is_one(folder) and (home := checkpoint.run_of(folder)) is not None:
+        return f"give the run of this checkpoint: aegis train {_quoted(home)}"
+    if inner := sorted(path.parent for path in folder.glob(f"*/{RECIPE}")):
+        return (
+            f"give one of its runs, e.g. aegis train {_quoted(inner[0])}; a job or study of aegis "
+            "run goes on when it is called again"
+        )
+    return "check the path, or begin a run: aegis train RECIPE --out RUN"
+
+
+def inputs_of(
+    run: Path, recipe: Recipe, demos: Sequence[Path], anchor: Path | None
+) -> tuple[list[Path], Path | None]:
+    """The demonstrations and the anchor that a run goes on with: those given, else its own.
+
+    Of a run that has not written them down, the recipe may name the demonstrations: then none here.
+
+    Raises:
+        AegisError: they are not where they were, or an earlier version has not written it down.
+    """
+    from aegis_cli.training import inputs
+
+    kept = inputs.of(run)
+    if kept is None:
+        if not demos and recipe.demos.path is None:
+            raise _unknown(run, "demonstrations", "--demos PATH")
+        return list(demos), anchor or _no_anchor(run)
+    if not demos:
+        demos = [_there(run, one, "demonstrations", "--demos PATH") for one in kept.demos]
+    if anchor is None and kept.anchor is not None:
+        anchor = _there(run, kept.anchor, "anchor", "--anchor FILE")
+    return list(demos), anchor
+
+
+def _there(run: Path, place: str, what: str, option: str) -> Path:
+    """A recorded place, if something is there; the id of a dataset is the hub's to find."""
+    path = Path(place)
+    if path.is_absolute() and not path.exists():
+        raise AegisError(
+            f"'{place}' is gone, the {what} of the run in '{run}'",
+            "what the run was begun with",
+            f"bring it back, or say where it lies now: aegis train {_quoted(run)} {option}",
+        )
+    return path
+
+
+def _no_anchor(run: Path) -> None:
+    """Raise AegisError if a checkpoint says that the run has been given an anchor."""
+    from aegis_cli.common import artifacts
+    from aegis_cli.training import checkpoint
+
+    if not checkpoint.begun(run):
+        return
+    header = artifacts.read_header(checkpoint.last(run) / checkpoint.EXPERT)
+    if "anchor" in header.inputs:
+        raise _unknown(run, "anchor", "--anchor FILE")
+
+
+def _unknown(run: Path, what: str, option: str) -> AegisError:
+    return AegisError(
+        f"no place of its {what} in the run '{run}', as in those of an earlier version",
+        "what the run was begun with",
+        f"say where it lies: aegis train {_quoted(run)} {option}",
+    )
+
+
+def command(
+    recipe: Any, out: Path, demos: Paths | None, anchor: Path | None, options: Sequence[str]
+) -> list[str] | None:
+    """The words that let a run go on; None where its folder does not say all that is needed.
+
+    That is so before it has begun, and where another run is there still.
+
+    Args:
+        recipe: by which the run is trained.
+        options: of the command that are no settings of the training.
+
+    Raises:
+        AegisError: something else lies in `out`.
+    """
+    from aegis_cli.training import folder, inputs, longer
+
+    if not (out / RECIPE).is_file():
+        return None
+    if isinstance(recipe, Recipe):
+        if demos is None or inputs.of(out) != inputs.Inputs.given(demos, anchor):
+            return None
+        recipe = longer.plan(out, recipe)
+    return ["train", str(out), *options] if folder.goes_on(out, recipe) else None
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

@@ -1,0 +1,87 @@
+"""A policy on the hub, as `aegis push` sends it, downloaded into the hub's own cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from aegis_cli.common import files, hub
+from aegis_cli.common.errors import AegisError, in_short
+from aegis_cli.models import lerobot_folder
+
+_EXPERT = "expert.safetensors"  # of a checkpoint's layout
+# All of a checkpoint's layout, and of LeRobot's what is small. Of any other repository it is hardly
+# more than a configuration.
+_PARTS = (lerobot_folder.CONFIG, _EXPERT, f"{lerobot_folder.BACKBONE}/*")
+_CARDS = ("*.md",)
+
+
+def locate(name: str | Path) -> Path:
+    """The folder of a run, a checkpoint or an exported policy, or of the copy of one on the hub.
+
+    A path that is not there and can be no id stays as it is: whoever reads it says what is missing.
+
+    Args:
+        name: a path as somebody wrote it, or the id of a policy on the hub, which is downloaded.
+
+    Raises:
+        AegisError: neither here nor to be had, or a repository without a policy of ours.
+    """
+    path = Path(name)
+    return path if path.exists() or hub.is_local(str(name)) else fetch(str(name))
+
+
+def fetch(name: str) -> Path:
+    """The local folder of a policy on the hub, with its newest files, but for its model card.
+
+    Raises:
+        AegisError: neither in the cache nor to be had, or a repository without a policy of ours.
+    """
+    if not hub.is_installed():
+        raise AegisError(
+            f"no run or policy '{name}', and no package 'huggingface_hub' to ask the hub for it",
+            "a local folder, or the package that downloads one",
+            "check the path, or pip install 'aegis-vla[hub]'",
+        )
+    folder = _snapshot(name, _PARTS)
+    config = folder / lerobot_folder.CONFIG
+    if config.is_file() and lerobot_folder.is_own_config(config.read_bytes()):
+        # Its weights have the name of every model's, so they are asked for only now.
+        return _snapshot(name, (*_PARTS, lerobot_folder.MODEL))
+    if (folder / _EXPERT).is_file() and (folder / lerobot_folder.BACKBONE).is_dir():
+        return folder
+    raise AegisError(
+        f"the repository '{name}' of the hub has no policy of Aegis{_instead(config)}",
+        f"what aegis push sends: {_EXPERT} and {lerobot_folder.BACKBONE}/, or LeRobot's layout "
+        f"with {lerobot_folder.CONFIG} of the type {lerobot_folder.TYPE}",
+        "check the name; where the policy lies in a folder of it: "
+        f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER",
+    )
+
+
+def _instead(config: Path) -> str:
+    """What a repository of something else says that it is."""
+    if not config.is_file():
+        return f", nor a {config.name}"
+    try:
+        said = files.parse_json(config.read_bytes())
+    except ValueError:
+        return f", and a {config.name} that is not JSON"
+    for key, what in (("type", "a policy of the type"), ("model_type", "a model of the family")):
+        if isinstance(said, dict) and isinstance(said.get(key), str):
+            return f", but {what} '{said[key]}'"
+    return ""
+
+
+def _snapshot(name: str, wanted: Sequence[str]) -> Path:
+    try:
+        return hub.snapshot(name, "model", wanted, unwanted=_CARDS)
+    except (OSError, ValueError) as error:
+        raise AegisError(
+            f"no run or folder '{name}', and no policy of that name from the Hugging Face hub: "
+            f"{in_short(error)}",
+            "the folder of a run, a checkpoint or an exported policy, or a hub id with a network "
+            "(and, for a private policy, a token)",
+            f"check the path; or where there is a network: hf download {name} --local-dir POLICY; "
+            "then give POLICY",
+        ) from error

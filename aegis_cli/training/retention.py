@@ -1,0 +1,59 @@
+"""Which checkpoints of a run stay where `train.keep_checkpoints` bounds their number."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+
+from aegis_cli.training import checkpoint, folder
+
+
+def prune(out: Path, step: int, count: int) -> None:
+    """Remove the checkpoints before `step` but for the last ones and the best one.
+
+    Later ones stay: whoever went back to an earlier checkpoint has them still. What is half removed
+    when the process is killed bears a name that the next checkpoint clears away.
+
+    Args:
+        step: of the checkpoint that has just been written, which is the newest.
+        count: how many of the last ones stay, that one included.
+
+    Raises:
+        AegisError: the log is damaged, or the disk refuses.
+    """
+    there = {int(path.name): path for path in checkpoint.whole(out)}
+    behind = sorted(number for number in there if number <= step)
+    for number in {*behind[:-count]} - {best(out, behind)}:
+        aside = there[number].with_name(f".{there[number].name}.tmp")
+        with checkpoint.writing(out):
+            os.rename(there[number], aside)
+            shutil.rmtree(aside)
+
+
+def best(out: Path, steps: Collection[int]) -> int | None:
+    """The one of these steps with the least validation loss; None where none has a loss.
+
+    Of equal losses it is the earliest step.
+    """
+    losses = {
+        line["step"]: line["validation_loss"]
+        for line in folder.read_metrics(out, "step")
+        if "validation_loss" in line
+    }
+    known = [step for step in steps if losses.get(step) is not None]
+    return min(known, key=lambda step: (losses[step], step), default=None)
+
+
+def most_at_once(planned: int, there: int, count: int | None) -> int:
+    """How many checkpoints a run adds to its disk at most at one time.
+
+    That is the last ones and the best one, and the one that is written before another goes.
+
+    Args:
+        planned: checkpoints that are still to be written.
+        there: how many lie there already.
+        count: as `train.keep_checkpoints` says; None: all stay.
+    """
+    return planned if count is None else min(planned, max(1, count + 2 - there))

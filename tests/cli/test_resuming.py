@@ -1,0 +1,234 @@
+"""`aegis train RUN`: a run goes on by what its own folder says, wherever it is called from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from samples.training_runs import assert_same_run, stop_at
+from samples.user_folder import TRAIN, training
+
+from aegis_cli import recipes
+from aegis_cli.cli import stages
+from aegis_cli.common import files
+from aegis_cli.evaluation import results
+from aegis_cli.training import checkpoint, inputs, train
+
+Aegis = Callable[..., tuple[int, str, str]]
+Bad = Callable[..., str]
+
+
+def cut(
+    place: Path,
+    method: str = "aegis",
+    steps: int = 2,
+    sets: tuple[str, ...] = ("demos.safetensors",),
+) -> Path:
+    """A run of the folder's recipe that was ended after so many steps of its three."""
+    resolved = recipes.load(place / "small.yaml", ["train.steps=3"])
+    anchor = None if method == "naive" else Path("anchor.safetensors")
+    with pytest.raises(KeyboardInterrupt):
+        train.run(
+            resolved,
+            method,
+            tuple(map(Path, sets)),
+            anchor,
+            Path("cut"),
+            on_event=stop_at(steps, KeyboardInterrupt()),
+        )
+    return place / "cut"
+
+
+def steps_of(run: Path) -> int:
+    return checkpoint.step_of(checkpoint.last(run))
+
+
+def test_it_ends_in_the_bytes_of_a_run_that_was_never_interrupted(
+    place: Path, aegis: Aegis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert aegis(*training(out="whole"), "--set", "train.steps=3")[0] == 0
+    run = cut(place)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    code, out, err = aegis("train", run, "--json")
+    assert code == 0, err
+    assert (json.loads(out)["steps"], json.loads(out)["out"]) == (3, str(run))
+    assert_same_run(run, place / "whole")
+
+
+def test_a_run_of_several_sets_goes_on_with_all_of_them(
+    place: Path, aegis: Aegis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
+    assert code == 0, err
+    run = cut(place, "naive", sets=("demos.safetensors", "new.safetensors"))
+    monkeypatch.chdir(tmp_path)
+    code, _, err = aegis("train", run)
+    assert code == 0 and steps_of(run) == 3, err
+    kept = inputs.of(run)
+    assert kept is not None
+    assert kept.demos == tuple(str(place / f"{name}.safetensors") for name in ("demos", "new"))
+
+
+def test_a_crash_before_the_first_checkpoint_begins_again(place: Path, aegis: Aegis) -> None:
+    run = cut(place, "naive")
+    shutil.rmtree(run / "checkpoints")
+    (run / "ledger.safetensors").unlink()
+    code, _, err = aegis("train", "cut")
+    assert code == 0 and steps_of(run) == 3, err
+
+
+def test_an_interruption_names_the_command(
+    place: Path, aegis: Aegis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, begun = stages.TRAIN[recipes.Recipe].module, train.run
+
+    def interrupted(*args: object, on_event: object, **options: object) -> None:
+        begun(*args, **options, on_event=stop_at(2, KeyboardInterrupt()))
+
+    monkeypatch.setattr(stage, "run", interrupted)
+    more = ("--set", "train.steps=3", "--device", "cpu")
+    code, _, err = aegis(*TRAIN, *more)
+    assert code == 130 and err.endswith("resume with: aegis train runs --device cpu\n")
+    monkeypatch.setattr(stage, "run", begun)
+    code, _, err = aegis("train", "runs", "--device", "cpu")
+    assert code == 0 and steps_of(place / "runs") == 3, err
+
+
+def test_where_nothing_has_begun_or_another_run_is_there_still_the_same_command_is_named(
+    place: Path, aegis: Aegis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, other = cut(place), "--set train.steps=5"
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages.TRAIN[recipes.Recipe].module, "run", interrupted)
+    assert f"aegis {' '.join(TRAIN)} --resume\n" in aegis(*TRAIN)[2]
+    again = training(out="cut")
+    err = aegis(*again, *other.split(), "--overwrite")[2]
+    assert f"resume with: aegis {' '.join(again)} {other} --resume\n" in err
+    same = aegis(*again, "--set", "train.steps=3", "--resume")[2]
+    assert "resume with: aegis train cut\n" in same
+    shutil.copy(place / "demos.safetensors", place / "copy.safetensors")
+    moved = training(out="cut", demos="copy.safetensors")
+    assert "--demos copy.safetensors" in aegis(*moved, "--set", "train.steps=3", "--resume")[2]
+    files.write_text(run / "recipe.yaml", "name: [")
+    assert "--resume\n" in aegis(*again, "--set", "train.steps=3", "--resume")[2]
+
+
+def test_what_has_moved_is_named_and_taken_from_where_it_lies_now(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    run = cut(place)
+    (place / "data").mkdir()
+    for name, option in (("demos", "--demos PATH"), ("anchor", "--anchor FILE")):
+        (place / f"{name}.safetensors").rename(place / "data" / f"{name}.safetensors")
+        says = f"'{place / name}.safetensors' is gone", f"aegis train cut {option}"
+        given = () if name == "demos" else ("--demos", "data/demos.safetensors")
+        bad("train", "cut", *given, says=says)
+    at = "--demos", "data/demos.safetensors", "--anchor", "data/anchor.safetensors"
+    code, _, err = aegis("train", "cut", *at)
+    assert code == 0 and steps_of(run) == 3, err
+    kept = inputs.of(run)
+    assert kept == inputs.Inputs((str(place / at[1]),), str(place / at[3]))
+    assert aegis("train", "cut")[0] == 0
+
+
+def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -> None:
+    run = cut(place)
+    code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
+    assert code == 0, err
+    says = "another demos than the run", "the run began with"
+    bad("train", run, "--demos", "new.safetensors", says=says)
+
+
+def test_a_run_of_an_earlier_version_asks_for_what_it_does_not_know(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    run = cut(place)
+    (run / inputs.NAME).unlink()
+    bad("train", "cut", says=("no place of its demonstrations", "aegis train cut --demos PATH"))
+    at = "--demos", "demos.safetensors"
+    bad("train", "cut", *at, says=("no place of its anchor", "aegis train cut --anchor FILE"))
+    code, _, err = aegis("train", "cut", *at, "--anchor", "anchor.safetensors")
+    assert code == 0 and steps_of(run) == 3 and inputs.of(run) is not None, err
+
+
+def test_of_an_earlier_version_the_recipe_may_name_the_demonstrations(
+    place: Path, aegis: Aegis
+) -> None:
+    run = cut(place, "naive")
+    (run / inputs.NAME).unlink()
+    kept = (run / "recipe.yaml").read_text()
+    resolved = recipes.load(run / "recipe.yaml", ["demos.path=demos.safetensors"])
+    files.write_text(run / "recipe.yaml", recipes.to_yaml(resolved))
+    assert (run / "recipe.yaml").read_text() != kept
+    code, _, err = aegis("train", "cut")
+    assert code == 0 and steps_of(run) == 3, err
+
+
+def test_a_run_that_has_ended_is_made_longer_twice(place: Path, aegis: Aegis) -> None:
+    assert aegis(*training(out="run"), "--set", "train.steps=2")[0] == 0
+    for steps in (3, 4):
+        code, _, err = aegis("train", "run", "--set", f"train.steps={steps}")
+        assert code == 0 and steps_of(place / "run") == steps, err
+    kept = results.recipe_of(place / "run").train
+    assert (kept.steps, kept.extended_from) == (4, (2, 3))
+
+
+def test_other_settings_are_refused(place: Path, bad: Bad) -> None:
+    cut(place)
+    says = "train.batch_size", "go on with its own: aegis train cut"
+    bad("train", "cut", "--set", "train.batch_size=7", says=says)
+    bad("train", "cut", "--method", "naive", says=("train.method",))
+
+
+def test_overwrite_begins_it_anew(place: Path, aegis: Aegis) -> None:
+    run = cut(place)
+    assert aegis("train", "cut")[0] == 0
+    (run / "results").mkdir()
+    (run / "results" / "rollout-seen.json").write_text("{}")
+    code, _, err = aegis("train", "cut", "--overwrite")
+    assert code == 0 and steps_of(run) == 3 and not (run / "results").exists(), err
+
+
+def test_a_dry_run_of_the_rest_writes_nothing(place: Path, aegis: Aegis) -> None:
+    run = cut(place)
+    before = sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
+    code, out, err = aegis("train", "cut", "--dry-run", "--json")
+    assert code == 0 and json.loads(out)["steps"] == 3, err
+    assert sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*")) == before
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def test_a_recipe_needs_a_folder_and_a_run_has_its_own(place: Path, bad: Bad) -> None:
+    cut(place)
+    says = "no --out", "aegis train small.yaml --out runs/NAME"
+    bad("train", "small.yaml", "--demos", "demos.safetensors", says=says)
+    says = "--out new with the run 'cut'", "aegis train cut/recipe.yaml --out new"
+    bad("train", "cut", "--out", "new", says=says)
+
+
+def test_a_folder_that_is_no_run_says_what_may_be_meant(place: Path, bad: Bad) -> None:
+    run = cut(place)
+    last = checkpoint.last(run).resolve()
+    bad("train", last, says=("no recipe.yaml in", f"aegis train {run}"))
+    (place / "job").mkdir()
+    shutil.copytree(run, place / "job" / "aegis", symlinks=True)
+    bad("train", "job", says=("no recipe.yaml in 'job'", "aegis train job/aegis"))
+    (place / "empty").mkdir()
+    bad("train", "empty", says=("no recipe.yaml in 'empty'", "aegis train RECIPE --out RUN"))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"demos": [3], "anchor": null}', '{"demos": ["x"]']
+)
+def test_damaged_places_are_one_error(text: str, place: Path, bad: Bad) -> None:
+    (cut(place) / inputs.NAME).write_text(text)
+    bad("train", "cut", says=(inputs.NAME,))
