@@ -264,6 +264,15 @@ def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: P
     assert any(tag == "svg" for tag, _ in page.tags)
 
 
+def test_questions_of_one_family_have_one_row(aegis, job: Path) -> None:
+    probed = files.load_json(job / "naive" / "probe.json")
+    probed["families"] = {"all": next(iter(probed["families"].values()))}
+    files.save_json(job / "naive" / "probe.json", probed)
+    page, _ = reported(aegis, job / "naive")
+    accuracies = [path for path, *_ in page.figures if path.endswith("/baseline_accuracy")]
+    assert [path for path in accuracies if "/families/" in path] == accuracies[-1:]
+
+
 @pytest.mark.parametrize("seeds", [1, 5])
 @pytest.mark.parametrize("diverged", [{}, {"x": {0}}])
 def test_figures_of_a_study_are_those_of_json(

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from aegis_cli.cli.page.html import Markup, element
 
 WIDTH, HEIGHT = 460, 260  # of a drawing, in its own units
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 14, 40
+_TURNED, _DIGIT = 30, 7.5  # what a turned label takes at the left, and a digit of a tick's number
+_ALL = 100  # percent
 COLORS = 8  # classes c0 to c7 of the style sheet
 Point = tuple[float, float]
 
@@ -28,13 +30,17 @@ def is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class Scale:
-    """How values become places from `start` to `end`, evenly or by their logarithm."""
+    """How values become places from `start` to `end`, evenly or by their logarithm.
+
+    `whole` values, as steps and layers are, have no ticks between them.
+    """
 
     low: float
     high: float
     start: float
     end: float
     log: bool = False
+    whole: bool = False
 
     def __call__(self, value: float) -> float:
         low, high, at = self.low, self.high, min(max(value, self.low), self.high)
@@ -44,12 +50,14 @@ class Scale:
 
     def ticks(self) -> list[float]:
         """Round values between the ends: powers of ten, or about five equal steps."""
-        if self.log:
+        if self.log and self.high > 10 * self.low:
             first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
             steps = (1, 2, 5) if last - first <= 2 else (1,)
             found = [s * 10.0**power for power in range(first, last + 1) for s in steps]
         else:
             step = round_step((self.high - self.low) / 5)
+            if self.whole:
+                step = max(step, 1)
             first = math.ceil(self.low / step - 1e-9)
             count = math.floor(self.high / step + 1e-9) - first + 1
             found = [round((first + k) * step, 12) for k in range(count)]
@@ -60,6 +68,14 @@ def round_step(least: float) -> float:
     """The smallest of 1, 2, 5, 10, ... times a power of ten that is not below `least`."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(size * power for size in (1, 2, 5, 10) if size * power >= least * (1 - 1e-9))
+
+
+def from_first_to_last(values: Sequence[float], start: float, end: float) -> Scale:
+    """A scale without room at its ends; a single value stands in its middle."""
+    low, high = min(values), max(values)
+    if low == high:
+        low, high = low - 1, high + 1
+    return Scale(low, high, start, end, whole=all(float(value).is_integer() for value in values))
 
 
 def spanning(values: Sequence[float], start: float, end: float, log: bool = False) -> Scale:
@@ -156,9 +172,10 @@ def lines(
     drawn = [s for s in series if s.points]
     points = [point for s in drawn for point in s.points]
     log = log and all(y > 0 for _, y in points)
-    across = [x for x, _ in points]
-    x = Scale(min(across), max(max(across), min(across) + 1), _LEFT, WIDTH - _RIGHT)
     y = spanning([value for _, value in points], HEIGHT - _BOTTOM, _TOP, log)
+    longest = max(len(label(value)) for value in y.ticks())
+    left = max(_LEFT, _TURNED + _DIGIT * longest)
+    x = from_first_to_last([value for value, _ in points], left, WIDTH - _RIGHT)
     return svg(
         *_axes(x, y, x_label, y_label),
         *(_series(s, x, y) for s in drawn),
@@ -208,12 +225,12 @@ def frontier(
     those that keep most lie within a few points and the others lose dozens.
     """
     width, height, line_y = 760, 430, 46
+    spots = [replace(spot, x_interval=_possible(spot)) for spot in spots]
     values = [value for s in spots for value in (s.y, *(s.y_interval or ()))]
     lost = [symlog(value) for value in [*values, 0.0]]
     across = [value for s in spots for value in (s.x, *(s.x_interval or ()))]
     room = max(2.0, 0.06 * (max(across) - min(across)))
-    # Shares end at 100 %, whatever room a mark at the border would like to have.
-    x = Scale(max(min(across) - room, 0), min(max(across) + room, 103), _LEFT, width - 24)
+    x = Scale(max(min(across) - room, 0), max(across) + room, _LEFT, width - 24)
     y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)
     drawn = []
     ticks = [t for t in (0, 0.5, 1, 2, 5, 10, 20, 50, 100) if y.low <= symlog(t) <= y.high]
@@ -222,7 +239,8 @@ def frontier(
         drawn.append(line(x.start, at, x.end, at, "grid" if value else "zero"))
         drawn.append(text(x.start - 6, at + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
-        drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
+        if value <= max(*across, _ALL):
+            drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
     drawn.append(line(x.start, y.end, x.end, y.end, "axis"))
     drawn.append(text((x.start + x.end) / 2, height - 8, x_label, class_="label"))
     middle = (y.start + y.end) / 2
@@ -234,6 +252,17 @@ def frontier(
     drawn += [_spot(spot, x, y) for spot in spots]
     drawn += _names([s for s in spots if not s.small], x, y)
     return svg(*drawn, width=width, height=height, name=name)
+
+
+def _possible(spot: Spot) -> Point | None:
+    """The part of a success's interval up to 100 %, beyond which Student's t may reach.
+
+    A return is a share of an expert's, which may be surpassed.
+    """
+    if spot.x_interval is None or spot.x > _ALL:
+        return spot.x_interval
+    low, high = spot.x_interval
+    return max(low, 0), min(high, _ALL)
 
 
 def symlog(value: float) -> float:
@@ -259,8 +288,8 @@ def _spot(spot: Spot, x: Scale, y: Scale) -> Markup:
 
 
 def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
-    """Each name beside its mark, moved until it covers neither a name nor a mark."""
-    taken = [(x(s.x) - 7, y(symlog(s.y)) - 7, x(s.x) + 7, y(symlog(s.y)) + 7) for s in spots]
+    """Each name beside its mark, moved until it covers no name, no mark and no interval."""
+    taken = [box for spot in spots for box in _drawn(spot, x, y)]
     drawn = []
     for spot in spots:
         at, down, wide = x(spot.x), y(symlog(spot.y)), 7.4 * len(spot.name)
@@ -276,6 +305,19 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
         look = f"name {color(spot.number)}"
         drawn.append(text(left, middle + 4, spot.name, "start", class_=look))
     return drawn
+
+
+def _drawn(spot: Spot, x: Scale, y: Scale) -> list[tuple[float, float, float, float]]:
+    """What a mark takes, and each of its intervals."""
+    at, down = x(spot.x), y(symlog(spot.y))
+    found = [(at - 7, down - 7, at + 7, down + 7)]
+    if spot.x_interval is not None:
+        left, right = map(x, spot.x_interval)
+        found.append((left, down - 1, right, down + 1))
+    if spot.y_interval is not None:
+        top, bottom = sorted(y(symlog(end)) for end in spot.y_interval)
+        found.append((at - 1, top, at + 1, bottom))
+    return found
 
 
 def _box(place: Point, wide: float) -> tuple[float, float, float, float]:

@@ -176,15 +176,8 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
         header = ["Family", "Questions", "Always the commonest %", "Before %"]
         header += [str(run["label"]) for run in asked]
         rows = [_family(name, probes) for name in names]
-        rows.append(
-            [
-                "all",
-                whole(probes[0]["questions"]),
-                share(probes[0]["majority"]),
-                share(probes[0]["baseline_accuracy"]),
-                *(with_interval(p["accuracy"], p["interval"], share) for p in probes),
-            ]
-        )
+        if len(names) > 1:  # a single family is all there is
+            rows.append(_every_family(probes))
         title = "VQA by family of questions" + (f", set {number + 1}" if number else "")
         yield section(
             title,
@@ -194,6 +187,18 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
             ),
             table(header, rows),
         )
+
+
+def _every_family(probes: Sequence[At]) -> list[Child]:
+    """A row: each run's accuracy over all questions."""
+    first = probes[0]
+    return [
+        "all",
+        whole(first["questions"]),
+        share(first["majority"]),
+        share(first["baseline_accuracy"]),
+        *(with_interval(p["accuracy"], p["interval"], share) for p in probes),
+    ]
 
 
 def _family(name: str, probes: Sequence[At]) -> list[Child]:

@@ -91,15 +91,17 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
         asked = f", asked {task['vqa']}" if task["vqa"] else ""
         fields = [name for name in _DECLARED if any(r[name] for r in task["results"])]
         barred = any(r["bar"] for r in task["results"])
-        header = ["Variant", "Knob", *(_DECLARED[name].header for name in fields)]
+        knobs = [knob_text(row) for row in found.results]
+        turned = any(row.knob is not None for row in found.results)
+        header = ["Variant", *["Knob"] * turned, *(_DECLARED[name].header for name in fields)]
         rows = [
             [
                 result["variant"],
-                knob_text(row),
+                *[knob] * turned,
                 *(_figure(result[name], name) for name in fields),
                 *([_bar(result)] if barred else []),
             ]
-            for result, row in zip(task["results"], found.results, strict=True)
+            for result, knob in zip(task["results"], knobs, strict=True)
         ]
         yield section(
             f"{task['task']}{asked}",
@@ -108,7 +110,7 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
                 "t and the crossed bootstrap. ",
                 *_before(task),
             ),
-            table(header + ["Bar"] * barred, rows, left=2),
+            table(header + ["Bar"] * barred, rows, left=1 + turned),
             _demands(task["results"]) if barred else None,
         )
 
@@ -121,7 +123,8 @@ def passing(compared: At) -> str:
         names = [str(r["variant"]) for r in barred if r["bar"]["passed"].value]
         if barred:
             who = ", ".join(names) or "no variant"
-            said.append(f"On {task['task']}, {who} passes the bar.")
+            asked = f" asked {task['vqa']}" if task["vqa"] else ""
+            said.append(f"On {task['task']}{asked}, {who} passes the bar.")
     return " ".join(said)
 
 
