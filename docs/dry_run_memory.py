@@ -1,6 +1,7 @@
 """What a dry run says of memory, beside what the training takes: the table of docs/own-data.md.
 
     python docs/dry_run_memory.py --backbone random:smolvlm2-256m --methods naive,lora
+    python docs/dry_run_memory.py --backbone random:smolvlm2-256m --set train.freeze=vision
 
 Each dry run, and each training of three steps with its checkpoint, is in a process of its own. They
 train on frames of noise, by anchors of eight questions. What is printed: MB as they were estimated,
@@ -47,6 +48,7 @@ def main() -> None:
     parser.add_argument("--backbone", default="embedded")
     parser.add_argument("--methods", default="naive")
     parser.add_argument("--batch-size", type=int, default=2)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     given = parser.parse_args()
     steps = {"steps": 3, "checkpoint_every": 3, "validate_every": 3, "warmup": 0}
     with tempfile.TemporaryDirectory() as folder:
@@ -54,7 +56,7 @@ def main() -> None:
         for method in given.methods.split(","):
             settings = steps | {"method": method, "batch_size": given.batch_size}
             raw = {"name": method, "backbone": given.backbone, "train": settings}
-            recipe, anchor = recipes.from_mapping(raw), None
+            recipe, anchor = recipes.from_mapping(raw, given.set), None
             bench_runs.save_demos(out, recipe.task)
             if parts := methods.get(method).needs:
                 anchor = out / f"{method}.safetensors"

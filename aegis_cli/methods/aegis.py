@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common import devices
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
@@ -40,12 +41,22 @@ LANGUAGE = "layers."
 
 
 def start(setting: Setting) -> Parts:
-    """Start the method of the paper, or a variant of it."""
+    """Start the method of the paper, or a variant of it.
+
+    Raises:
+        AegisError: options that leave no group to project.
+    """
     options = setting.options
     assert setting.anchor is not None
     chosen = {
         name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups
     }
+    if not any(chosen.values()):
+        raise AegisError(
+            f"aegis.groups: {options['groups']} with no language layer that learns",
+            "a group to project",
+            "--set aegis.groups=all, or freeze less",
+        )
     like = next(p for group in setting.groups.values() for p in group)
     # Weights in bfloat16 are compared with an anchor in float32 all the same.
     like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))

@@ -28,10 +28,11 @@ class Setting:
 
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
-        groups: every parameter of the backbone in exactly one group, `layers.{i}` for each language
-            layer.
+        groups: every parameter that learns in exactly one group, `layers.{i}` for each language
+            layer; in a loop of somebody else's, which may let more of them learn later, every
+            parameter of the backbone.
         sites: each map whose inputs an anchor can describe, or lone row that it has used -> its
-            kind: maps, norms, embeddings or stem.
+            kind: maps, norms, embeddings or stem. What the user has frozen is none of them.
         options: the method's own part of the recipe.
         anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
             none of it.

@@ -33,9 +33,11 @@ def start(setting: Setting) -> Parts:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
     owners = setting.owners  # not the setting, which would keep the whole anchor in memory
-    of_group = schedule(setting.groups, weight)
+    # Of all groups, so that what is frozen does not change how the others are held.
+    groups = setting.backbone.parameter_groups()
+    of_group = schedule(groups, weight)
     strengths: dict[int, float] = {}
-    for group, parameters in setting.groups.items():
+    for group, parameters in groups.items():
         strengths |= {id(p): of_group[group] for p in parameters}
 
     @torch.no_grad()

@@ -364,7 +364,7 @@ def frozen(model: nn.Module, site: str) -> bool:
     if len(set(learns.values())) > 1:
         still = ", ".join(name for name, does in learns.items() if not does)
         raise AegisError(
-            f"a {type(module).__name__} of which only the {still} is frozen",
+            f"{site}, a {type(module).__name__}, of which only the {still} is frozen",
             "all or nothing",
             "freeze both or none",
         )

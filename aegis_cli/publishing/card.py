@@ -20,7 +20,7 @@ from aegis_cli.evaluation.results import Result, evaluated_on
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, freezing
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
@@ -48,7 +48,7 @@ fine-tuned by Aegis {version} with the method `{method}`:
 ## Training
 
 {steps} steps, of {batch} frames each, seed {seed}; learning rate {backbone_lr:g} for the backbone
-and {expert_lr:g} for the expert. Options of the method: `{options}`.{averaged}{merged}
+and {expert_lr:g} for the expert. Options of the method: `{options}`.{frozen}{averaged}{merged}
 
 {stored}
 
@@ -133,6 +133,7 @@ def text(
         backbone_lr=recipe.train.backbone_lr,
         expert_lr=recipe.train.expert_lr,
         options=options,
+        frozen=freezing.sentence(recipe.train.freeze, before=" "),
         averaged="" if decay is None else _AVERAGED.format(decay),
         merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
         stored=stored,

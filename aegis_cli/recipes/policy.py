@@ -25,6 +25,7 @@ from aegis_cli.recipes.keys import (
     key,
     section,
 )
+from aegis_cli.recipes.patterns import EXPECTED, is_pattern
 
 METHODS = (
     "naive",
@@ -81,6 +82,7 @@ TASK = Check(
     TASKS,
 )
 
+PART = Check(EXPECTED, is_pattern)
 
 _AS_IT_IS = "{}"  # what `ask` makes of a question where it changes nothing
 _ASK = (
@@ -314,6 +316,14 @@ class Train:
         later=True,
         doc="Share of the steps after which the backbone stands still and the expert alone goes "
         "on.",
+    )
+    freeze: str | tuple[str, ...] | None = key(
+        PART,
+        None,
+        later=True,
+        doc="Parts of the backbone that do not learn, whatever the method: names or patterns of "
+        "them, such as vision, or [vision, embeddings, layers.0-11], each with all that is below "
+        "it. Null: all learns that the method trains.",
     )
     validation_share: float = key(
         SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."

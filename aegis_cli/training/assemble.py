@@ -32,7 +32,7 @@ from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, Parts, Pass, Setting
 from aegis_cli.methods.stepper import Stepper
-from aegis_cli.models import backbones
+from aegis_cli.models import backbones, structure
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
@@ -41,6 +41,7 @@ from aegis_cli.training import (
     card,
     checkpoint,
     eight_bit,
+    freezing,
     optimizers,
     parallel,
     retention,
@@ -261,7 +262,7 @@ def build(
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     own = list(backbone.parameters())
-    method.adapt(backbone, backbone.language_maps(), options)
+    freezing.adapt(method, backbone, options, recipe.train.freeze, on_event)
     # After it, for adapters are wide anyway, and what does not learn needs no master.
     masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
     del own
@@ -337,10 +338,10 @@ def _loaded(
 
 
 def _ledger(method: Method, backbone: Backbone) -> Ledger:
-    """A ledger of the backbone's groups and layers, or without columns for one backward pass."""
+    """A ledger of what learns and of all layers, or without columns for one backward pass."""
     if not method.dual:
         return Ledger([], [])
-    return Ledger(list(backbone.parameter_groups()), [f"layers.{i}" for i in range(backbone.depth)])
+    return Ledger(list(backbone.learning_groups()), [f"layers.{i}" for i in range(backbone.depth)])
 
 
 def check_named(recipe: Recipe, on_event: OnEvent) -> None:
@@ -557,8 +558,8 @@ def _start(
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
     setting = Setting(
         backbone,
-        backbone.parameter_groups(),
-        sites,
+        backbone.learning_groups(),
+        {site: kind for site, kind in sites.items() if not structure.frozen(backbone, site)},
         options,
         anchor,
         vqa_loss,

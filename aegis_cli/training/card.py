@@ -12,6 +12,7 @@ from aegis_cli.common.version import __version__
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.methods.base import Method
 from aegis_cli.recipes import Recipe
+from aegis_cli.training import freezing
 
 _CARD = """---
 library_name: transformers
@@ -29,7 +30,7 @@ reads it is in `expert.safetensors`, beside this folder.
 
 `{method}`: {summary}. Options: `{options}`.
 {steps} of {planned} steps, {batch} frames per step, seed {seed}; learning rate
-{backbone_lr:g} for the backbone and {expert_lr:g} for the expert.
+{backbone_lr:g} for the backbone and {expert_lr:g} for the expert.{frozen}
 
 ## Data
 
@@ -102,6 +103,7 @@ def text(
         batch=settings.batch_size,
         backbone_lr=settings.backbone_lr,
         expert_lr=settings.expert_lr,
+        frozen=freezing.sentence(settings.freeze, before="\n"),
         seed=recipe.seed,
         task="" if data.task is None else f" of `{data.task}`",
         train=data.train,

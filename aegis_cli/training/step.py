@@ -41,7 +41,10 @@ Rows = TypeVar("Rows", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class LedgerRow:
-    """What the ledger keeps of a step: inner products [G] per group and W2^2 [L] per layer."""
+    """What the ledger keeps of a step: inner products [G] per group and W2^2 [L] per layer.
+
+    The groups are those of which something learns.
+    """
 
     tt: Tensor
     ta: Tensor
@@ -112,10 +115,7 @@ def compute_gradients(
         masters: the weights that a pass sees rounded; their gradients are float32 all the same.
     """
     names = _learning_names(policy.backbone)
-    groups = [
-        [p for p in group if id(p) in names]
-        for group in policy.backbone.parameter_groups().values()
-    ]
+    groups = list(policy.backbone.learning_groups().values())
     settings = _Settings(
         policy,
         method,

@@ -51,6 +51,9 @@ class Toy(nn.Module):
             hidden.append(h)
         return SimpleNamespace(hidden=hidden)
 
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {name: list(self.get_submodule(name).parameters()) for name in GROUPS}
+
 
 def make_setting(
     weight: float,
@@ -59,9 +62,8 @@ def make_setting(
     **changes: str,
 ) -> Setting:
     toy = Toy()
-    groups = {name: list(toy.get_submodule(name).parameters()) for name in GROUPS}
     options = {"weight": weight, "step": "gradient"} | changes
-    return Setting(toy, groups, {}, options, anchor, vqa_loss)
+    return Setting(toy, toy.parameter_groups(), {}, options, anchor, vqa_loss)
 
 
 def values(setting: Setting) -> dict[str, Tensor]:

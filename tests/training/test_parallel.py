@@ -68,6 +68,7 @@ OF_THREE = (
     ("fsdp", "kfac"),
 )
 OF_TWO = (("ddp", "nullspace"), ("fsdp", "nullspace"), ("fsdp", "ewc"), ("fsdp", "lora"))
+FROZEN = (("ddp", "aegis"), ("fsdp", "aegis"), ("fsdp", "nullspace"))  # parts of the backbone are
 OF_TWO_IN_BF16 = (("ddp", "aegis"), ("fsdp", "aegis"), ("fsdp", "nullspace"), ("fsdp", "kfac"))
 
 
@@ -102,6 +103,13 @@ def shared_runs(
     two["fsdp", "nullspace", "average"] = make(
         "nullspace", out / "average", parallel="fsdp", ema_decay=0.6
     )
+    for way, name in FROZEN:
+        held = {"parallel": way, "freeze": ("stem", "layers.0")}
+        two[way, name, "frozen"] = make(name, out / way / f"{name}-frozen", **held)
+    tower = replace(hugging_face.recipe.train, freeze="vision")
+    two["fsdp", "hf", "frozen"] = replace(
+        hugging_face, recipe=replace(hugging_face.recipe, train=tower), out=out / "hf-frozen"
+    )
     for way, name in OF_TWO_IN_BF16:
         two[way, name, "bf16"] = make(
             name, out / way / f"{name}-bf16", parallel=way, precision="bf16"
@@ -132,6 +140,23 @@ def test_processes_train_what_one_trains(
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
     assert_same_training(job.out, alone.out)
+
+
+@pytest.mark.parametrize("key", [*FROZEN, ("fsdp", "hf")])
+def test_parts_that_are_frozen_stay_so_in_every_process(
+    shared_runs: dict[object, Any], tmp_path: Path, key: tuple[str, str]
+) -> None:
+    job = shared_runs[2, *key, "frozen"]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    assert_same_training(job.out, alone.out)
+    before, after = (
+        dict(backbones.load(str(at)).named_parameters()) for at in (job.recipe.backbone, job.out)
+    )
+    parts = ("stem.", "layers.0.", "vlm.model.vision", "vlm.model.multi_modal")
+    still = {name for name in before if name.startswith(parts)}
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    assert still and moved and not moved & still
 
 
 @pytest.mark.parametrize("key", [*OF_TWO_IN_BF16, ("fsdp", "hf")])

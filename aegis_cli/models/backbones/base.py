@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,14 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.attention import KeyValue, Rotation
 from aegis_cli.data.batch import Asked, Images
 from aegis_cli.models.backbones.compiling import compiled
-from aegis_cli.models.structure import digest, lone_rows, owning_modules, site_kind, under
+from aegis_cli.models.structure import (
+    averaging,
+    digest,
+    lone_rows,
+    owning_modules,
+    site_kind,
+    under,
+)
 
 FLOAT32 = "float32"
 # Names of the types that weights are stored in.
@@ -103,6 +110,7 @@ class Backbone(nn.Module, ABC):
             holding them still.
         idle: dotted names of the parts whose outputs nothing reads: no gradient comes to them.
         numbers: how many numbers, from 0 on, `number_texts` has texts for.
+        inside: what stands before the names that its parts have in the model itself.
     """
 
     tied_heads: Mapping[str, str] = {}
@@ -114,6 +122,7 @@ class Backbone(nn.Module, ABC):
     held: Sequence[str] = ()
     idle: Sequence[str] = ()
     numbers: int = 256
+    inside: str = ""
     depth: int
     width: int
     heads: int
@@ -202,6 +211,23 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The parameters, each in exactly one group: `layers.{i}`, or another part by its name."""
+
+    def train(self, mode: bool = True) -> Self:
+        """Go to training mode, but for running averages (BatchNorm's) of what does not learn."""
+        super().train(mode)
+        for module in averaging(self).values():
+            own = list(module.parameters())
+            if own and not any(p.requires_grad for p in own):
+                module.eval()
+        return self
+
+    def learning_groups(self) -> dict[str, list[nn.Parameter]]:
+        """What learns of each group, without the groups of which nothing does."""
+        found = {}
+        for name, group in self.parameter_groups().items():
+            if learning := [p for p in group if p.requires_grad]:
+                found[name] = learning
+        return found
 
     @abstractmethod
     def language_maps(self) -> dict[str, nn.Linear]:

@@ -56,6 +56,7 @@ class HFBackbone(Backbone):
 
     reads_several = True
     rounds = True
+    inside = "vlm."
     _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(

@@ -1,0 +1,53 @@
+"""Patterns of dotted names: `vision`, `layers.0-11`, `*.layers.0-5`, `*.bias`.
+
+`*` stands for any characters, dots too, and `?` for one. A word of the form `0-11`, between dots,
+stands for each of these whole numbers. A pattern is of whole names; there are no brackets, because
+`[0-11]` is a 0 or a 1 in a shell.
+"""
+
+from __future__ import annotations
+
+import re
+
+_RANGE = re.compile(r"(\d+)-(\d{1,3})")
+EXPECTED = "a dotted name such as vision; `*` and `?` as in a shell, and ranges such as layers.0-11"
+
+
+def is_pattern(text: str) -> bool:
+    """Whether a text can be a pattern: words between dots, and ranges that rise below 1,000."""
+    words = text.split(".")
+    return all(re.fullmatch(r"[\w*?-]+", word) and _rises(word) for word in words)
+
+
+def compiled(pattern: str) -> re.Pattern[str]:
+    """What fully matches the names that the pattern stands for."""
+    return re.compile(r"\.".join(map(_word, pattern.split("."))))
+
+
+def at_its_ends(pattern: str) -> tuple[str, ...]:
+    """The pattern with the first number of each of its ranges, and with the last.
+
+    A range that goes beyond what there is was meant for something else. One without ranges has no
+    ends: ().
+    """
+    words = pattern.split(".")
+    if not any(map(_RANGE.fullmatch, words)):
+        return ()
+    return tuple(".".join(_end(word, number) for word in words) for number in (1, 2))
+
+
+def _end(word: str, number: int) -> str:
+    found = _RANGE.fullmatch(word)
+    return found[number] if found else word
+
+
+def _rises(word: str) -> bool:
+    found = re.fullmatch(r"(\d+)-(\d+)", word)
+    return found is None or int(found[1]) <= int(found[2]) < 1000
+
+
+def _word(word: str) -> str:
+    if found := _RANGE.fullmatch(word):
+        numbers = range(int(found[1]), int(found[2]) + 1)
+        return f"(?:{'|'.join(map(str, numbers))})"
+    return "".join({"*": ".*", "?": "."}.get(letter) or re.escape(letter) for letter in word)

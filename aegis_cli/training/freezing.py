@@ -1,0 +1,171 @@
+"""What `train.freeze` names: parts of the backbone that do not learn, whatever the method.
+
+A pattern is of whole names, which are of two kinds. Groups have the names that ledgers and dry runs
+give them, much the same in every backbone: `vision` or `stem`, `embeddings`, `layers.0`,
+`final_norm`, `head`. Modules and parameters have their dotted names in the model itself, as its
+repository has them. What is named stands still with all that is below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from torch import nn
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned
+from aegis_cli.methods.base import Method
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.structure import names
+from aegis_cli.recipes import patterns
+from aegis_cli.recipes.strict_yaml import did_you_mean
+
+_KEY = "train.freeze"
+_BEHIND = {"final_norm", "head"}  # the groups behind all that the action expert reads
+
+
+def adapt(
+    method: Method,
+    backbone: Backbone,
+    options: Mapping[str, Any],
+    freeze: str | Sequence[str] | None,
+    on_event: OnEvent,
+) -> None:
+    """Let the method make trainable what it trains, and freeze what is named.
+
+    Args:
+        freeze: `train.freeze` of the recipe.
+
+    Raises:
+        AegisError: a name that no part has, or nothing that is left to learn.
+    """
+    maps, given = backbone.language_maps(), names(freeze or ())
+    # Before the method puts modules of its own in others' places.
+    every, named = _every(backbone), _named(backbone, given)
+    still = {id(every[name]): name for name in sorted(named)}
+    # A low-rank term would change what its map does.
+    free = {name: linear for name, linear in maps.items() if id(linear.weight) not in still}
+    method.adapt(backbone, free, options)
+    if not given:
+        return
+    adds_less = method.export is not None and len(free) < len(maps)
+    stops = adds_less or any(every[name].requires_grad for name in named)
+    for name in named:
+        every[name].requires_grad_(False)
+    said = f"{_KEY}: {', '.join(given)}"
+    if not stops:
+        text = f"{said} changes nothing: method '{method.name}' trains none of it anyway"
+        on_event(Warned("train", text))
+        return
+    _check_something_learns(backbone, f"{said} with method '{method.name}'")
+    for other, parameter in every.items():
+        if id(parameter) in still and other not in named:
+            text = f"{said} freezes {other} too, the same weight as {still[id(parameter)]}"
+            on_event(Warned("train", f"{text}: name both"))
+
+
+def sentence(freeze: str | Sequence[str] | None, before: str) -> str:
+    """What a model card says of `train.freeze`, after `before`; nothing where nothing is named."""
+    given = names(freeze or ())
+    return f"{before}Of the backbone `{'`, `'.join(given)}` did not learn." if given else ""
+
+
+def _check_something_learns(backbone: Backbone, said: str) -> None:
+    """Raise AegisError unless something learns that the action expert reads."""
+    left = list(backbone.learning_groups())
+    if set(left) <= _BEHIND:
+        but = f" but {' and '.join(left)}, which the action expert does not read" if left else ""
+        raise AegisError(
+            f"{said}: nothing of the backbone is left to learn{but}",
+            "a part that learns",
+            "freeze less; or --method stop-gradient, which trains the action expert alone",
+        )
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+def _named(backbone: Backbone, given: Sequence[str]) -> set[str]:
+    """Names of the parameters that the patterns name, themselves or a part that they lie in.
+
+    Raises:
+        AegisError: a pattern that names none, or a range beyond what there is.
+    """
+    found: set[str] = set()
+    for pattern in given:
+        for needed in (*patterns.at_its_ends(pattern), pattern):
+            matched = _matched(backbone, needed)
+            if not matched:
+                raise _unknown(backbone, pattern, needed)
+        found |= matched
+    return found
+
+
+def _matched(backbone: Backbone, pattern: str) -> set[str]:
+    matches = patterns.compiled(pattern).fullmatch
+    found = {name for name in _every(backbone) if any(map(matches, _and_above(name)))}
+    for group, own in _groups(backbone).items():
+        if matches(group):
+            found.update(own)
+    return found
+
+
+def _every(backbone: Backbone) -> dict[str, nn.Parameter]:
+    """The parameters by all their names in the model itself."""
+    named = backbone.named_parameters(remove_duplicate=False)
+    return {name.removeprefix(backbone.inside): parameter for name, parameter in named}
+
+
+def _groups(backbone: Backbone) -> dict[str, list[str]]:
+    """The names of each group's parameters, of a tied one the first."""
+    first: dict[int, str] = {}
+    for name, parameter in _every(backbone).items():
+        first.setdefault(id(parameter), name)
+    groups = backbone.parameter_groups().items()
+    return {group: [first[id(parameter)] for parameter in own] for group, own in groups}
+
+
+def _and_above(name: str) -> Iterator[str]:
+    """A dotted name, and those of all parts that it lies in."""
+    words = name.split(".")
+    for count in range(1, len(words) + 1):
+        yield ".".join(words[:count])
+
+
+def _unknown(backbone: Backbone, pattern: str, needed: str) -> AegisError:
+    """The error for a pattern that names nothing; `needed` is it, or an end of its range."""
+    groups = list(_groups(backbone))
+    below = {part: None for name in _every(backbone) for part in _and_above(name)}
+    own = ", ".join(_largest(below))
+    others = [group for group in groups if not group.startswith("layers.")]
+    listed = f"{', '.join(others)}, layers.0 to layers.{backbone.depth - 1}"
+    fix, of_range = f"--set {_KEY}={others[0]}", ""
+    if needed != pattern:
+        fix, of_range = "let the range end where the names do", f" (of {pattern})"
+    elif near := _near(needed, groups, list(below)):
+        fix = f"did you mean '{near}'?"
+    return AegisError(
+        f"{_KEY}: '{needed}'{of_range}, and no part of the backbone is called so",
+        f"a group ({listed}), or the dotted name of a module or parameter in or below {own}",
+        fix,
+    )
+
+
+def _largest(below: Iterable[str]) -> list[str]:
+    """The parts of a model that are worth a name in an error: those in its only large one."""
+    known = list(below)
+    outer = [name for name in known if "." not in name]
+    found = []
+    for name in outer:
+        inner = [n for n in known if n.startswith(f"{name}.") and n.count(".") == 1]
+        # A model of the hub has its two towers in a part `model`, and a head beside it.
+        towers = len(outer) <= 2 and len(inner) > 1
+        found += inner if towers else [name]
+    return found
+
+
+def _near(name: str, groups: Sequence[str], below: Sequence[str]) -> str | None:
+    """What may have been meant: the part whose name ends so, or one that is spelled alike."""
+    ends = [known for known in below if known.endswith(f".{name}")]
+    return min(ends, key=len, default=None) or did_you_mean(name, groups + list(below))
