@@ -41,6 +41,10 @@ from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 
+# A proximal step of this weight takes away all that has a curvature. In float32 a larger one may be
+# infinite, and infinity times a curvature of 0 is no number.
+_HEAVIEST = 1e30
+
 
 @dataclass(frozen=True)
 class Curvature:
@@ -87,6 +91,10 @@ class Curvature:
             bias: displacement of its bias, [o].
             strength: the penalty's weight w, a tensor [] where nobody may read it.
         """
+        if isinstance(strength, Tensor):
+            strength = strength.clamp(max=_HEAVIEST)
+        else:
+            strength = min(strength, _HEAVIEST)
         return self._weighed(weight, bias, strength, _taken)
 
     def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:

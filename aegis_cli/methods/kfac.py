@@ -25,6 +25,7 @@ the root mean square of its gradient and R that of all maps' together.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -93,7 +94,7 @@ def start(setting: Setting) -> Parts:
         # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
-            strength = strength / _at_least(update.rate_left, _LEAST_RATE) ** growth
+            strength = strength / _shrunk(update.rate_left, growth)
         for group in groups:
             joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
 
@@ -113,9 +114,14 @@ def start(setting: Setting) -> Parts:
     return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
 
 
-def _at_least(rate: float | Tensor, least: float) -> float | Tensor:
-    """A share of the peak learning rate that can be divided by: a schedule may end at 0."""
-    return rate.clamp(min=least) if isinstance(rate, Tensor) else max(rate, least)
+def _shrunk(rate: float | Tensor, growth: float) -> float | Tensor:
+    """A share of the peak learning rate to the power of `growth`, above 0: it is divided by."""
+    # A schedule may end at 0, and a high power of a small share is 0 too.
+    return _at_least(_at_least(rate, _LEAST_RATE) ** growth, sys.float_info.min)
+
+
+def _at_least(x: float | Tensor, least: float) -> float | Tensor:
+    return x.clamp(min=least) if isinstance(x, Tensor) else max(x, least)
 
 
 @dataclass(frozen=True)
