@@ -95,7 +95,7 @@ class Curvature:
             strength = strength.clamp(max=_HEAVIEST)
         else:
             strength = min(strength, _HEAVIEST)
-        return self._weighed(weight, bias, strength, _taken)
+        return self._weighed(weight, bias, strength, taken)
 
     def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
         """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
@@ -208,6 +208,6 @@ def _relative(spectrum: Spectrum) -> Tensor:
     return ratio(spectrum.values, spectrum.values.mean())[: spectrum.vectors.shape[1]]
 
 
-def _taken(strength: Tensor) -> Tensor:
+def taken(strength: Tensor) -> Tensor:
     """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
     return strength / (1 + strength)
