@@ -85,9 +85,9 @@ def penalty(context: TaskContext, traces: Traces) -> Tensor:
     for name, size in sizes.items():
         history, new = used[name]
         columns = range(len(history), len(history) + len(new))
-        price = context.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
+        price = context.options["reuse"] * size / sum(sizes.values())
         for passed in traces[name]:
-            charge(passed, columns, price)
+            charge(passed, columns, price / len(traces[name]))
     norms = []
     for name, (_, new) in used.items():
         norms += [squared_norm(expert) for expert in context.sites[name].of(new)]
