@@ -158,12 +158,19 @@ def apply(
         torch._foreach_mul_(there, _like(wg, there[0]))
     if not isinstance(wa, Tensor) and wa == 0:
         return list(gs)
-    both = [(g, a) for g, a in zip(gs, as_, strict=True) if g is not None and a is not None]
-    if both:
-        add_scaled([g for g, _ in both], [a for _, a in both], wa)
-    return [
-        scaled(a, wa) if g is None and a is not None else g for g, a in zip(gs, as_, strict=True)
-    ]
+    combined: list[Tensor | None] = []
+    changed, added = list[Tensor](), list[Tensor]()
+    for g, a in zip(gs, as_, strict=True):
+        if g is None and a is not None:
+            combined.append(scaled(a, wa))
+            continue
+        combined.append(g)
+        if g is not None and a is not None:
+            changed.append(g)
+            added.append(a)
+    if changed:
+        add_scaled(changed, added, wa)
+    return combined
 
 
 def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor) -> None:
