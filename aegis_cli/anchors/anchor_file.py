@@ -8,7 +8,7 @@ are read. The rounding turns a direction by about 2e-4, so it lets through 4e-8 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -174,16 +174,12 @@ def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
 def to_device(anchor: Anchor, device: torch.device) -> Anchor:
     """Move all of an anchor's tensors to the device on which training runs."""
     return Anchor(
-        image=_moved_layers(anchor.image, device),
-        text=_moved_layers(anchor.text, device),
+        image=[layer.to(device) for layer in anchor.image],
+        text=[layer.to(device) for layer in anchor.text],
         inputs=_moved(anchor.inputs, device),
         fisher={name: information.to(device) for name, information in anchor.fisher.items()},
         curvature=_moved(anchor.curvature, device),
     )
-
-
-def _moved_layers(layers: Sequence[Moments], device: torch.device) -> list[Moments]:
-    return [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in layers]
 
 
 def _moved(spectra: Mapping[str, Spectrum], device: torch.device) -> dict[str, Spectrum]:

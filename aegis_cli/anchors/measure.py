@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -189,7 +189,7 @@ def _on_questions(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
     surety = curvature.Surety()
-    anchor, seconds = _measure_parts(model, asked, settings, on_event, ranks, surety)
+    anchor, seconds = _PartMeasurement(model, asked, settings, on_event, ranks, surety).parts()
     return _Measured(
         anchor,
         model.fingerprint(),
@@ -265,61 +265,76 @@ def _check_frames(settings: Settings, demos: Path | None) -> Path:
     return demos
 
 
-def _measure_parts(
-    model: Backbone,
-    asked: VQASet,
-    settings: Settings,
-    on_event: OnEvent,
-    ranks: Ranks,
-    surety: curvature.Surety,
-) -> tuple[Anchor, dict[str, float]]:
-    """The parts, always in one order, and the seconds each took.
+@dataclass(frozen=True)
+class _PartMeasurement:
+    """The questions that each part is measured on, and what with.
 
-    Args:
+    Attributes:
         surety: what counts the answers of the curvature.
     """
-    image: Sequence[Moments] = ()
-    text: Sequence[Moments] = ()
-    spectra: dict[str, dict[str, Spectrum]] = {"inputs": {}, "curvature": {}}
-    information: dict[str, Tensor] = {}
-    seconds: dict[str, float] = {}
-    memory = None if settings.memory is None else settings.memory * 10**6
-    for part in sorted(set(settings.parts)):
-        start = time.perf_counter()
-        if part == "moments":
-            image, text = moments.measure(
-                model, asked.batches(settings.batch_size), len(asked.questions), on_event, ranks
-            )
-        elif part == "inputs":
-            spectra[part] = inputs.measure(
-                model,
-                asked,
-                settings.energy,
-                settings.batch_size,
-                on_event,
-                memory,
-                settings.exact_width,
-                ranks,
-                inputs.Drawn(settings.tokens, settings.seed),
-            )
-        elif part == "curvature":
-            spectra[part] = curvature.measure(
-                model,
-                asked,
-                settings.energy,
-                settings.seed,
-                settings.batch_size,
-                on_event,
-                memory,
-                settings.exact_width,
-                ranks,
-                settings.temperature,
-                surety,
-            )
-        else:
-            information = fisher.measure(
-                model, asked, min(settings.fisher_samples, len(asked.questions)), on_event, ranks
-            )
-        seconds[part] = time.perf_counter() - start
-    anchor = Anchor(image, text, spectra["inputs"], information, spectra["curvature"])
-    return anchor, seconds
+
+    model: Backbone
+    asked: VQASet
+    settings: Settings
+    on_event: OnEvent
+    ranks: Ranks
+    surety: curvature.Surety
+
+    def parts(self) -> tuple[Anchor, dict[str, float]]:
+        """The parts asked for, always in one order, and the seconds each took."""
+        measures = {
+            "moments": self._moments,
+            "inputs": self._inputs,
+            "curvature": self._curvature,
+            "fisher": self._fisher,
+        }
+        found: dict[str, Any] = {}
+        seconds: dict[str, float] = {}
+        for part in sorted(set(self.settings.parts)):
+            start = time.perf_counter()
+            found[part] = measures[part]()
+            seconds[part] = time.perf_counter() - start
+        image, text = found.pop("moments", ((), ()))
+        return Anchor(image, text, **found), seconds
+
+    def _moments(self) -> tuple[list[Moments], list[Moments]]:
+        batches = self.asked.batches(self.settings.batch_size)
+        count = len(self.asked.questions)
+        return moments.measure(self.model, batches, count, self.on_event, self.ranks)
+
+    def _inputs(self) -> dict[str, Spectrum]:
+        return inputs.measure(
+            self.model,
+            self.asked,
+            self.settings.energy,
+            self.settings.batch_size,
+            self.on_event,
+            self._memory,
+            self.settings.exact_width,
+            self.ranks,
+            inputs.Drawn(self.settings.tokens, self.settings.seed),
+        )
+
+    def _curvature(self) -> dict[str, Spectrum]:
+        return curvature.measure(
+            self.model,
+            self.asked,
+            self.settings.energy,
+            self.settings.seed,
+            self.settings.batch_size,
+            self.on_event,
+            self._memory,
+            self.settings.exact_width,
+            self.ranks,
+            self.settings.temperature,
+            self.surety,
+        )
+
+    def _fisher(self) -> dict[str, Tensor]:
+        samples = min(self.settings.fisher_samples, len(self.asked.questions))
+        return fisher.measure(self.model, self.asked, samples, self.on_event, self.ranks)
+
+    @property
+    def _memory(self) -> int | None:
+        """Bytes that the sums of a group of maps may take; None: all maps are one group."""
+        return None if self.settings.memory is None else self.settings.memory * 10**6

@@ -102,15 +102,12 @@ def measure_passes(
             on_event(Progress("anchor", done, total, "samples"))
     image: list[Moments] = []
     text: list[Moments] = []
-    measured = _on_cpu(recorder.image), _on_cpu(recorder.text)
+    # Those of several processes, each of which may have its own GPU, can be merged on the CPU.
+    cpu = torch.device("cpu")
+    measured = [[layer.to(cpu) for layer in found] for found in (recorder.image, recorder.text)]
     for of_image, of_text in ranks.gathered(measured):
         image, text = _merged(image, of_image), _merged(text, of_text)
     return image, text
-
-
-def _on_cpu(found: Sequence[Moments]) -> list[Moments]:
-    """The moments where those of several processes can be merged, each of which has its own GPU."""
-    return [Moments(one.count, one.mean.cpu(), one.var.cpu()) for one in found]
 
 
 def _merged(found: list[Moments], more: list[Moments]) -> list[Moments]:

@@ -83,14 +83,8 @@ def learn(
             if current.phase == 1:
                 _watch(run, training)
             if current.step % settings.log_every == 0 or current.step == steps:
-                line = {
-                    "task": current.task,
-                    "step": current.step,
-                    "phase": current.phase,
-                    "loss": sum(current.window) / len(current.window),
-                }
-                folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
-                current.window, started = [], time.perf_counter()
+                _log(run, time.perf_counter() - started)
+                started = time.perf_counter()
             # after the last step the state waits for the evaluation, so that a run goes on either
             # before a task's end or after it, and nowhere in between
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
@@ -180,6 +174,20 @@ def _step(run: StreamRun, training: TaskTraining, step: int, batch: Any) -> floa
     return figures["loss"]
 
 
+def _log(run: StreamRun, seconds: float) -> None:
+    """Write a line of metrics, of the steps since the last one."""
+    current = run.current
+    line = {
+        "task": current.task,
+        "step": current.step,
+        "phase": current.phase,
+        "loss": sum(current.window) / len(current.window),
+        "seconds": seconds,
+    }
+    folder.append_metrics(run.out, line)
+    current.window = []
+
+
 # --- the end of phase 1 ---------------------------------------------------------------------------
 
 
@@ -204,7 +212,9 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
     """Mean over maps of the total variation since the last check; infinite at the first."""
     if not before:
         return math.inf
-    distances = [total_variation(torch.tensor(before[n]), torch.tensor(after[n])) for n in after]
+    distances = []
+    for name, masses in after.items():
+        distances.append(total_variation(torch.tensor(before[name]), torch.tensor(masses)))
     return sum(distances) / len(distances)
 
 

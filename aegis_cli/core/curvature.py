@@ -41,6 +41,10 @@ from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
 
+# A proximal step of this weight takes away all that has a curvature. In float32 a larger one may be
+# infinite, and infinity times a curvature of 0 is no number.
+_HEAVIEST = 1e30
+
 
 @dataclass(frozen=True)
 class Curvature:
@@ -87,7 +91,11 @@ class Curvature:
             bias: displacement of its bias, [o].
             strength: the penalty's weight w, a tensor [] where nobody may read it.
         """
-        return self._weighed(weight, bias, strength, _taken)
+        if isinstance(strength, Tensor):
+            strength = strength.clamp(max=_HEAVIEST)
+        else:
+            strength = min(strength, _HEAVIEST)
+        return self._weighed(weight, bias, strength, taken)
 
     def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
         """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
@@ -200,6 +208,6 @@ def _relative(spectrum: Spectrum) -> Tensor:
     return ratio(spectrum.values, spectrum.values.mean())[: spectrum.vectors.shape[1]]
 
 
-def _taken(strength: Tensor) -> Tensor:
+def taken(strength: Tensor) -> Tensor:
     """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
     return strength / (1 + strength)

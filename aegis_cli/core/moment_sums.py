@@ -173,30 +173,14 @@ class Sketch(MomentSum):
 
     @torch.no_grad()
     def spectrum(self, count: int, energy: float) -> Spectrum:
-        probe = _probe(self._width, columns(self._width), str(self._device))
         trace = (self._trace / count).cpu()
         # A shift by the rounding of the sum keeps what is inverted positive; it is undone below.
         shift = float(torch.linalg.matrix_norm(self._seen)) / count * _ROUNDING
         if shift == 0:
             return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace * 0)
-
-        def shifted() -> Iterator[tuple[Tensor, Tensor]]:
-            """Rows of O and of Y + shift O; all of them in float64 would be several sketches."""
-            for part, seen in zip(
-                probe.split(_WIDE_ROWS), self._seen.split(_WIDE_ROWS), strict=True
-            ):
-                wide = part.double()
-                yield wide, seen.double() / count + shift * wide
-
-        core = sum(part.T @ seen for part, seen in shifted())
-        root = torch.linalg.cholesky((core + core.T) / 2)
-
-        def halves() -> Iterator[Tensor]:
-            """Rows of B, with B B^T = Y (O^T Y)^-1 Y^T."""
-            for _, seen in shifted():
-                yield torch.linalg.solve_triangular(root, seen.T, upper=False).T
-
-        rising, turn = torch.linalg.eigh(sum(half.T @ half for half in halves()))
+        root = self._root(count, shift)
+        gram = sum(half.T @ half for half in self._halves(root, count, shift))
+        rising, turn = torch.linalg.eigh(gram)  # B^T B has the values of B B^T
         values, turn = rising.flip(0), turn.flip(1)
         resolved = int((values > 2 * shift).sum())
         scaled = turn[:, :resolved] / values[:resolved].sqrt()
@@ -204,11 +188,30 @@ class Sketch(MomentSum):
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
         vectors = torch.empty(self._width, kept)
-        for part, half in zip(vectors.split(_WIDE_ROWS), halves(), strict=True):
+        parts = vectors.split(_WIDE_ROWS)
+        for part, half in zip(parts, self._halves(root, count, shift), strict=True):
             part.copy_(half @ scaled[:, :kept])
         # Rounding may leave less than nothing.
         rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
         return with_rest(values[:kept], vectors, rest)
+
+    def _shifted(self, count: int, shift: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """Rows of O and of Y + shift O; all of them in float64 would be several sketches."""
+        probe = _probe(self._width, columns(self._width), str(self._device))
+        both = zip(probe.split(_WIDE_ROWS), self._seen.split(_WIDE_ROWS), strict=True)
+        for part, seen in both:
+            wide = part.double()
+            yield wide, seen.double() / count + shift * wide
+
+    def _root(self, count: int, shift: float) -> Tensor:
+        """The Cholesky root of O^T (Y + shift O), [l, l]."""
+        core = sum(part.T @ seen for part, seen in self._shifted(count, shift))
+        return torch.linalg.cholesky((core + core.T) / 2)
+
+    def _halves(self, root: Tensor, count: int, shift: float) -> Iterator[Tensor]:
+        """Rows of B, with B B^T = Y (O^T Y)^-1 Y^T, both Y with the shift."""
+        for _, seen in self._shifted(count, shift):
+            yield torch.linalg.solve_triangular(root, seen.T, upper=False).T
 
 
 class TraceOnly(MomentSum):

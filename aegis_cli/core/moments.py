@@ -29,6 +29,10 @@ class Moments:
     mean: Tensor
     var: Tensor
 
+    def to(self, like: Tensor | torch.device) -> Moments:
+        """The same on a device, or on a tensor's device and in its dtype."""
+        return Moments(self.count, self.mean.to(like), self.var.to(like))
+
 
 def empty(width: int) -> Moments:
     """The moments of no tokens: the neutral element of `merge`."""

@@ -2,7 +2,8 @@
 
 For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get
 D. So the *applied* update is projected, weight decay included: D <- D - D A with A = U U^T. A soft
-threshold has A = C (C + s)^-1 instead, with C in shares of its trace.
+threshold has A = C (C + s)^-1 instead, with C in shares of its trace. What it leaves is the X that
+minimises |X - D|^2 + E|X x|^2 / s: a proximal step, as that of core/curvature.py is.
 """
 
 from __future__ import annotations

@@ -158,38 +158,49 @@ def apply(
         torch._foreach_mul_(there, _like(wg, there[0]))
     if not isinstance(wa, Tensor) and wa == 0:
         return list(gs)
-    both = [(g, a) for g, a in zip(gs, as_, strict=True) if g is not None and a is not None]
-    if both:
-        add_scaled([g for g, _ in both], [a for _, a in both], wa)
-    return [
-        scaled(a, wa) if g is None and a is not None else g for g, a in zip(gs, as_, strict=True)
-    ]
+    combined: list[Tensor | None] = []
+    changed, added = list[Tensor](), list[Tensor]()
+    for g, a in zip(gs, as_, strict=True):
+        if g is None and a is not None:
+            combined.append(scaled(a, wa))
+            continue
+        combined.append(g)
+        if g is not None and a is not None:
+            changed.append(g)
+            added.append(a)
+    if changed:
+        add_scaled(changed, added, wa)
+    return combined
 
 
 def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor) -> None:
     """x <- x + scale y in place, for each; a scale that is a tensor [] is not read."""
-    if isinstance(scale, Tensor):
-        torch._foreach_add_(list(xs), torch._foreach_mul(list(ys), _like(scale, ys[0])))
-    elif all(_holds(y.dtype, scale) for y in ys):
-        torch._foreach_add_(list(xs), list(ys), alpha=scale)
-    else:
+    if not all(_holds(y.dtype, scale) for y in ys):
         for x, y in zip(xs, ys, strict=True):
-            x.add_(y.double(), alpha=scale)
+            x.add_(y.double() * scale)
+    elif isinstance(scale, Tensor):
+        torch._foreach_add_(list(xs), torch._foreach_mul(list(ys), _like(scale, ys[0])))
+    else:
+        torch._foreach_add_(list(xs), list(ys), alpha=scale)
 
 
 def scaled(y: Tensor, scale: float | Tensor) -> Tensor:
     """scale y, a new tensor of y's type."""
-    if isinstance(scale, Tensor) or _holds(y.dtype, scale):
+    if _holds(y.dtype, scale):
         return y * scale
     return (y.double() * scale).to(y.dtype)
 
 
-def _holds(dtype: torch.dtype, scale: float) -> bool:
+def _holds(dtype: torch.dtype, scale: float | Tensor) -> bool:
     """Whether a type has numbers as large as a finite scale.
 
     A small anchor gradient has a large weight, beyond float16 easily, and their product is as small
-    as the task gradient. PyTorch refuses such a number.
+    as the task gradient. PyTorch refuses such a number, and makes a tensor of it infinite. A tensor
+    is not read, and may always be too large for float16. For the wider types it is only where the
+    gradients differ by 38 orders of magnitude.
     """
+    if isinstance(scale, Tensor):
+        return dtype != torch.float16
     return not math.isfinite(scale) or abs(scale) <= torch.finfo(dtype).max
 
 

@@ -95,11 +95,12 @@ def channel_moment(rows: Tensor, bias: bool) -> Tensor:
         [D, 1, 1] float64; with a bias [D, 2, 2].
     """
     x = rows.double()
-    squares, sums, ones = x.square().sum(0), x.sum(0), torch.full_like(x[0], len(x))
+    squares = x.square().sum(0)
     if not bias:
         return squares[:, None, None]
+    sums = x.sum(0)
     of_scale = torch.stack([squares, sums], -1)
-    of_shift = torch.stack([sums, ones], -1)
+    of_shift = torch.stack([sums, torch.full_like(sums, len(x))], -1)
     return torch.stack([of_scale, of_shift], -2)
 
 

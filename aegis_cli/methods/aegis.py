@@ -18,6 +18,7 @@ at the first of so many steps alone; with `fraction`, on so much of the batch.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -75,6 +76,34 @@ def start(setting: Setting) -> Parts:
 # --- the anchor gradient --------------------------------------------------------------------------
 
 
+@dataclass
+class _Target:
+    """What the tokens of one type are compared with.
+
+    Attributes:
+        scope: which tokens: `all`, `image` or `text`.
+        anchor: their Gaussian in the pre-trained backbone, one per layer.
+        weights: what each layer's distance counts [L].
+    """
+
+    scope: str
+    anchor: Sequence[Moments]
+    weights: Tensor
+
+    def cost(self, seen: Pass) -> tuple[Tensor, Tensor]:
+        """The transport cost of a pass, with its graph, and W2^2 of each layer [L]."""
+        self._follow(seen.hidden[0].device)
+        inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}
+        found = _moments(seen, seen.mask & inside[self.scope])
+        return transport_penalty(found, self.anchor, weights=self.weights)
+
+    def _follow(self, device: torch.device) -> None:
+        """Go where the hidden states are: somebody may have moved the model meanwhile."""
+        if self.anchor[0].mean.device != device:
+            self.anchor = [layer.to(device) for layer in self.anchor]
+            self.weights = self.weights.to(device)
+
+
 def _penalty(
     anchor: Anchor, scope: str, weighting: str, like: Tensor
 ) -> Callable[[Pass], tuple[Tensor, Tensor]]:
@@ -82,46 +111,32 @@ def _penalty(
 
     The scope `each` averages the costs of image and of text tokens.
     """
-    targets = {"image": anchor.image, "text": anchor.text}
+    measured = {"image": anchor.image, "text": anchor.text}
     # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
-    targets["all"] = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
+    measured["all"] = [merge(*both) for both in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
-    wanted = {}
+    targets = []
     for name in scopes:
-        layers = targets[name]
-        wanted[name] = [Moments(m.count, m.mean.to(like), m.var.to(like)) for m in layers]
-    # Once: they are checked, and on a GPU that waits.
-    weights = {name: layer_weights(moments, weighting) for name, moments in wanted.items()}
+        layers = [layer.to(like) for layer in measured[name]]
+        # Once: they are checked, and on a GPU that waits.
+        targets.append(_Target(name, layers, layer_weights(layers, weighting)))
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
-        costs, distances = [], []
-        device = seen.hidden[0].device
-        for name, moments in list(wanted.items()):
-            if moments[0].mean.device != device:  # somebody has moved the model meanwhile
-                moments = [Moments(m.count, m.mean.to(device), m.var.to(device)) for m in moments]
-                wanted[name], weights[name] = moments, weights[name].to(device)
-            cost, w2 = _cost(seen, name, moments, weights[name])
-            costs.append(cost)
-            distances.append(w2)
+        costs, distances = zip(*(target.cost(seen) for target in targets), strict=True)
         return torch.stack(costs).mean(), torch.stack(distances).mean(0)
 
     return penalty
 
 
-def _cost(
-    seen: Pass, scope: str, anchor: Sequence[Moments], weights: Tensor
-) -> tuple[Tensor, Tensor]:
-    inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}[scope]
-    mask = seen.mask & inside
+def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
+    """Mean [D] and variance [D] of each layer over a pass's tokens in the mask [B, T]."""
     # To select rows on a GPU would wait for their number, once a layer.
     waits = devices.reading_waits(mask.device)
     if seen.total is not None:
-        moments = shared_moments(seen.hidden, mask, seen.total, reads=not waits)
-    elif waits:
-        moments = joint_moments(seen.hidden, mask)
-    else:
-        moments = [batch_moments(hidden, mask) for hidden in seen.hidden]
-    return transport_penalty(moments, anchor, weights=weights)
+        return shared_moments(seen.hidden, mask, seen.total, reads=not waits)
+    if waits:
+        return joint_moments(seen.hidden, mask)
+    return [batch_moments(hidden, mask) for hidden in seen.hidden]
 
 
 # --- what is done with it -------------------------------------------------------------------------

@@ -18,13 +18,15 @@ in place of a Kronecker product.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
+from aegis_cli.core.curvature import taken
 from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
 
@@ -44,25 +46,56 @@ def start(setting: Setting) -> Parts:
         for name, parameter in learning.items():
             rows = setting.owners.rows(len(parameter))
             importance[name] = importance[name][rows].clone()
+    held = []
+    for name, parameter in learning.items():
+        held.append(_Held(parameter, reference[name], importance[name]))
+    if setting.options["step"] == "gradient":
+        return Parts(pull=_pull(held, weight))
+    # It compares with the start, not with the step before, so no step's weights are copied.
+    return Parts(constrain=_constrain(held, weight), compares=False)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A parameter that is drawn to where it was.
+
+    Attributes:
+        origin: its pre-trained value.
+        importance: F, of its rows that this process has.
+    """
+
+    parameter: nn.Parameter
+    origin: Tensor
+    importance: Tensor
+
+    def moved(self) -> Tensor:
+        """How far its rows here are from where they began."""
+        return rows_here(self.parameter) - rows_here(self.origin)
+
+
+def _pull(held: Sequence[_Held], weight: float) -> Callable[[], None]:
+    """The penalty's gradient, added to the task's."""
 
     @torch.no_grad()
     def pull() -> None:
-        for name, parameter in learning.items():
-            if parameter.grad is not None:  # without a gradient it has not moved
-                moved = rows_here(parameter) - rows_here(reference[name])
-                rows_here(parameter.grad).addcmul_(importance[name], moved, value=weight)
+        for one in held:
+            gradient = one.parameter.grad
+            if gradient is not None:  # without a gradient it has not moved
+                rows_here(gradient).addcmul_(one.importance, one.moved(), value=weight)
+
+    return pull
+
+
+def _constrain(held: Sequence[_Held], weight: float) -> Callable[[Update], None]:
+    """The proximal step."""
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        for name, parameter in learning.items():
-            strength = weight * update.steps * importance[name]
-            here = rows_here(parameter)
-            here.sub_((here - rows_here(reference[name])) * (strength / (1 + strength)))
+        for one in held:
+            share = taken(weight * update.steps * one.importance)
+            rows_here(one.parameter).sub_(one.moved() * share)
 
-    if setting.options["step"] == "gradient":
-        return Parts(pull=pull)
-    # It compares with the start, not with the step before, so no step's weights are copied.
-    return Parts(constrain=constrain, compares=False)
+    return constrain
 
 
 def relative_fisher(

@@ -25,7 +25,8 @@ the root mean square of its gradient and R that of all maps' together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -68,24 +69,39 @@ def start(setting: Setting) -> Parts:
 
     With weight 0 nothing is drawn back.
     """
-    options = setting.options
-    weight, balance, growth = options["weight"], options["balance"], options["growth"]
-    assert setting.anchor is not None
+    options, owners = setting.options, setting.owners
+    weight, balance = options["weight"], options["balance"]
     pairs = {site: weights(setting.backbone, site) for site in setting.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
-    owners = setting.owners
     slowed = (lambda: shares(maps, balance, owners)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
-    found = curvature.curvatures(
-        setting.anchor,
-        {site: rows_here(pair[0]) for site, pair in maps.items()},
-        options["damping"],
+    groups = _grouped(maps, _curvatures(setting, maps), owners)
+    if options["step"] == "gradient":
+        return Parts(shares=slowed, pull=_pull(groups, weight))
+    return Parts(
+        shares=slowed,
+        constrain=_constrain(groups, weight, options["growth"]),
+        compares=False,  # it does so with the start, so no step's weights are copied
+        every=options["every"],
     )
+
+
+def _curvatures(setting: Setting, maps: Mapping[str, Pair]) -> dict[str, Curvature]:
+    """The curvature of each map's rows that this process has."""
+    owners = setting.owners
+    likes = {site: rows_here(weight) for site, (weight, _) in maps.items()}
+    assert setting.anchor is not None
+    found = curvature.curvatures(setting.anchor, likes, setting.options["damping"])
     if owners.several:
-        for site, pair in maps.items():
-            found[site] = found[site].of_rows(owners.rows(len(pair[0])), owners.total)
-    groups = _grouped(maps, found, owners)
+        # One after the other, so that no more than one map's rows are there twice.
+        for site, (weight, _) in maps.items():
+            found[site] = found[site].of_rows(owners.rows(len(weight)), owners.total)
+    return found
+
+
+def _constrain(groups: Sequence[_Group], weight: float, growth: float) -> Callable[[Update], None]:
+    """The proximal step."""
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
@@ -93,9 +109,15 @@ def start(setting: Setting) -> Parts:
         # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
-            strength = strength / _at_least(update.rate_left, _LEAST_RATE) ** growth
+            strength = strength / _shrunk(update.rate_left, growth)
         for group in groups:
             joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
+
+    return constrain
+
+
+def _pull(groups: Sequence[_Group], weight: float) -> Callable[[], None]:
+    """The penalty's gradient, added to the task's."""
 
     @torch.no_grad()
     def pull() -> None:
@@ -107,15 +129,17 @@ def start(setting: Setting) -> Parts:
                     if tensor is not None and tensor.grad is not None and by is not None:
                         rows_here(tensor.grad).add_(by)
 
-    if options["step"] == "gradient":
-        return Parts(shares=slowed, pull=pull)
-    # It compares with the start, not with the step before, so no step's weights are copied.
-    return Parts(shares=slowed, constrain=constrain, compares=False, every=options["every"])
+    return pull
 
 
-def _at_least(rate: float | Tensor, least: float) -> float | Tensor:
-    """A share of the peak learning rate that can be divided by: a schedule may end at 0."""
-    return rate.clamp(min=least) if isinstance(rate, Tensor) else max(rate, least)
+def _shrunk(rate: float | Tensor, growth: float) -> float | Tensor:
+    """A share of the peak learning rate to the power of `growth`, above 0: it is divided by."""
+    # A schedule may end at 0, and a high power of a small share is 0 too.
+    return _at_least(_at_least(rate, _LEAST_RATE) ** growth, sys.float_info.min)
+
+
+def _at_least(x: float | Tensor, least: float) -> float | Tensor:
+    return x.clamp(min=least) if isinstance(x, Tensor) else max(x, least)
 
 
 @dataclass(frozen=True)

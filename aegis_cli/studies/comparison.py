@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter, sub
 from typing import Annotated, Any
@@ -343,17 +343,17 @@ def task_results(
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
-        samples[name] = Sample({(task, seed): row for seed, row in own.items() if measured(row)})
+        figures = {(task, seed): row for seed, row in own.items() if measured(row)}
+        samples[name] = Sample(figures)
     results, pairs = [], list[tuple[PolicyFigures, PolicyFigures]]()
     for name, own in found.items():
         variant = variants[name]
-        cost = _cost(name, variant.against, costs)
         # Contrasts are declared against naive, whose place a variant may give to another.
-        reference = variant.against or (None if name == NAIVE else NAIVE)
-        references = {NAIVE: samples[reference]} if reference in samples else {}
+        against = variant.against or (None if name == NAIVE else NAIVE)
+        references = {NAIVE: samples[against]} if against in samples else {}
         for other in references.values():
-            for setting in samples[name].figures.keys() & other.figures.keys():
-                pairs.append((samples[name].figures[setting], other.figures[setting]))
+            pairs += _pairs(samples[name], other)
+        cost = _cost(name, variant.against, costs)
         made = PolicyResult(
             variant=name,
             method=variant.method,
@@ -369,19 +369,29 @@ def task_results(
         if not variant.is_plain(NAIVE) and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
-    # One cell of each set of questions, since seeds may have sets of their own.
-    asked: dict[int, PolicyFigures] = {}
-    for sample in samples.values():
-        for row in sample.figures.values():
-            asked.setdefault(row.probe_seed, row)
-    before = {name: _mean([getattr(row, name) for row in asked.values()]) for name in _BEFORE}
     return TaskResults(
         task=task,
         results=results,
         compared=len(pairs),
         across_versions=sum(one.code != other.code for one, other in pairs),
-        **before,
+        **_before(samples.values()),
     )
+
+
+def _pairs(sample: Sample, reference: Sample) -> list[tuple[PolicyFigures, PolicyFigures]]:
+    """Cells of the same task and seed."""
+    settings = sample.figures.keys() & reference.figures.keys()
+    return [(sample.figures[setting], reference.figures[setting]) for setting in settings]
+
+
+def _before(samples: Iterable[Sample]) -> dict[str, float | None]:
+    """What the backbone knew before training, a mean over the sets of questions that were asked."""
+    # One cell of each set of questions, since seeds may have sets of their own.
+    asked: dict[int, PolicyFigures] = {}
+    for sample in samples:
+        for row in sample.figures.values():
+            asked.setdefault(row.probe_seed, row)
+    return {name: _mean([getattr(row, name) for row in asked.values()]) for name in _BEFORE}
 
 
 _BEFORE = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")

@@ -123,16 +123,21 @@ def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> 
     measures = [point for point in everyone if point.method == rule.reference] or everyone
     chosen = {}
     for variant, own in points.items():
-        best = max(_ability(rule, p) for p in (measures if rule.reference else own))
+        compared = measures if rule.reference else own
+        best = max(_ability(rule, point) for point in compared)
         chosen[variant] = _best(rule, own, max(0, best - within / 100 - ROUNDING))
     return chosen
 
 
 def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
-    able = [i for i, point in enumerate(own) if _ability(rule, point) >= least]
+    """Which of a variant's points is chosen; of those that are equal, `max` takes the first."""
+    abilities = [_ability(rule, point) for point in own]
+    merits = [rule.merit(point) for point in own]
+    numbers = range(len(own))
+    able = [i for i in numbers if abilities[i] >= least]
     if able:
-        return max(able, key=lambda i: (rule.merit(own[i]), _ability(rule, own[i]), -i))
-    return max(range(len(own)), key=lambda i: (_ability(rule, own[i]), rule.merit(own[i]), -i))
+        return max(able, key=lambda i: (merits[i], abilities[i]))
+    return max(numbers, key=lambda i: (abilities[i], merits[i]))
 
 
 def _ability(rule: Rule, point: Point) -> float:

@@ -426,6 +426,33 @@ def test_fisher_is_positive_where_something_is_read_and_zero_elsewhere() -> None
     assert (information["words.weight"].sum(1) > 0).all()  # the tied head scores every word
 
 
+# --- rows -----------------------------------------------------------------------------------------
+
+
+@given(
+    kernel=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    stride=st.tuples(st.integers(1, 3), st.integers(1, 3)),
+    padding=st.one_of(st.just("valid"), st.tuples(st.integers(0, 2), st.integers(0, 2))),
+    dilation=st.integers(1, 2),
+    biased=st.booleans(),
+)
+def test_the_rows_of_a_convolution_times_its_weights_are_its_outputs(
+    kernel: tuple[int, int],
+    stride: tuple[int, int],
+    padding: str | tuple[int, int],
+    dilation: int,
+    biased: bool,
+) -> None:
+    """In the order in which the curvature has the gradients at these outputs."""
+    module = nn.Conv2d(3, 4, kernel, stride, padding, dilation, bias=biased).double()
+    x = torch.randn(2, 3, 8, 7, dtype=torch.float64)
+    weights = module.weight.flatten(1)
+    if biased:
+        weights = torch.cat([weights, module.bias[:, None]], 1)
+    found = inputs.dense_rows(module, x) @ weights.T
+    torch.testing.assert_close(found, curvature._output_rows(module, module(x)))
+
+
 # --- curvature ------------------------------------------------------------------------------------
 
 

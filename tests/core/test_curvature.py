@@ -146,6 +146,20 @@ def test_no_strength_takes_nothing_and_more_takes_more() -> None:
     assert sizes == sorted(sizes, reverse=True) and len(set(sizes)) == len(sizes)
 
 
+@pytest.mark.parametrize("strength", [1e38, 1e39, 1e300])
+@pytest.mark.parametrize("read", [True, False])
+def test_a_weight_beyond_float32_takes_what_has_a_curvature_and_leaves_numbers(
+    strength: float, read: bool
+) -> None:
+    c, g = moment(IN, rank=2), moment(OUT, rank=2)
+    displacement = draw(OUT, IN).float(), None
+    found = of(c, g, displacement[0])
+    given = strength if read else torch.tensor(strength, dtype=torch.float64)
+    kept = minus(displacement, found.excess(*displacement, given))[0]
+    torch.testing.assert_close(kept, drawn_back(found, displacement, 1e30)[0])
+    assert kept.isfinite().all() and kept.norm() < displacement[0].norm()
+
+
 def test_damping_holds_outputs_that_answers_do_not_mind_and_frees_no_other_input() -> None:
     c, g = moment(IN, rank=2), moment(OUT, rank=2)
     found = of(c, g, draw(OUT, IN), damping=0.1)

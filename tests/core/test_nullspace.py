@@ -121,6 +121,24 @@ def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
 
 
 @pytest.mark.parametrize("soft", SOFT)
+@pytest.mark.parametrize("name", DENSE)
+def test_soft_leaves_what_is_nearest_to_the_update_and_least_seen(name: str, soft: float) -> None:
+    """X = argmin |X - D|^2 + E|X x|^2 / soft over VQA's inputs x, whose mean energy is 1.
+
+    So the soft threshold is a proximal step, as that of `kfac` is, of an update's own effect.
+    """
+    module, x = CASES[name].model().map, CASES[name].any()[0]
+    moment = second_moment(rows_of(module, x), module.bias is not None)
+    update = random_update(CASES[name])
+    left = joined(allowed(protect(decompose(moment), Strength(soft=soft), update[0]), update))
+    left = left.requires_grad_()
+    seen = (left @ (moment / moment.trace()) @ left.T).trace()
+    objective = (left - joined(update)).square().sum() + seen / soft
+    (gradient,) = torch.autograd.grad(objective, left)
+    torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("soft", SOFT)
 @pytest.mark.parametrize("name", ["norm", "norm without shift"])
 def test_soft_equals_a_solve_in_each_channel(name: str, soft: float) -> None:
     module, inputs = CASES[name].model().map, CASES[name].vqa()

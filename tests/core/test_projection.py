@@ -134,6 +134,20 @@ def test_weights_beyond_the_gradients_type_are_applied(dtype: torch.dtype, size:
     assert alone.dtype == dtype and float(alone[0]) == pytest.approx(-300.0)
 
 
+@pytest.mark.parametrize("missing", [True, False])
+def test_weights_that_are_not_read_may_lie_beyond_half_precision(missing: bool) -> None:
+    """Of a float16 gradient on a GPU: a weight of 3e6 made infinite would leave no number."""
+    g = torch.tensor([300.0, 20.0], dtype=torch.float16)
+    a = torch.tensor([-1e-4, 0.0], dtype=torch.float16)
+    weight = projection.aegis(*projection.inner([g], [a]))[1]
+    assert weight > torch.finfo(torch.float16).max
+    one = torch.ones_like(weight)
+    (found,) = projection.apply([None if missing else g], [a], one, weight)
+    assert found.dtype == torch.float16
+    expected = [-300.0, 0.0] if missing else [0.0, 20.0]
+    assert found.tolist() == pytest.approx(expected, abs=1e-9)
+
+
 def test_missing_gradients_count_as_zero() -> None:
     (g1, g2, *_), (a1, a2, *_) = pair(1, conflict=True)
     sparse = projection.inner([g1, g2, None, None], [a1, None, a2, None])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import pytest
 import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.core.moments import Moments, batch_moments
+from aegis_cli.core.moments import Moments, batch_moments, joint_moments, shared_moments
 from aegis_cli.core.transport import layer_weights, transport_penalty, w2_diag
+
+MomentsOf = Callable[[Sequence[Tensor], Tensor], Sequence[tuple[Tensor, Tensor]]]
 
 
 def gaussian(seed: int, width: int = 7) -> tuple[Tensor, Tensor]:
@@ -102,6 +106,34 @@ def test_penalty_carries_the_graph_and_w2_does_not() -> None:
     penalty.backward()
     assert mean.grad is not None and mean.grad.dtype == torch.float32 and mean.grad.abs().sum() > 0
     assert not w2.requires_grad
+
+
+@pytest.mark.parametrize(
+    "moments_of",
+    [
+        lambda hidden, mask: [batch_moments(h, mask) for h in hidden],
+        joint_moments,
+        lambda hidden, mask: shared_moments(hidden, mask, lambda x: x),
+        lambda hidden, mask: shared_moments(hidden, mask, lambda x: x, reads=False),
+    ],
+)
+def test_each_token_moves_as_the_closed_form_says(moments_of: MomentsOf) -> None:
+    """dP/dh_t = 2 / (n L) (mean - mean0 + (1 - sigma0 / sigma) (h_t - mean)), and 0 of padding.
+
+    However the moments were computed.
+    """
+    generator = torch.Generator().manual_seed(3)
+    hidden = [torch.randn(2, 5, 7, dtype=torch.float64, generator=generator) for _ in range(3)]
+    mask = torch.arange(5) < torch.tensor([[3], [5]])
+    anchor = [Moments(10, *gaussian(i)) for i in range(3)]
+    leaves = [h.requires_grad_() for h in hidden]
+    penalty, _ = transport_penalty(moments_of(leaves, mask), anchor)
+    for h, then, found in zip(hidden, anchor, torch.autograd.grad(penalty, leaves), strict=True):
+        tokens = h.detach()[mask]
+        var, mean = torch.var_mean(tokens, 0, correction=0)
+        wanted = mean - then.mean + (1 - (then.var / var).sqrt()) * (tokens - mean)
+        torch.testing.assert_close(found[mask], 2 / (8 * 3) * wanted)
+        assert (found[~mask] == 0).all()
 
 
 def test_layers_must_match() -> None:

@@ -168,11 +168,14 @@ def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
     assert moved == (growth > 0)
 
 
-def test_a_rate_of_zero_still_has_a_weight() -> None:
+@pytest.mark.parametrize("growth", [1.0, 8.0, 80.0])
+@pytest.mark.parametrize("read", [True, False])
+def test_a_rate_of_zero_still_has_a_weight(growth: float, read: bool) -> None:
     setting = make_setting()
     assert setting.anchor is not None
-    last = Update({}, {}, 1, rate_left=0.0)
-    found = drawn_back(setting.backbone, setting.anchor, last, growth=1.0)
+    rate = 0.0 if read else torch.zeros((), dtype=torch.float64)
+    last = Update({}, {}, 1, rate_left=rate)
+    found = drawn_back(setting.backbone, setting.anchor, last, growth=growth)
     assert all(tensor.isfinite().all() for tensor in found.values())
 
 

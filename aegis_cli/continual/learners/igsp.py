@@ -76,14 +76,21 @@ def start(router: Router, old: int, new: int, share: float) -> None:
 
 def penalty(context: TaskContext, traces: Traces) -> Tensor:
     """What phase 1 adds to the loss: the norms; the mass is charged on the way back."""
-    parts = {name: (site, *_parts(site, context.task)) for name, site in context.sites.items()}
-    sizes = {name: _numbers(site, new) for name, (site, history, new) in parts.items() if history}
+    used = {name: _used(site, context.task) for name, site in context.sites.items()}
+    # Where a map has no history, there is nothing to prefer to new experts.
+    sizes = {}
+    for name, (history, new) in used.items():
+        if history:
+            sizes[name] = _numbers(context.sites[name], new)
     for name, size in sizes.items():
-        _, history, new = parts[name]
+        history, new = used[name]
+        columns = range(len(history), len(history) + len(new))
+        price = context.options["reuse"] * size / sum(sizes.values())
         for passed in traces[name]:
-            price = context.options["reuse"] * size / sum(sizes.values()) / len(traces[name])
-            charge(passed, range(history, history + len(new)), price)
-    norms = [squared_norm(expert) for site, _, new in parts.values() for expert in site.of(new)]
+            charge(passed, columns, price / len(traces[name]))
+    norms = []
+    for name, (_, new) in used.items():
+        norms += [squared_norm(expert) for expert in context.sites[name].of(new)]
     return context.options["norm"] * torch.stack(norms).sum()
 
 
@@ -103,12 +110,13 @@ def constrain(context: TaskContext) -> Constraint | None:
     """With `orthogonal`, keep the new experts that are left off the columns of earlier ones."""
     if not context.options["orthogonal"]:
         return None
-    held = []
+    held: list[tuple[Tensor, Tensor]] = []  # each new B, and what its columns must not enter
     for site in context.sites.values():
-        old = [e.b for e in site.of(site.numbers) if e.owner < context.task]
+        experts = site.of(site.numbers)
+        old = [expert.b for expert in experts if expert.owner < context.task]
         if old:
             columns = basis(old)
-            held += [(e.b, columns) for e in site.of(site.numbers) if e.owner == context.task]
+            held += [(expert.b, columns) for expert in experts if expert.owner == context.task]
     before = [b.detach().clone() for b, _ in held]
 
     @torch.no_grad()
@@ -126,11 +134,14 @@ def constrain(context: TaskContext) -> Constraint | None:
     return Constraint(gradient, update)
 
 
-def _parts(site: RoutedLinear, task: int) -> tuple[int, list[int]]:
-    """How many experts of the task's router are old, which come first; the new ones' numbers."""
+def _used(site: RoutedLinear, task: int) -> tuple[list[int], list[int]]:
+    """Numbers of the experts that the task's router uses: those of earlier tasks, and its own.
+
+    They stand in the router in this order.
+    """
     used = site.routers[str(task)].experts
-    new = [n for n in used if site.experts[str(n)].owner == task]
-    return len(used) - len(new), new
+    new = [number for number in used if site.experts[str(number)].owner == task]
+    return [number for number in used if number not in new], new
 
 
 def _numbers(site: RoutedLinear, experts: list[int]) -> int:
