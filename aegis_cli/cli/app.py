@@ -677,6 +677,8 @@ def probe(
     limit = "--max-drop"
     if max_drop is None and asks.max_drop is not None:
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
+        if launch.rank() == 0:
+            render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:

@@ -58,12 +58,15 @@ def inputs_of(
     Of a run that has not written them down, the recipe may name the demonstrations: then none here.
 
     Raises:
-        AegisError: they are not where they were, or an earlier version has not written it down.
+        AegisError: they are not where they were, an earlier version has not written it down, or
+            the run was merged.
     """
-    from aegis_cli.training import inputs
+    from aegis_cli.training import checkpoint, inputs
 
     kept = inputs.of(run)
     if kept is None:
+        if checkpoint.begun(run):
+            checkpoint.kept_state(run)
         if not demos and recipe.demos.path is None:
             raise _unknown(run, "demonstrations", "--demos PATH")
         return list(demos), anchor or _no_anchor(run)

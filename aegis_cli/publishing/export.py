@@ -151,8 +151,9 @@ def warn_of_steps_left(
     steps, planned = checkpoint.step_of(at), recipes.load(home / "recipe.yaml").train.steps
     if steps < planned and at.resolve() == checkpoint.last(home).resolve():
         taken = steps_taken(steps, planned)
-        goes_on = commands.aegis("train", home)
-        text = f"'{home}' is not finished: {taken} steps; {goes_on} goes on"
+        text = f"'{home}' is not finished: {taken} steps"
+        if (at / checkpoint.STATE).is_file():  # one that was merged has none
+            text += f"; {commands.aegis('train', home)} goes on"
         on_event(Warned(stage, text))
     return steps, planned
 

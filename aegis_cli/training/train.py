@@ -143,13 +143,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     Returns:
         How many steps lie behind it, and the sums since the last line of metrics.
     """
-    state = checkpoint.last(run.out) / checkpoint.STATE
-    if not state.is_file():
-        raise AegisError(
-            f"no training state in '{run.out}', as in what aegis merge wrote",
-            "a run that aegis train wrote",
-            "continue the run that was merged, or start anew in another --out",
-        )
+    state = checkpoint.kept_state(run.out)
     with _reading_state(run.out):
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:

@@ -483,3 +483,6 @@ def test_a_merged_run_is_not_trained_on(
     given = ("--demos", merge_place.demos, "--out", out, "--resume")
     err = refused(aegis("train", out / "recipe.yaml", *given))
     assert "aegis merge" in err
+    # Its folder does not say what it was trained on, and that would not help.
+    err = refused(aegis("train", out))
+    assert "aegis merge" in err and "--set 'expert.start=" in err and "--demos" not in err
