@@ -179,12 +179,16 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
     lines = [
         (
-            f"{c[0].first_step} to {c[-1].last_step}",
+            _steps(c[0].first_step, c[-1].last_step),
             percent(sum(b.energy_shed for b in c) / len(c), 3),
         )
         for c in chunks
     ]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def _steps(first: int, last: int) -> str:
+    return f"{first} to {last}" if last > first else str(first)
 
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
