@@ -71,7 +71,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
-from aegis_cli.common import files, interrupts, launch
+from aegis_cli.common import commands, files, interrupts, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.data.selection import Paths, Selection
@@ -378,7 +378,7 @@ def train(
     if run is not None:
         recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
     if out is None:
-        fix = f"aegis train {recipe} --out runs/NAME"
+        fix = commands.aegis("train", recipe, "--out", "runs/NAME")
         raise AegisError("no --out", "a folder for the run", fix)
     chosen = [f"train.method={method}"] if method is not None else []
     resolved = load_training(recipe, (overrides or []) + chosen)
@@ -677,6 +677,8 @@ def probe(
     limit = "--max-drop"
     if max_drop is None and asks.max_drop is not None:
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
+        if launch.rank() == 0:
+            render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.cli import render
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, describe, shipped, study_cells
 from aegis_cli.recipes.strict_yaml import dump
@@ -109,7 +110,7 @@ def _recipe_of(cells: Path) -> Path:
         raise AegisError(
             f"'{cells}', which does not say of which study it is",
             "a study's folder, or NAME.cells.json with its recipe NAME.yaml beside it",
-            f"aegis inspect {cells.parent}",
+            commands.aegis("inspect", cells.parent),
         )
     name = cells.name.removesuffix(f".{_CELLS}")
     for folder in (cells.parent, cells.absolute().parent.parent):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.selection import Paths
 from aegis_cli.recipes import Recipe
@@ -30,7 +30,8 @@ def recipe_of(run: Path, out: Path | None) -> Path:
         raise AegisError(
             f"--out {out} with the run '{run}'",
             "a run alone, which goes on in its own folder",
-            f"leave --out out, or train anew by its recipe: aegis train {run / RECIPE} --out {out}",
+            "leave --out out, or train anew by its recipe: "
+            f"{commands.aegis('train', run / RECIPE, '--out', out)}",
         )
     return run / RECIPE
 
@@ -40,11 +41,11 @@ def _instead(folder: Path) -> str:
     from aegis_cli.training import checkpoint
 
     if checkpoint.is_one(folder) and (home := checkpoint.run_of(folder)) is not None:
-        return f"give the run of this checkpoint: aegis train {_quoted(home)}"
+        return f"give the run of this checkpoint: {commands.aegis('train', home)}"
     if inner := sorted(path.parent for path in folder.glob(f"*/{RECIPE}")):
         return (
-            f"give one of its runs, e.g. aegis train {_quoted(inner[0])}; a job or study of aegis "
-            "run goes on when it is called again"
+            f"give one of its runs, e.g. {commands.aegis('train', inner[0])}; a job or study of "
+            "aegis run goes on when it is called again"
         )
     return "check the path, or begin a run: aegis train RECIPE --out RUN"
 
@@ -57,32 +58,57 @@ def inputs_of(
     Of a run that has not written them down, the recipe may name the demonstrations: then none here.
 
     Raises:
-        AegisError: they are not where they were, or an earlier version has not written it down.
+        AegisError: they are not where they were, an earlier version has not written it down, or
+            the run was merged.
     """
-    from aegis_cli.training import inputs
+    from aegis_cli.training import checkpoint, inputs
 
     kept = inputs.of(run)
     if kept is None:
+        if checkpoint.begun(run):
+            checkpoint.kept_state(run)
         if not demos and recipe.demos.path is None:
             raise _unknown(run, "demonstrations", "--demos PATH")
         return list(demos), anchor or _no_anchor(run)
     if not demos:
-        demos = [_there(run, one, "demonstrations", "--demos PATH") for one in kept.demos]
+        demos = _all_there(run, kept.demos)
+    elif len(demos) != len(kept.demos):
+        raise AegisError(
+            f"{len(demos)} of --demos for the run in '{run}', which began with {len(kept.demos)}",
+            f"each of its sets, in their order: {', '.join(kept.demos)}",
+            f"name all of them: {commands.aegis('train', run, *_options(kept.demos))}",
+        )
     if anchor is None and kept.anchor is not None:
-        anchor = _there(run, kept.anchor, "anchor", "--anchor FILE")
+        anchor = _there(run, kept.anchor, "anchor", ["--anchor", "FILE"])
     return list(demos), anchor
 
 
-def _there(run: Path, place: str, what: str, option: str) -> Path:
-    """A recorded place, if something is there; the id of a dataset is the hub's to find."""
-    path = Path(place)
-    if path.is_absolute() and not path.exists():
+def _all_there(run: Path, places: Sequence[str]) -> list[Path]:
+    """The recorded sets of demonstrations, if something is there of each."""
+    # The command names all sets, for those that are given are all that the run goes on with.
+    options = _options("PATH" if _gone(place) else place for place in places)
+    return [_there(run, place, "demonstrations", options) for place in places]
+
+
+def _options(places: Iterable[str]) -> list[str]:
+    return [word for place in places for word in ("--demos", place)]
+
+
+def _there(run: Path, place: str, what: str, options: Sequence[str]) -> Path:
+    """A recorded place, if something is there."""
+    if _gone(place):
         raise AegisError(
             f"'{place}' is gone, the {what} of the run in '{run}'",
             "what the run was begun with",
-            f"bring it back, or say where it lies now: aegis train {_quoted(run)} {option}",
+            f"bring it back, or say where it lies now: {commands.aegis('train', run, *options)}",
         )
-    return path
+    return Path(place)
+
+
+def _gone(place: str) -> bool:
+    """Whether nothing is there; the id of a dataset is the hub's to find."""
+    path = Path(place)
+    return path.is_absolute() and not path.exists()
 
 
 def _no_anchor(run: Path) -> None:
@@ -101,7 +127,7 @@ def _unknown(run: Path, what: str, option: str) -> AegisError:
     return AegisError(
         f"no place of its {what} in the run '{run}', as in those of an earlier version",
         "what the run was begun with",
-        f"say where it lies: aegis train {_quoted(run)} {option}",
+        f"say where it lies: {commands.aegis('train', run)} {option}",
     )
 
 
@@ -128,7 +154,3 @@ def command(
             return None
         recipe = longer.plan(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))

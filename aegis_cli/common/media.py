@@ -64,20 +64,31 @@ def tiled(
         An image of Pillow. Frame k of cell i begins `_CAPTION` pixels under the cell's upper
         corner and `_GAP` + k (`tile` + `_GAP`) to the right of it.
     """
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     width = max(len(frames) for _, frames in cells) * (tile + _GAP) + _BETWEEN_CELLS
     height = _CAPTION + tile + 2 * _GAP
     sheet = Image.new("RGB", (columns * width, math.ceil(len(cells) / columns) * height), "white")
     draw = ImageDraw.Draw(sheet)
-    draw.font = ImageFont.load_default(text)
     for i, (caption, frames) in enumerate(cells):
         x, y = i % columns * width, i // columns * height
+        draw.font = _font(caption, text)
         above = (_CAPTION - text) // 2 - 1
         draw.text((x + _GAP, y + above), _shortened(draw, caption, width - 2 * _GAP), fill="black")
         for k, frame in enumerate(frames):
             sheet.paste(_fitted(frame, tile), (x + _GAP + k * (tile + _GAP), y + _CAPTION))
     return sheet
+
+
+def _font(text: str, size: int) -> Any:
+    """Pillow's own font, or for letters beyond ASCII, which it has none of, that of matplotlib."""
+    from PIL import ImageFont
+
+    if text.isascii():
+        return ImageFont.load_default(size)
+    import matplotlib
+
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
 
 
 def _shortened(draw: Any, text: str, width: int) -> str:
@@ -155,7 +166,7 @@ def _pictures(clips: Sequence[Clip]) -> Iterator[Any]:
 
 def _framed(moment: Moment, ring: Any) -> np.ndarray:
     """The frame enlarged, with its ring, its note and its border."""
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     picture = _fitted(moment.frame, _CLIP_PICTURE)
     if ring is not None:
@@ -164,7 +175,7 @@ def _framed(moment: Moment, ring: Any) -> np.ndarray:
     tile = Image.new("RGB", (_CLIP_TILE, _CLIP_TILE), color)
     left, top = (_CLIP_TILE - picture.width) // 2, (_CLIP_TILE - picture.height) // 2
     tile.paste(picture, (left, top))
-    draw, font = ImageDraw.Draw(tile), ImageFont.load_default(_CLIP_TEXT)
+    draw, font = ImageDraw.Draw(tile), _font(moment.note, _CLIP_TEXT)
     # The note stands on a patch of the border's colour, so that it is read on any picture.
     _, _, right, bottom = draw.textbbox((0, 0), moment.note, font=font)
     corner = (left + right + 12, top + bottom + 9)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, commands, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.state_dicts import check_state, reading_meta
 from aegis_cli.continual import state
@@ -59,7 +59,7 @@ def read(path: Path) -> StreamReport:
         raise AegisError(
             f"{path} has no {REPORT}: the stream is not learned to its end",
             "a finished run of a stream",
-            f"continue it: aegis train {path}",
+            f"continue it: {commands.aegis('train', path)}",
         )
     raw = files.load_json(path / REPORT)
     kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport

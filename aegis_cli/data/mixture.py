@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import torch
@@ -166,6 +167,19 @@ def digests(inputs: Mapping[str, str]) -> frozenset[str]:
     return frozenset(x for name, x in inputs.items() if name.split(" ")[0] == _INPUT)
 
 
+def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
+    """Which inputs of a run have other digests here than there, as in "another anchor"."""
+    names = sorted(name for name in there.keys() | here.keys() if there.get(name) != here.get(name))
+    sets = [name for name in names if name.startswith(f"{_INPUT} ")]
+    if not sets:
+        return f"another {', '.join(names)}"
+    if {there.get(name) for name in sets} == {here.get(name) for name in sets}:
+        return "the sets of demonstrations in another order"
+    others = [name for name in names if name not in (_INPUT, *sets)]
+    numbered = [f"set {name.removeprefix(f'{_INPUT} ')} of the demonstrations" for name in sets]
+    return f"another {', '.join([*others, *numbered])}"
+
+
 # --- shares ---------------------------------------------------------------------------------------
 
 
@@ -192,8 +206,9 @@ def drawn(found: Demonstrations, weights: Sequence[float] | None) -> list[int]:
     sizes = [member.train for member in found.members]
     if weights is None:
         return sizes
-    total, whole = sum(sizes), sum(weights)
-    exact = [total * weight / whole for weight in weights]
+    total, exactly = sum(sizes), list(map(Fraction, weights))
+    whole = sum(exactly)  # exactly, for the sum of large weights is more than a float holds
+    exact = [total * weight / whole for weight in exactly]
     counts = [int(count) for count in exact]
     by_rest = sorted(range(len(counts)), key=lambda i: counts[i] - exact[i])
     for i in by_rest[: total - sum(counts)]:

@@ -11,7 +11,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts, commands, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.headers import Header
 from aegis_cli.continual import files as stream_files
@@ -63,7 +63,7 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     example = next(iter(runs), "runs/<recipe>/<method>")
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
     raise UnknownFolder(
-        f"{path} is neither a run nor an artifact", expected, f"aegis inspect {example}"
+        f"{path} is neither a run nor an artifact", expected, commands.aegis("inspect", example)
     )
 
 
@@ -111,7 +111,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     settings = recipes.load(path / "recipe.yaml")
     rows = path / "ledger.safetensors"
     if not rows.is_file():
-        fix = f"continue it: aegis train {path}"
+        fix = f"continue it: {commands.aegis('train', path)}"
         raise AegisError(
             f"{path} has no ledger.safetensors", "a run with at least one checkpoint", fix
         )

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import check_utf8, hidden, make_folder, write_text
@@ -151,7 +151,9 @@ def warn_of_steps_left(
     steps, planned = checkpoint.step_of(at), recipes.load(home / "recipe.yaml").train.steps
     if steps < planned and at.resolve() == checkpoint.last(home).resolve():
         taken = steps_taken(steps, planned)
-        text = f"'{home}' is not finished: {taken} steps; aegis train --resume goes on"
+        text = f"'{home}' is not finished: {taken} steps"
+        if (at / checkpoint.STATE).is_file():  # one that was merged has none
+            text += f"; {commands.aegis('train', home)} goes on"
         on_event(Warned(stage, text))
     return steps, planned
 

@@ -79,7 +79,8 @@ def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
     if list(plans) != sorted(set(plans)):
         named = ", ".join(map(str, plans[:-1]))
         found = f"train.extended_from: {named} with train.steps: {recipe.train.steps}"
-        yield Problem(found, "rising numbers below train.steps", "delete train.extended_from")
+        fix = "raise train.steps, which cannot fall again, or delete train.extended_from"
+        yield Problem(found, "rising numbers below train.steps", fix)
     if earlier and recipe.train.backbone_until < 1:
         found = f"train.extended_from with train.backbone_until: {recipe.train.backbone_until:g}"
         yield Problem(found, "one of them", "delete train.extended_from")

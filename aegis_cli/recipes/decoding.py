@@ -121,6 +121,8 @@ def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | No
         return f"did you mean '{near}'?"
     if field.default is dataclasses.MISSING:
         return f"change '{dotted}'"
+    if field.default is None:
+        return f"change '{dotted}', or leave it out"
     default = list(field.default) if isinstance(field.default, tuple) else field.default
     return f"change '{dotted}'; its default is {_quote(default)}"
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import canonical, refuse_special
+from aegis_cli.recipes import shipped
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.keys import changed, is_retired, recorded
@@ -216,18 +217,21 @@ def _own_section(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Any:
     return getattr(recipe, recipe.train.method.replace("-", "_"), None)
 
 
+def _instead(path: Path) -> str:
+    """What may have been meant by the path of a recipe that is not there."""
+    if near := did_you_mean(path.stem, [p.stem for p in path.parent.glob("*.yaml")]):
+        return f"did you mean {path.with_name(near + '.yaml')}?"
+    if shipped.is_one(path.stem):
+        return f"'{path.stem}' ships with Aegis, and is found by its name alone: {path.stem}"
+    return "check the path, or give the name of one that ships with Aegis: see aegis recipes ls"
+
+
 def _read(path: Path) -> str:
     refuse_special(path)
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        near = did_you_mean(path.stem, [p.stem for p in path.parent.glob("*.yaml")])
-        fix = (
-            f"did you mean {path.with_name(near + '.yaml')}?"
-            if near
-            else "check the path, e.g. recipes/quickstart.yaml"
-        )
-        raise AegisError(f"no file {path}", "a recipe, a YAML file", fix) from None
+        raise AegisError(f"no file {path}", "a recipe, a YAML file", _instead(path)) from None
     except UnicodeDecodeError:
         raise AegisError(
             f"{path} is not text",

@@ -68,6 +68,11 @@ def path(name: str) -> Path:
     return found
 
 
+def is_one(name: str) -> bool:
+    """Whether a recipe of this name comes with Aegis."""
+    return any((place / f"{name}.yaml").is_file() for place in (_CHECKOUT, _INSTALLED))
+
+
 def find(given: Path) -> Path:
     """The file that a user means: the one at this path, or else the recipe of this name."""
     bare = given.name == str(given) and not given.suffix

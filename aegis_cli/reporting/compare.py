@@ -120,7 +120,7 @@ def _warn_of_unfinished(rows: Sequence[ComparedRun], on_event: OnEvent) -> None:
         if None not in (row.steps, row.planned_steps) and row.steps < row.planned_steps:
             left.append(f"{row.run}, {inspection.steps_taken(row.steps, row.planned_steps)} steps")
     if left:
-        text = f"not finished: {'; '.join(left)}; aegis train --resume goes on"
+        text = f"not finished: {'; '.join(left)}; aegis train RUN goes on"
         on_event(Warned("compare", text))
 
 

@@ -68,6 +68,7 @@ class RunDocument:
         train: the figures of train.json; empty where `aegis run` did not train it.
         probes, rollouts, open_loops: what was measured of the last checkpoint, and with which
             settings.
+        question_sets: that of each of the probes, as somebody named it.
         gate: whether the drop is within `probe.max_drop` or `--max-drop`; None without one.
         machine: on which it was trained; empty for a run of an earlier Aegis.
         commands: which make the same again.
@@ -90,6 +91,7 @@ class RunDocument:
     probes: list[results.Result]
     rollouts: list[results.Result]
     open_loops: list[results.Result]
+    question_sets: list[str]
     gate: bool | None
     machine: dict[str, Any]
     videos: list[Video]
@@ -200,6 +202,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     train = path / "train.json"
     about = path / machine.NAME
     anchor = _anchor(path, recipe, found)
+    probes = results.probes(path)
     return RunDocument(
         kind="run",
         path=str(path),
@@ -215,9 +218,10 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         over_time=found.over_time,
         energy_shed_mean=found.energy_shed_mean,
         train=kept_figures.read(train, kept_figures.TrainFigures) if train.is_file() else {},
-        probes=results.probes(path),
+        probes=probes,
         rollouts=list(found.rollouts),
         open_loops=list(found.open_loops),
+        question_sets=[results.question_set(probed, recipe) for probed in probes],
         gate=found.gate,
         machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],

@@ -256,6 +256,23 @@ def begun(folder: Path) -> bool:
     return False
 
 
+def kept_state(run: Path) -> Path:
+    """The file of the training state in a run's last checkpoint.
+
+    Raises:
+        AegisError: none, as in a merged run.
+    """
+    state = last(run) / STATE
+    if not state.is_file():
+        raise AegisError(
+            f"no training state in '{run}', as in what aegis merge wrote",
+            "a run that aegis train wrote",
+            "continue the run that was merged, or begin another with what this one has learned: "
+            f"--set 'backbone={run}' --set 'expert.start={run}'",
+        )
+    return state
+
+
 def last(folder: Path) -> Path:
     """The newest complete checkpoint of a run.
 

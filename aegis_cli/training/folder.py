@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
-from aegis_cli.common import files, locks, machine
+from aegis_cli.common import commands, files, locks, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint, inputs
@@ -54,22 +54,35 @@ def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> 
         raise AegisError(
             f"an existing run in '{out}'",
             "a new folder",
-            f"continue it: aegis train {out}, or the same command with --resume; begin anew with "
-            "--overwrite, or choose another --out",
+            f"continue it: {commands.aegis('train', out)}, or the same command with --resume; "
+            "begin anew with --overwrite, or choose another --out",
         )
-    if not goes_on(out, recipe):
+    if not continues(out, recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings: "
             f"{_differences(_begun(out, recipe), recipe)}",
             "the recipe and overrides it began with",
-            f"go on with its own: aegis train {out}; compare with {saved}, or start anew in "
-            "another --out",
+            f"go on with its own: {commands.aegis('train', out)}; compare with '{saved}', or start "
+            "anew in another --out",
         )
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:
     """Whether a run that has begun was begun with what shapes `recipe`'s training."""
     return recipes.training_part(_begun(out, recipe)) == recipes.training_part(recipe)
+
+
+def continues(out: Path, recipe: Trained) -> bool:
+    """Whether a run may go on by `recipe`, by which its backbone may lie elsewhere now.
+
+    The checkpoints of a policy's run know the backbone by its digest, which is compared later.
+    """
+    begun = _begun(out, recipe)
+    if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
+        there, here = (each.backbone.partition("#")[2] for each in (begun, recipe))
+        if there == here:  # other layers of one model have the same weights, and learn otherwise
+            begun = dataclasses.replace(begun, backbone=recipe.backbone)
+    return recipes.training_part(begun) == recipes.training_part(recipe)
 
 
 def _begun(out: Path, recipe: Trained) -> Trained:

@@ -33,7 +33,7 @@ def plan(out: Path, recipe: Recipe) -> Recipe:
     if plans != tuple(sorted(plans)):
         return recipe
     planned = _replanned(recipe, plans)
-    return planned if folder.goes_on(out, planned) or lengthens(out, planned) else recipe
+    return planned if folder.continues(out, planned) or lengthens(out, planned) else recipe
 
 
 def check(out: Path, recipe: Recipe, resume: bool, overwrite: bool, on_event: OnEvent) -> None:
@@ -52,7 +52,7 @@ def lengthens(out: Path, recipe: Recipe) -> bool:
     """Whether `recipe` is that of the run in `out` with more steps, as its last plan says."""
     earlier = recipe.train.plans[:-1]
     there = (out / "recipe.yaml").exists()
-    return bool(earlier) and there and folder.goes_on(out, _replanned(recipe, earlier))
+    return bool(earlier) and there and folder.continues(out, _replanned(recipe, earlier))
 
 
 def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:

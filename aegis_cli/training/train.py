@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli import methods
+from aegis_cli import methods, recipes
 from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
@@ -22,7 +22,7 @@ from aegis_cli.common.headers import rewrite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.data import augment, demonstrations
+from aegis_cli.data import augment, demonstrations, mixture
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
@@ -115,8 +115,10 @@ def run(
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
             restored = _restore(training)
+            if restored[0] >= recipe.train.steps:
+                on_event(Progress("train (up to date)", 1, 1, "stage"))
             if ranks.first:
-                if longer.lengthens(out, recipe):
+                if longer.lengthens(out, recipe) or _moved(out, recipe, places):
                     folder.write_recipe(out, recipe)
                 inputs.keep(out, places)
             return _train(training, *restored, on_event)
@@ -129,29 +131,24 @@ def run(
         return _train(training, 0, Window(), on_event)
 
 
+def _moved(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
+    """Whether a run's backbone or its inputs lie elsewhere than when it began."""
+    begun = recipes.load(out / "recipe.yaml", kind=Recipe)
+    return begun.backbone != recipe.backbone or inputs.of(out) not in (None, places)
+
+
 def _restore(run: TrainingRun) -> tuple[int, Window]:
     """State, ledger and metrics as they were after the last checkpoint.
 
     Returns:
         How many steps lie behind it, and the sums since the last line of metrics.
     """
-    state = checkpoint.last(run.out) / checkpoint.STATE
-    if not state.is_file():
-        raise AegisError(
-            f"no training state in '{run.out}', as in what aegis merge wrote",
-            "a run that aegis train wrote",
-            "continue the run that was merged, or start anew in another --out",
-        )
+    state = checkpoint.kept_state(run.out)
     with _reading_state(run.out):
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
-        changed = sorted(
-            k
-            for k in saved.inputs.keys() | run.inputs.keys()
-            if saved.inputs.get(k) != run.inputs.get(k)
-        )
         raise AegisError(
-            f"another {', '.join(changed)} than the run in '{run.out}' began with",
+            f"{mixture.differing(saved.inputs, run.inputs)} than the run in '{run.out}' began with",
             "the same inputs",
             "give the files the run began with, or start anew in another --out",
         )
@@ -401,7 +398,8 @@ def _good_steps_saved(run: TrainingRun) -> Iterator[None]:
     except Diverged as end:
         good = end.good_steps
         _save(run, good)
-        kept = f"the {good} good steps are in {run.out}/checkpoints/last; {end.fix}"
+        steps = "1 good step is" if good == 1 else f"{good} good steps are"
+        kept = f"the {steps} in {run.out}/checkpoints/last; {end.fix}"
         raise Diverged(end.found, end.expected, kept, good) from None
 
 

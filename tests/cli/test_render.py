@@ -26,7 +26,7 @@ from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live
 from aegis_cli.cli.render.studies import study
-from aegis_cli.cli.render.tables import facts, pipeline, pretrain, probe
+from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.evaluation.open_loop import (
@@ -206,6 +206,14 @@ def test_facts_have_units_and_figures_that_can_be_read():
         "drop interval -0.25 to 1.5 points",
         "cameras -",
     ]
+
+
+def test_values_of_several_sets_stand_in_brackets_under_names_that_can_be_read() -> None:
+    sets = {"arm": {"training_frames": 355, "share": 0.75}, "more": {"training_frames": 90}}
+    (line,) = text_of(pairs({"sets": sets})).splitlines()
+    assert line.split(maxsplit=1)[1] == (
+        "arm (training frames 355, share 0.75), more (training frames 90)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -459,6 +467,23 @@ def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() 
     shown = text_of(render.inspect(InspectReport("run", "x", {}, open_loops=(evaluated,))))
     assert re.search(r"2 held-out episodes of arm +0\.250 +- +- +1,000", shown)
     assert "nothing is measured" not in shown
+
+
+def test_a_merge_is_told_without_what_was_not_measured() -> None:
+    merged = {"method": "linear", "strength": 0.5, "validation_loss": None}
+    (line,) = text_of(render.inspect(InspectReport("run", "x", {"merge": merged}))).splitlines()[
+        2:3
+    ]
+    assert line.split() == "merge method linear, strength 0.5".split()
+    merged["validation_loss"] = 0.25
+    assert "validation loss 0.25" in text_of(
+        render.inspect(InspectReport("run", "x", {"merge": merged}))
+    )
+
+
+def test_a_single_episode_is_no_number_of_episodes() -> None:
+    shown = text_of(open_loop(open_loop_report(episodes=[3])))
+    assert re.search(r"^episode +3$", shown, re.M) and "episodes " not in shown
 
 
 def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from samples.command import refused
-from samples.reports import HOSTILE, METHODS, open_loop, write_job
+from samples.reports import HOSTILE, METHODS, open_loop, probe, write_job
 from samples.studies import found
 
 from aegis_cli.common import files
@@ -271,6 +271,25 @@ def test_questions_of_one_family_have_one_row(aegis, job: Path) -> None:
     page, _ = reported(aegis, job / "naive")
     accuracies = [path for path, *_ in page.figures if path.endswith("/baseline_accuracy")]
     assert [path for path in accuracies if "/families/" in path] == accuracies[-1:]
+
+
+def test_families_stand_side_by_side_only_where_the_same_was_asked(aegis, job: Path) -> None:
+    """The second probe of one run is of other questions than the second one of another."""
+    for method, vqa, family in (("naive", "scenes", "color"), ("aegis", "easy-vqa", "shape")):
+        found = {**probe(family), "questions": 14}
+        results.keep(job / method, f"probe-{vqa}", found, {"vqa": vqa})
+    results.keep(
+        job / "naive", "probe-again", {**probe("color"), "questions": 14}, {"vqa": "scenes"}
+    )
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    titles = re.findall(r"VQA by family of questions(: [^A]*)?Accuracy", page.said)
+    asked = "scenes, 40 questions", "scenes, 14 questions", "easy-vqa, 14 questions"
+    assert sorted(titles) == sorted(
+        f": {each}" for each in (*asked, "scenes, 14 questions, asked again")
+    )
+    runs = {run["label"]: run["question_sets"] for run in document["runs"]}
+    assert runs["naive"] == ["scenes"] * 3 and runs["aegis"] == ["scenes", "easy-vqa"]
 
 
 @pytest.mark.parametrize("seeds", [1, 5])

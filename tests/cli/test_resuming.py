@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from samples.tiny import make_tiny
 from samples.training_runs import assert_same_run, stop_at
 from samples.user_folder import TRAIN, training
 
@@ -138,6 +139,72 @@ def test_what_has_moved_is_named_and_taken_from_where_it_lies_now(
     assert aegis("train", "cut")[0] == 0
 
 
+def test_of_several_sets_the_one_that_has_moved_is_asked_for_beside_the_others(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
+    assert code == 0, err
+    run = cut(place, "naive", sets=("demos.safetensors", "new.safetensors"))
+    (place / "new.safetensors").rename(place / "moved.safetensors")
+    demos, moved = place / "demos.safetensors", place / "moved.safetensors"
+    says = "new.safetensors' is gone", f"aegis train cut --demos {demos} --demos PATH"
+    bad("train", "cut", says=says)
+    says = "1 of --demos for the run in 'cut', which began with 2", "name all of them"
+    bad("train", "cut", "--demos", moved, says=says)
+    says = "the sets of demonstrations in another order than the run in 'cut'"
+    bad("train", "cut", "--demos", moved, "--demos", demos, says=(says,))
+    code, _, err = aegis("train", "cut", "--demos", demos, "--demos", moved)
+    assert code == 0 and steps_of(run) == 3, err
+    told = results.recipe_of(run).demos.path
+    assert told == (str(demos), str(moved)) and aegis("train", "cut")[0] == 0
+
+
+def test_another_one_of_several_sets_is_refused_by_its_place(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    for seed, name in ((5, "new"), (6, "other")):
+        made = "demos", "reach", "--episodes", 8, "--seed", seed, "--out", f"{name}.safetensors"
+        assert aegis(*made)[0] == 0
+    cut(place, "naive", sets=("demos.safetensors", "new.safetensors"))
+    given = "--demos", "demos.safetensors", "--demos", "other.safetensors"
+    bad("train", "cut", *given, says=("another set 2 of the demonstrations than the run",))
+
+
+def test_a_run_goes_on_with_its_backbone_at_another_place(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    run = cut(place, "naive")
+    make_tiny(seed=1).save(place / "other")
+    says = "another backbone than the run in 'cut' began with"
+    bad("train", "cut", "--set", "backbone=other", says=(says,))
+    moved = "--set", "backbone=model.safetensors"
+    code, _, err = aegis("train", "cut", *moved)
+    assert code == 0 and steps_of(run) == 3, err
+    assert results.recipe_of(run).backbone == "model.safetensors"
+    (place / "model.safetensors").rename(place / "elsewhere.safetensors")
+    moved = "--set", "backbone=elsewhere.safetensors", "--set", "train.steps=4"
+    code, _, err = aegis("train", "cut", *moved)
+    kept = results.recipe_of(run)
+    assert code == 0 and kept.train.extended_from == (3,), err
+    assert kept.backbone == "elsewhere.safetensors" and aegis("train", "cut")[0] == 0
+
+
+def test_a_run_that_has_ended_says_that_nothing_is_to_be_done(place: Path, aegis: Aegis) -> None:
+    cut(place, "naive")
+    assert "up to date" not in aegis("train", "cut")[2]
+    code, _, err = aegis("train", "cut")
+    assert code == 0 and "train (up to date): 1/1 stage" in err
+
+
+def test_a_command_that_a_message_names_is_one_for_a_shell(place: Path, bad: Bad) -> None:
+    cut(place).rename(place / "my run")
+    again = training(out="my run")
+    bad(*again, says=("continue it: aegis train 'my run', or",))
+    bad("train", "my run", "--out", "new", says=("aegis train 'my run/recipe.yaml' --out new",))
+    says = "go on with its own: aegis train 'my run'; compare"
+    bad("train", "my run", "--set", "seed=7", says=(says,))
+
+
 def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -> None:
     run = cut(place)
     code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
@@ -178,6 +245,14 @@ def test_a_run_that_has_ended_is_made_longer_twice(place: Path, aegis: Aegis) ->
         assert code == 0 and steps_of(place / "run") == steps, err
     kept = results.recipe_of(place / "run").train
     assert (kept.steps, kept.extended_from) == (4, (2, 3))
+
+
+def test_a_run_that_was_made_longer_does_not_become_shorter(
+    place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    assert aegis(*training(out="run"), "--set", "train.steps=2")[0] == 0
+    assert aegis("train", "run", "--set", "train.steps=3")[0] == 0
+    bad("train", "run", "--set", "train.steps=1", says=("raise train.steps, which cannot fall",))
 
 
 def test_other_settings_are_refused(place: Path, bad: Bad) -> None:

@@ -74,6 +74,14 @@ def test_a_caption_never_reaches_into_the_next_cell() -> None:
     assert (long[:, :cell] != none[:, :cell]).any() and (long[:, cell:] == none[:, cell:]).all()
 
 
+def test_letters_beyond_ascii_are_drawn_in_captions_and_notes() -> None:
+    for first, second in (("ü", "ß"), ("к", "ш")):  # what no font has would be one box
+        captions = [np.asarray(media.tiled([(x, [GREY])], 1, 64, 10)) for x in (first, second)]
+        assert (captions[0] != captions[1]).any()
+        notes = [media._framed(Moment(GREY, x), None) for x in (first, second)]
+        assert (notes[0] != notes[1]).any()
+
+
 # --- videos ---------------------------------------------------------------------------------------
 
 

@@ -223,6 +223,7 @@ def of_sizes(made: Demonstrations, sizes: Sequence[int]) -> Demonstrations:
         ((10, 20), (2, 1), [20, 10]),
         ((10, 21), (1, 1), [16, 15]),
         ((5, 5, 5), (1, 1, 5), [2, 2, 11]),
+        ((10, 20), (1e308, 1e308), [15, 15]),
     ],
 )
 def test_weights_are_shares_of_the_frames(

@@ -458,6 +458,7 @@ def test_a_run_is_held_to_the_gate_of_its_recipe_on_the_questions_that_it_names(
     worse = ("--baseline", taught)
     code, text, err = aegis(*given, *worse)
     assert code == 1 and "more than the recipe's probe.max_drop 0" in err
+    assert "the gate is at a drop of 0 points, the recipe's probe.max_drop\n" in err
     assert aegis(*given, *worse, "--max-drop", 100)[0] == 0
     other = write_jsonl(tmp_path, 24)
     code, text, _ = aegis(*given, "--vqa", other)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
 from collections.abc import Callable
@@ -123,6 +124,7 @@ def test_a_merged_run_shows_what_it_is_and_not_what_it_was_made_of(
     assert document["label"] == "naive, merged" and document["machine"]
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "naive, merged" in page and "linear, strength 0.999" in page
+    assert re.search(r"damping 0.01; <data [^>]*>\d+\.\d</data> % of the maps", page)
     assert aegis("export", out, "--out", tmp_path / "policy")[0] == 0
     assert "by naive, merged" in (tmp_path / "policy" / "README.md").read_text(encoding="utf-8")
 
@@ -483,3 +485,6 @@ def test_a_merged_run_is_not_trained_on(
     given = ("--demos", merge_place.demos, "--out", out, "--resume")
     err = refused(aegis("train", out / "recipe.yaml", *given))
     assert "aegis merge" in err
+    # Its folder does not say what it was trained on, and that would not help.
+    err = refused(aegis("train", out))
+    assert "aegis merge" in err and "--set 'expert.start=" in err and "--demos" not in err

@@ -323,6 +323,19 @@ def test_a_missing_file_names_its_neighbour(tmp_path):
     assert caught.value.fix == f"did you mean {tmp_path / 'quickstart.yaml'}?"
 
 
+def test_a_missing_file_of_a_shipped_name_says_that_the_name_will_do(tmp_path):
+    with pytest.raises(AegisError) as caught:
+        load(tmp_path / "smolvla-style.yaml")
+    assert caught.value.fix.endswith("found by its name alone: smolvla-style")
+    with pytest.raises(AegisError, match="aegis recipes ls"):
+        load(tmp_path / "my-own.yaml")
+
+
+def test_a_key_without_a_default_may_be_left_out(tmp_path):
+    fix = refusal(tmp_path, "name: x", "demos.weights=[0, 1]").fix
+    assert fix == "change 'demos.weights', or leave it out"
+
+
 def test_a_folder_or_binary_file_is_refused(tmp_path):
     with pytest.raises(AegisError):
         load(tmp_path)

@@ -103,19 +103,19 @@ def _anchor(runs: Sequence[At]) -> str | None:
 def _trained(run: At, anchor: str | None) -> Markup:
     """What was trained on what, in a few words."""
     recipe, train = run["recipe"], run["recipe"]["train"]
-    shown = [
-        ("Backbone", run["backbone"]),
+    shown: list[tuple[str, Child]] = [
+        ("Backbone", str(run["backbone"])),
         ("Demonstrations", _demonstrations(recipe) or f"{recipe['demos']['episodes']} episodes"),
         *_weights(recipe),
         *([("Anchor", anchor)] if anchor else []),
         ("Steps", f"{_steps(run)}, of {train['batch_size']} frames each"),
         ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
-        ("Precision", train["precision"]),
-        ("Seed", run["facts"]["seed"]),
+        ("Precision", str(train["precision"])),
+        ("Seed", str(run["facts"]["seed"])),
     ]
     if "merge" in run["facts"].value:
         shown.append(("Merged afterwards", _merge(run["facts"]["merge"])))
-    return pairs([(name, str(value)) for name, value in shown])
+    return pairs(shown)
 
 
 def _weights(recipe: At) -> list[tuple[str, str]]:
@@ -132,10 +132,10 @@ def _steps(run: At) -> str:
     return steps_taken(facts["steps"], facts["planned_steps"])
 
 
-def _merge(merge: At) -> str:
+def _merge(merge: At) -> list[Child]:
     """How what was trained was moved back."""
-    how = f"{merge['method']}, strength {merge['strength']}, damping {merge['damping']}"
-    return f"{how}; {share(merge['kept'])} % of the maps' displacement are left"
+    how = f"{merge['method']}, strength {merge['strength']}, damping {merge['damping']}; "
+    return [how, share(merge["kept"]), " % of the maps' displacement is left"]
 
 
 def _measured(found: Sequence[At]) -> list[Child]:

@@ -169,16 +169,18 @@ def _by_instruction(run: At, found: At) -> Markup | None:
 
 def families(runs: Sequence[At]) -> Iterator[Markup]:
     """VQA accuracy by family of questions: one table for each set of questions."""
-    for number in range(max((len(run["probes"].value) for run in runs), default=0)):
-        asked = [run for run in runs if len(run["probes"].value) > number]
-        probes = [run["probes"][number]["figures"] for run in asked]
+    by_questions = _by_questions(runs)
+    for (name, count, again), found in by_questions.items():
+        asked, probes = list(found), list(found.values())
         names = list(dict.fromkeys(name for p in probes for name in p["families"].value))
         header = ["Family", "Questions", "Always the commonest %", "Before %"]
-        header += [str(run["label"]) for run in asked]
+        header += asked
         rows = [_family(name, probes) for name in names]
         if len(names) > 1:  # a single family is all there is
             rows.append(_every_family(probes))
-        title = "VQA by family of questions" + (f", set {number + 1}" if number else "")
+        title = "VQA by family of questions"
+        if len(by_questions) > 1:
+            title += f": {name}, {count:,} questions" + ", asked again" * again
         yield section(
             title,
             note(
@@ -199,6 +201,22 @@ def _every_family(probes: Sequence[At]) -> list[Child]:
         share(first["baseline_accuracy"]),
         *(with_interval(p["accuracy"], p["interval"], share) for p in probes),
     ]
+
+
+def _by_questions(runs: Sequence[At]) -> dict[tuple[str, int, int], dict[str, At]]:
+    """The figures of the runs' probes by their labels, for each set and number of questions.
+
+    What was asked several times of one run, as with other seeds, has a place for each time.
+    """
+    found: dict[tuple[str, int, int], dict[str, At]] = {}
+    for run in runs:
+        label = str(run["label"])
+        for name, probed in zip(run["question_sets"], run["probes"], strict=True):
+            figures, again = probed["figures"], 0
+            while label in found.get(key := (str(name), figures["questions"].value, again), ()):
+                again += 1
+            found.setdefault(key, {})[label] = figures
+    return found
 
 
 def _family(name: str, probes: Sequence[At]) -> list[Child]:

@@ -18,7 +18,7 @@ from aegis_cli.inspection import steps_taken
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
     """The facts, then the tables that there are; tensors are listed where they are asked for."""
     shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
-    facts = _with_steps_taken(report.facts)
+    facts = _as_they_are_read(report.facts)
     parts: list[RenderableType] = [
         pairs({"kind": report.kind, "path": report.path, **facts, **shed})
     ]
@@ -57,10 +57,14 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
     return Group(*parts)
 
 
-def _with_steps_taken(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """The facts with one line on a run's steps, which says of how many where some are left."""
+def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The facts with one line on a run's steps, of how many where some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
     left = {name: value for name, value in facts.items() if name != "planned_steps"}
+    if merged := facts.get("merge"):
+        # A merge whose sweep measured no validation loss has none.
+        told = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
+        left["merge"] = told
     if None in (planned, steps) or steps >= planned:
         return left
     return left | {"steps": steps_taken(steps, planned)}
@@ -175,12 +179,16 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
     lines = [
         (
-            f"{c[0].first_step} to {c[-1].last_step}",
+            _steps(c[0].first_step, c[-1].last_step),
             percent(sum(b.energy_shed for b in c) / len(c), 3),
         )
         for c in chunks
     ]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def _steps(first: int, last: int) -> str:
+    return f"{first} to {last}" if last > first else str(first)
 
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")

@@ -11,6 +11,7 @@ from rich.text import Text
 from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
 from aegis_cli.cli.render.plots import figure, save_figure
 from aegis_cli.cli.render.tables import pairs
+from aegis_cli.common import commands
 
 _COLOR, _CHOSEN = "#0072b2", "#d55e00"
 
@@ -57,7 +58,8 @@ def _points(report: Any) -> Any:
 def _next(report: Any) -> str:
     """What to do with the finding: a strength that was chosen has to be judged on other data."""
     if report.out is not None:
-        return f"now ask the test questions: aegis probe {report.out} --baseline {report.base}"
+        probe = commands.aegis("probe", report.out, "--baseline", report.base)
+        return f"now ask the test questions: {probe}"
     if report.passed is False:
         return "no strength of this sweep passes: try stronger ones with --sweep"
     return "write one: --strength S --out FOLDER, or --max-drop POINTS --out FOLDER"

@@ -33,7 +33,8 @@ def open_loop(report: Any) -> RenderableType:
         error += f" ({low} to {high})"
     facts = {
         "data": report.data,
-        "episodes": report.episodes,
+        # A lone number would be read as how many there are.
+        "episodes" if len(report.episodes) > 1 else "episode": report.episodes,
         "chosen": _SPLITS[report.split],
         "frames": report.frames,
         "chunk": report.chunk,

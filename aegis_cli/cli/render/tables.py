@@ -336,12 +336,19 @@ def _cell(value: Any, name: str = "") -> str:
     if name in ("drop_interval", "return_interval"):
         return " to ".join(number(v) for v in value)
     if isinstance(value, dict):
-        return _list([f"{k} {_cell(v)}" for k, v in value.items()])
+        return _list([f"{k} {_within(v)}" for k, v in value.items()])
     if isinstance(value, (tuple, list)):
         return _list([_cell(v) for v in value]) or "-"
     if isinstance(value, float):
         return percent(value) if _is_share(name) else number(value)
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
+
+
+def _within(value: Any) -> str:
+    """A value of a value; several stand in brackets, under their names as they are read."""
+    if not isinstance(value, dict):
+        return _cell(value)
+    return f"({', '.join(f'{_label(k)} {_cell(v)}' for k, v in value.items())})"
 
 
 def _list(items: Sequence[str], most: int = 12) -> str:

@@ -130,7 +130,7 @@ def load(
         files.make_folder(path.parent)
         parts = list(split(source, index, camera))
         height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
-        _write(path, parts, (count, height, width, 3), workers, on_event)
+        _write(path, parts, (count, height, width, 3), workers, camera, on_event)
     frames = _open(path, count)
     if kept:
         _check_some(path, frames, source, index, camera)
@@ -237,9 +237,10 @@ def _write(
     parts: Sequence[Part],
     shape: tuple[int, ...],
     workers: int | None,
+    camera: str,
     on_event: OnEvent,
 ) -> None:
-    """Decode into a file beside `path`, then rename it."""
+    """Decode a camera's frames into a file beside `path`, then rename it."""
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
@@ -252,7 +253,7 @@ def _write(
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
-        done = 0
+        done, stage = 0, f"decode {layout.short(camera)}"
         workers = workers or worker_count(len(parts) // _PER_WORKER)
         decode = partial(_decode, aside, offset, shape[1:3])
         with mapped(
@@ -260,7 +261,7 @@ def _write(
         ) as counts:
             for decoded in counts:
                 done += decoded
-                on_event(Progress("decode", done, count, "frames"))
+                on_event(Progress(stage, done, count, "frames"))
         with open(aside, "rb") as file:
             os.fsync(file.fileno())
         os.replace(aside, path)

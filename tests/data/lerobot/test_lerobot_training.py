@@ -206,9 +206,9 @@ def test_frames_are_decoded_once(
 ) -> None:
     folder, events = save(tmp_path / "d"), []
     loaded = demonstrations.load(folder, 0.3, 0, on_event=events.append)
-    assert [e.stage for e in events] == ["decode"] and events[-1].done == events[-1].total == len(
-        loaded.episode_of
-    )
+    assert [e.stage for e in events] == ["decode top"] and events[-1].done == events[
+        -1
+    ].total == len(loaded.episode_of)
     monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
     again = demonstrations.load(folder, 0.3, 1, on_event=events.append)
     assert torch.equal(again.frames[0], loaded.frames[0]) and len(events) == 1

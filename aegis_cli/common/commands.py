@@ -1,0 +1,10 @@
+"""Commands that a message names, so that a shell takes them as they are printed."""
+
+from __future__ import annotations
+
+import shlex
+
+
+def aegis(*words: object) -> str:
+    """A call of `aegis` with these words, each quoted where it has to be."""
+    return shlex.join(["aegis", *map(str, words)])
