@@ -37,6 +37,8 @@ _PLACE = "aegis_place"  # in a parameter's state: the number of what it is in th
 # In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
 _PARTNER = "aegis_partner"
 _NAMED = 4  # maps that a warning names
+# In which a program may keep a VLM that is stored in float32, in the order of looking for them.
+_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 # How far a weight that has learned is from what it was, of its own size, at most. Weights that have
 # nothing to do with each other are farther apart than the size of either.
 _NEAR = 0.5
@@ -281,6 +283,9 @@ def _match(
 ) -> dict[str, Pair]:
     """The parameters that have the values of the base model's sites, by site.
 
+    A program may have rounded the VLM, which is stored in float32: then those that have the rounded
+    values, of sites whose own nothing has.
+
     Args:
         claimed: ids of parameters that are known to be something else.
 
@@ -293,9 +298,27 @@ def _match(
     for place, parameter in enumerate(ordered):
         if parameter.shape in shapes and id(parameter) not in claimed:
             places.setdefault(_values(parameter), []).append(place)
+    found: dict[str, Pair] = {}
+    for dtype in _TYPES:
+        rest = {site: pair for site, pair in base.items() if site not in found}
+        found |= _match_in(dtype, rest, ordered, places)
+    return found
+
+
+def _match_in(
+    dtype: torch.dtype,
+    base: Mapping[str, Pair],
+    ordered: Sequence[Tensor],
+    places: Mapping[str, Sequence[int]],
+) -> dict[str, Pair]:
+    """The parameters that have the values of the base model's sites in one type, by site.
+
+    Args:
+        places: of the parameters, by their values.
+    """
     alike: dict[str, list[str]] = {}
     for site, (weight, _) in base.items():
-        alike.setdefault(_values(weight), []).append(site)
+        alike.setdefault(_values(weight.to(dtype)), []).append(site)
     found: dict[str, Pair] = {}
     for values, sites in alike.items():
         at = places.get(values, [])
@@ -322,7 +345,7 @@ def _bias(
     """The bias that belongs to the weight at a place: the next parameter, or the only one alike."""
     if value is None:
         return None
-    at = places.get(_values(value), ())
+    at = next((places[v] for v in _in_each_type(value) if v in places), ())
     if place + 1 in at:
         return ordered[place + 1]
     if len(at) == 1:
@@ -470,6 +493,11 @@ def _values(tensor: Tensor) -> str:
     return digest({"": tensor})
 
 
+def _in_each_type(tensor: Tensor) -> Iterator[str]:
+    """Digests of its values, and of these rounded to each narrower type."""
+    return (_values(tensor.to(dtype)) for dtype in _TYPES)
+
+
 def _freeze(
     base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
 ) -> tuple[list[Tensor], dict[str, Tensor]]:
@@ -487,10 +515,13 @@ def _freeze(
         on the CPU. They may have learned before.
     """
     held = {id(t) for site in protected for t in weights(base, site) if t is not None}
-    sequence = [(_values(p), id(p) in held) for p in base.parameters()]
-    others = Counter(value for value, is_held in sequence if not is_held)
     in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
     given = Counter(value for _, values in in_groups for value in values)
+    sequence = []
+    for parameter in base.parameters():
+        known = next((v for v in _in_each_type(parameter) if v in given), "")
+        sequence.append((known or _values(parameter), id(parameter) in held))
+    others = Counter(value for value, is_held in sequence if not is_held)
     held_values = {value for value, is_held in sequence if is_held}
     lost: dict[str, Tensor] = {}
     for (name, parameter), (value, is_held) in zip(base.named_parameters(), sequence, strict=True):

@@ -490,6 +490,31 @@ def train_rounded(model: nn.Module, optimizer: torch.optim.Optimizer, steps: ran
         optimizer.zero_grad()
 
 
+@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_vlm_that_the_program_has_rounded_is_known_as_the_bases(
+    method: str, wide: bool, trained_folder: Path
+) -> None:
+    """Its base is stored in float32, and LeRobot loads it in bfloat16."""
+    model = Foreign(trained_folder)
+    whole = made_of(trained_folder, model, method)
+    train(model, whole, range(1))
+    model = Foreign(trained_folder)
+    model.inner.to(torch.bfloat16)
+    if wide:
+        model.inner.float()
+    optimizer = made_of(trained_folder, model, method)
+    still = {name for name, p in model.named_parameters() if not p.requires_grad}
+    before = values(model)
+    train(model, optimizer, range(3))
+    assert optimizer.protected == whole.protected and len(optimizer.protected) > 10
+    assert all(torch.equal(before[name], model.get_parameter(name)) for name in still)
+    assert bool(still) == (method == "kfac")
+    assert not torch.equal(
+        before["inner.vlm.layers.0.up.weight"], model.inner.vlm.layers[0].up.weight
+    )
+
+
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
 def test_half_precise_weights_are_the_rounded_ones_of_a_float32_training(
     method: str, half_folder: Path, half_base: Backbone, half_anchor: Path
