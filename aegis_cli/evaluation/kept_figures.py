@@ -155,6 +155,18 @@ class TrainFigures:
     out: str | None = None
 
 
+@dataclass(frozen=True)
+class MergeFigures:
+    """How `aegis run` has merged what it trained."""
+
+    method: str
+    strength: Number
+    damping: Number
+    base: str
+    kept: Number
+    validation_loss: Number | None = None
+
+
 Plain = dict[str, str | int | Number | bool | None]  # of a machine
 
 

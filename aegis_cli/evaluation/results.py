@@ -25,7 +25,7 @@ from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
-from aegis_cli.training import checkpoint, track
+from aegis_cli.training import checkpoint, folder, track
 
 FOLDER = "results"
 OPEN_LOOP = "evaluate"  # what the names of its files begin with
@@ -236,8 +236,9 @@ def open_loops(run: Path) -> list[Result]:
 def _read(
     run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
 ) -> list[Result]:
-    by_recipe = []
-    for path in sorted(run.glob(f"{kind}.json")) + sorted(run.glob(f"{kind}-*.json")):
+    by_recipe, own = [], folder.measured_in(run)
+    listed = [] if own is None else [own.glob(f"{kind}.json"), own.glob(f"{kind}-*.json")]
+    for path in [path for found in listed for path in sorted(found)]:
         # What a study measures on validation data chooses its knobs, and is no result.
         if not re.match(rf"{kind}-validation(-|$)", path.stem):
             by_recipe.append(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -60,6 +61,9 @@ class DualBackward:
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._looked = 0, False
+        # Whether the ledger has a row of the last sum, of which a step may still be to come; and
+        # whether a scaler may skip that.
+        self._row_is_open, self._skips = False, False
         # Those whose `.grad` tells a scaler to skip the step that it is of.
         self._poisoned: list[nn.Parameter] = []
 
@@ -75,6 +79,17 @@ class DualBackward:
     def forget(self) -> None:
         """Forget the sum."""
         self._sum = None
+        self.close_row()
+
+    def close_row(self) -> None:
+        """Drop the row of the last sum where no step was made of it.
+
+        A scaler has skipped it, as for a gradient of what the guard does not know, or the loop has
+        left it out.
+        """
+        if self._row_is_open and not self._stepper.may_have_moved(self._skips):
+            self._ledger.truncate(self._step - 1)
+        self._row_is_open = False
 
     def check_group(self) -> None:
         """Raise AegisError where processes have been connected of which the guard does not know.
@@ -111,6 +126,8 @@ class DualBackward:
         total, self._sum = self._sum if continued else None, None  # until this pass has ended well
         if total is not None:
             accumulation.take_back(total, groups)
+        else:
+            self.close_row()
         self._see_whether_cleared()
         # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
         # gradients are those of unscaled ones.
@@ -147,6 +164,8 @@ class DualBackward:
         self._reopened, self._sum = self._sum if self.continues() else None, None
         if self._reopened is not None:
             accumulation.take_back(self._reopened, self._learning())
+        else:
+            self.close_row()
         self._see_whether_cleared()
 
     def _see_whether_cleared(self) -> None:
@@ -210,13 +229,14 @@ class DualBackward:
         # A further micro-batch of the same step replaces the step's row.
         self._ledger.truncate(self._step - 1)
         numbers = [*gram, total.w2] if loss is None else [loss, *gram, total.w2]
-        if not all(x.isfinite().all() for x in numbers):
+        if not all(x.isfinite().all() for x in numbers) or _overflowed(groups):
             if not skips:
                 raise diverged(len(self._ledger))
             self._poisoned = accumulation.poison(total, groups)
             return
         check_row(gram, self._ledger.groups)
         self._ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
+        self._row_is_open, self._skips = True, skips
         accumulation.mark(total, groups, weights)
         self._sum = total
 
@@ -239,6 +259,13 @@ class DualBackward:
                 'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
         self._looked = True
+
+
+def _overflowed(groups: Sequence[Sequence[nn.Parameter]]) -> bool:
+    """Whether a combination of finite gradients is none in float16, the only type so narrow."""
+    gradients = [p.grad for group in groups for p in group if p.grad is not None]
+    narrow = [gradient for gradient in gradients if gradient.dtype == torch.float16]
+    return bool(narrow) and not nn.utils.get_total_norm(narrow, norm_type=math.inf).isfinite()
 
 
 def diverged(steps: int) -> Diverged:

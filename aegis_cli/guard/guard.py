@@ -372,6 +372,8 @@ class Guard(Removable):
                 "call it instead of loss.backward()",
             )
         self._stepper.step(optimizer, scaler, self._anchor_gradient())
+        if dual is not None and self._stepper.is_of_all(optimizer):
+            dual.close_row()
 
     def settle(self) -> None:
         """Constrain the steps since the last constraint now, before a model is saved or evaluated.

@@ -37,6 +37,8 @@ _PLACE = "aegis_place"  # in a parameter's state: the number of what it is in th
 # In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
 _PARTNER = "aegis_partner"
 _NAMED = 4  # maps that a warning names
+# In which a program may keep a VLM that is stored in float32, in the order of looking for them.
+_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 # How far a weight that has learned is from what it was, of its own size, at most. Weights that have
 # nothing to do with each other are farther apart than the size of either.
 _NEAR = 0.5
@@ -101,8 +103,11 @@ class ProtectedAdamW(torch.optim.AdamW):
         # come, tells what they are; the first step asks again.
         with contextlib.suppress(AegisError):
             self._found = _match(self._base, self._ordered())
+        # What no longer learns, and the VLM's values of what should not and was not found.
+        self._frozen: list[Tensor] = []
+        self._lost: dict[str, Tensor] = {}
         if method == "kfac" and self._options["weight"] > 0:
-            _freeze(base, self._base, self.param_groups)
+            self._frozen, self._lost = _freeze(base, self._base, self.param_groups)
         self._notes: dict[Tensor, dict[str, int]] = {}  # what each parameter's state remembers
         self._stepper: Stepper | None = None
         self._wide = WideStep(self, ())
@@ -121,10 +126,12 @@ class ProtectedAdamW(torch.optim.AdamW):
 
         Raises:
             AegisError: at the first step, where none of the VLM's maps is among the parameters,
-                they cannot be told, some have learned, or half of one is frozen.
+                they cannot be told, some have learned or are tables of another size, or half of one
+                is frozen; at any, where something learns again that `kfac` has frozen.
         """
         if overflowed(self):
             return None
+        self._refuse_thawed()
         if self._stepper is None:
             self._start()
         assert self._stepper is not None
@@ -150,6 +157,16 @@ class ProtectedAdamW(torch.optim.AdamW):
         with wide_step.loading(self, state_dict):
             super().load_state_dict(state_dict)
 
+    def _refuse_thawed(self) -> None:
+        """Refuse a step of what was frozen at the start."""
+        if any(parameter.requires_grad for parameter in self._frozen):
+            raise AegisError(
+                f"normalisations or tables of the base model that learn again, of "
+                f"{len(self._frozen)} parameters that were frozen",
+                "what kfac holds: linear maps and convolutions alone",
+                "leave them frozen after the optimizer is made; aegis_nullspace protects them too",
+            )
+
     def _ordered(self) -> list[Tensor]:
         """The parameters in the order that their state is saved in."""
         return [p for group in self.param_groups for p in group["params"]]
@@ -172,6 +189,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         # Those of a resumed training have learned; it has been asked when it began.
         if not known:
             _refuse_strays(self._base, found, self._ordered())
+            _refuse_lost(self._lost, self._base, found, self._ordered())
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
@@ -185,6 +203,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._found = learning
         self._notes = self._to_remember()
         self._base.clear()
+        self._lost.clear()
 
     def _known_again(self) -> dict[str, Pair]:
         """The sites that a loaded state names.
@@ -264,6 +283,9 @@ def _match(
 ) -> dict[str, Pair]:
     """The parameters that have the values of the base model's sites, by site.
 
+    A program may have rounded the VLM, which is stored in float32: then those that have the rounded
+    values, of sites whose own nothing has.
+
     Args:
         claimed: ids of parameters that are known to be something else.
 
@@ -276,9 +298,27 @@ def _match(
     for place, parameter in enumerate(ordered):
         if parameter.shape in shapes and id(parameter) not in claimed:
             places.setdefault(_values(parameter), []).append(place)
+    found: dict[str, Pair] = {}
+    for dtype in _TYPES:
+        rest = {site: pair for site, pair in base.items() if site not in found}
+        found |= _match_in(dtype, rest, ordered, places)
+    return found
+
+
+def _match_in(
+    dtype: torch.dtype,
+    base: Mapping[str, Pair],
+    ordered: Sequence[Tensor],
+    places: Mapping[str, Sequence[int]],
+) -> dict[str, Pair]:
+    """The parameters that have the values of the base model's sites in one type, by site.
+
+    Args:
+        places: of the parameters, by their values.
+    """
     alike: dict[str, list[str]] = {}
     for site, (weight, _) in base.items():
-        alike.setdefault(_values(weight), []).append(site)
+        alike.setdefault(_values(weight.to(dtype)), []).append(site)
     found: dict[str, Pair] = {}
     for values, sites in alike.items():
         at = places.get(values, [])
@@ -305,7 +345,7 @@ def _bias(
     """The bias that belongs to the weight at a place: the next parameter, or the only one alike."""
     if value is None:
         return None
-    at = places.get(_values(value), ())
+    at = next((places[v] for v in _in_each_type(value) if v in places), ())
     if place + 1 in at:
         return ordered[place + 1]
     if len(at) == 1:
@@ -339,18 +379,15 @@ def _refuse_strays(
     """Refuse learning parameters that belong to a map of the VLM which was not found.
 
     A map may be missing, as in a VLM with fewer layers. One that is there with other values would
-    learn unprotected.
+    learn unprotected, and so would a table with more rows.
 
     Raises:
-        AegisError: a map's weight that has moved, or its bias without its weight.
+        AegisError: a weight that has moved, a table of another size, or a bias without its weight.
     """
-    claimed = _ids(found)
-    free: dict[torch.Size, list[Tensor]] = {}
-    for parameter in ordered:
-        if parameter.requires_grad and id(parameter) not in claimed:
-            free.setdefault(parameter.shape, []).append(parameter)
+    free = _free(found, ordered)
     for site in sorted(base.keys() - found.keys()):
         weight, bias = base[site]
+        _refuse_resized(site, weight, free)
         if any(_near(parameter, weight) for parameter in free.get(weight.shape, ())):
             raise AegisError(
                 f"a parameter {list(weight.shape)} near {site} of the base model, and "
@@ -368,6 +405,74 @@ def _refuse_strays(
                 "all or nothing",
                 "freeze both or none",
             )
+
+
+def _refuse_lost(
+    lost: Mapping[str, Tensor],
+    base: Mapping[str, Pair],
+    found: Mapping[str, Pair],
+    ordered: Sequence[Tensor],
+) -> None:
+    """Refuse learning parameters that belong to the VLM and that `kfac` could not freeze.
+
+    Those of a layer of which no map was found are missing, as the layer is.
+
+    Args:
+        lost: values of the VLM's parameters that are of no map, and were not found, by name.
+        base: the VLM's maps, of which some were found.
+
+    Raises:
+        AegisError: one that has moved, or a table of another size.
+    """
+    free = _free(found, ordered)
+    for name, value in lost.items():
+        if not _is_there(name, base.keys(), found.keys()):
+            continue
+        _refuse_resized(name, value, free)
+        if any(_near(parameter, value) for parameter in free.get(value.shape, ())):
+            raise AegisError(
+                f"a parameter {list(value.shape)} near {name} of the base model, which learns, and "
+                "kfac holds linear maps and convolutions alone",
+                "normalisations and tables with the base model's values, which are frozen, or "
+                "frozen ones among the optimizer's parameters",
+                "freeze it; aegis_nullspace protects one that has not learned before",
+            )
+
+
+def _is_there(name: str, sites: Collection[str], found: Collection[str]) -> bool:
+    """Whether maps were found in the innermost part of the VLM that has the parameter and maps."""
+    part = name
+    while part:
+        part = part.rpartition(".")[0]
+        inside = [site for site in sites if not part or site.startswith(f"{part}.")]
+        if inside:
+            return any(site in found for site in inside)
+    return False
+
+
+def _refuse_resized(name: str, table: Tensor, free: Mapping[torch.Size, Sequence[Tensor]]) -> None:
+    """Refuse a table that has rows after those of the VLM's: its own would learn unprotected."""
+    for shape, parameters in free.items():
+        if table.ndim != 2 or shape[1:] != table.shape[1:] or len(shape) != 2:
+            continue
+        if shape[0] > len(table) and any(_near(p[: len(table)], table) for p in parameters):
+            raise AegisError(
+                f"a parameter {list(shape)} whose first rows are near {name} {list(table.shape)} "
+                "of the base model, as resize_token_embeddings leaves it",
+                "a table of the base model's size, or one that is frozen",
+                "freeze it; or give the base model's the same rows, save it, measure its anchor, "
+                "and name it as the base",
+            )
+
+
+def _free(found: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[torch.Size, list[Tensor]]:
+    """What learns and was not found to be the VLM's, by shape."""
+    claimed = _ids(found)
+    free: dict[torch.Size, list[Tensor]] = {}
+    for parameter in ordered:
+        if parameter.requires_grad and id(parameter) not in claimed:
+            free.setdefault(parameter.shape, []).append(parameter)
+    return free
 
 
 def _near(parameter: Tensor, weight: Tensor) -> bool:
@@ -388,9 +493,14 @@ def _values(tensor: Tensor) -> str:
     return digest({"": tensor})
 
 
+def _in_each_type(tensor: Tensor) -> Iterator[str]:
+    """Digests of its values, and of these rounded to each narrower type."""
+    return (_values(tensor.to(dtype)) for dtype in _TYPES)
+
+
 def _freeze(
     base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
-) -> None:
+) -> tuple[list[Tensor], dict[str, Tensor]]:
     """Let nothing learn of the VLM besides its protected maps.
 
     Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
@@ -399,20 +509,35 @@ def _freeze(
     Args:
         protected: the sites that learn.
         groups: the optimizer's.
+
+    Returns:
+        What was frozen; and by name those of the VLM that have too few parameters of their values,
+        on the CPU. They may have learned before.
     """
     held = {id(t) for site in protected for t in weights(base, site) if t is not None}
-    sequence = [(_values(p), id(p) in held) for p in base.parameters()]
-    others = Counter(value for value, is_held in sequence if not is_held)
     in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
     given = Counter(value for _, values in in_groups for value in values)
+    sequence = []
+    for parameter in base.parameters():
+        known = next((v for v in _in_each_type(parameter) if v in given), "")
+        sequence.append((known or _values(parameter), id(parameter) in held))
+    others = Counter(value for value, is_held in sequence if not is_held)
     held_values = {value for value, is_held in sequence if is_held}
+    lost: dict[str, Tensor] = {}
+    for (name, parameter), (value, is_held) in zip(base.named_parameters(), sequence, strict=True):
+        if not is_held and given[value] < others[value]:
+            lost[name] = _on_cpu(parameter)
     unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
+    frozen: list[Tensor] = []
     for parameters, values in in_groups:
         others_here = _in_order(sequence, values) if unclear & set(values) else set()
         for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
             is_other = place in others_here if value in unclear else value in others
             if is_other:
                 parameter.requires_grad_(False)
+                parameter.grad = None  # AdamW would step by one that was there before
+                frozen.append(parameter)
+    return frozen, lost
 
 
 def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> set[int]:

@@ -62,6 +62,10 @@ class GuardedStepper:
         # Ids of the optimizers that have stepped since the last guarded backward pass; None before
         # the first pass.
         self._stepped: set[int] | None = None
+        # Whether an optimizer has moved the weights since then; whether any has ever told of a
+        # step; and how often each weight had been written to.
+        self._took, self._tells = False, False
+        self._written: list[int] = []
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
             register_optimizer_step_pre_hook(before),
@@ -104,8 +108,20 @@ class GuardedStepper:
         if not self._sums_late:
             check_reached(self._learning.values())
         self._stepped, self._counted = set(), None
+        self._took, self._written = False, self._versions()
         if not self._in_closure:
             self._depth = 0  # a step that raised an exception has left it as it was
+
+    def may_have_moved(self, skips: bool) -> bool:
+        """Whether a step may have moved the weights since the last guarded backward pass.
+
+        Args:
+            skips: whether a scaler was there, which skips steps that overflow.
+        """
+        if self._took or self._written != self._versions():
+            return True
+        # An optimizer that is none of PyTorch's tells nothing, and may write past its count.
+        return not (self._tells or skips)
 
     @property
     def _sums_late(self) -> bool:
@@ -281,12 +297,17 @@ class GuardedStepper:
             self._stepper.begin(self._by_name(self._automatic()))
             self._slowed = SlowedStep(self._parts)
 
-    def after_step(self, optimizer: Optimizer) -> None:
-        """The weights have moved, and go on to move where this step lies inside another one."""
+    def after_step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
+        """The weights have moved, and go on to move where this step lies inside another one.
+
+        Args:
+            scaler: what the step was given as `grad_scaler`.
+        """
         if not self._guards(optimizer):
             return
-        moved = not overflowed(optimizer)
+        moved = not overflowed(optimizer, scaler)
         self._moved = moved or bool(self._moved)
+        self._took, self._tells = moved or self._took, True
         if self._stepped is not None:
             self._stepped.add(id(optimizer))
         self._depth = max(0, self._depth - 1)
@@ -307,6 +328,11 @@ class GuardedStepper:
     def _guards(self, optimizer: Optimizer) -> bool:
         mine = {id(p) for p in self._learning.values()}
         return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
+
+    def is_of_all(self, optimizer: Optimizer) -> bool:
+        """Whether an optimizer has all that learns, and no other one's step belongs to its own."""
+        mine = {id(p) for p in self._learning.values()}
+        return mine <= {id(p) for group in optimizer.param_groups for p in group["params"]}
 
     def _refuse_unguarded(self, optimizer: Optimizer) -> None:
         """Raise if guarded gradients are those of a plain backward pass."""
@@ -345,14 +371,20 @@ class SlowedStep:
             parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
 
 
-def overflowed(optimizer: Optimizer) -> bool:
+def overflowed(optimizer: Optimizer, scaler: Scaler | None = None) -> bool:
     """Whether a scaler has told this optimizer to leave out the step that it is in.
 
     A scaler calls the step of a fused optimizer in any case. It gives it `found_inf` for that time,
     and the kernel leaves the weights as they are, although PyTorch counts them as written to.
+
+    Args:
+        scaler: what the step was given as `grad_scaler`: by the older contract, the optimizer asks
+            it by itself.
     """
     found = getattr(optimizer, "found_inf", None)
-    return found is not None and bool(found)
+    if found is not None:
+        return bool(found)
+    return scaler is not None and any(map(bool, scaler._found_inf_per_device(optimizer).values()))
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
@@ -386,6 +418,6 @@ def _hooks_of_every_optimizer(
 
     def after(optimizer: Optimizer, given: tuple[Any, ...], named: dict[str, Any]) -> None:
         if (alive := known()) is not None:
-            alive.after_step(optimizer)
+            alive.after_step(optimizer, named.get("grad_scaler"))
 
     return before, after

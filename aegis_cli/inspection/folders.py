@@ -17,7 +17,7 @@ from aegis_cli.common.headers import Header
 from aegis_cli.continual import files as stream_files
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
-from aegis_cli.evaluation import results
+from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import figures, file
 from aegis_cli.inspection.report import (
@@ -30,6 +30,9 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, folder
+
+# What a merged checkpoint and a report of `aegis run` tell alike.
+_TOLD_OF_MERGES = ("method", "strength", "damping", "base", "kept", "validation_loss")
 
 
 def inspect(path: Path) -> InspectReport | StreamInspection:
@@ -118,12 +121,14 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     until = None if at is None else checkpoint.step_of(at)
     header, metrics = artifacts.read_header(rows), _last_metrics(path, until)
     which = path / "checkpoints" / checkpoint.LAST if at is None else at
-    if merged := _merged(which):
+    if merged := _merged(path, which):
         # The log is that of the training, before the weights were moved back.
         metrics["validation_loss"] = merged.get("validation_loss")
     facts = _run_facts(path, until, header, settings, metrics)
     if merged:
         facts["merge"] = merged
+    elif (into := folder.merged_in(path)) is not None:
+        facts["merged_into"] = str(into)
     if cameras := header.meta.get("cameras", settings.demos.camera):
         facts["cameras"] = cameras
     if dataset_id := header.meta.get("dataset"):
@@ -193,10 +198,20 @@ def _without_pictures(found: Result) -> Result:
     )
 
 
-def _merged(at: Path) -> dict[str, Any] | None:
-    """How `aegis merge` made a checkpoint; None of any other, and where a study has removed it."""
-    expert = at / checkpoint.EXPERT
-    return artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
+def _merged(run: Path, at: Path) -> dict[str, Any] | None:
+    """How `aegis merge` made a checkpoint of a run; None of any other.
+
+    The report of `aegis run` tells it too: a study removes checkpoints, and those of an earlier
+    Aegis do not know the loss after the merge.
+    """
+    expert, home = at / checkpoint.EXPERT, folder.measured_in(run)
+    found = artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
+    if home is None or not (home / folder.MERGE_REPORT).is_file():
+        return found
+    told = kept_figures.read(home / folder.MERGE_REPORT, kept_figures.MergeFigures)
+    return {name: told.get(name) for name in _TOLD_OF_MERGES} | {
+        name: value for name, value in (found or {}).items() if value is not None
+    }
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:

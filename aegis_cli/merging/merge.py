@@ -50,6 +50,7 @@ class MergeReport:
     Attributes:
         strength: of the merge that was written; None: nothing was.
         kept: its maps' mean share of the displacement.
+        validation_loss: of the merged policy on held-out episodes; None where it was not tried.
         baseline_accuracy: the pre-trained model's on the validation questions; None without a
             sweep, as `questions` is 0 then and `points` is empty.
         points: the sweep, weakest first, beginning with 0, which is the fine-tuned model.
@@ -68,6 +69,7 @@ class MergeReport:
     questions: int
     baseline_accuracy: float | None
     points: tuple[MergePoint, ...] = ()
+    validation_loss: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -81,6 +83,7 @@ def run(
     sweep: Sequence[float] = (),
     max_drop: float | None = None,
     on_event: OnEvent = ignore,
+    judged: bool = False,
 ) -> MergeReport:
     """Write the merge of one strength, or try several.
 
@@ -91,6 +94,7 @@ def run(
         sweep: empty: the method's own grid.
         max_drop: of a sweep, the weakest merge is written that loses at most these percentage
             points of accuracy on validation questions.
+        judged: of one strength, whether the task is tried on validation data, as a sweep does.
 
     Raises:
         AegisError: nothing that can be merged, or not by this method, or another process that is
@@ -100,7 +104,7 @@ def run(
     if out is not None:
         sources.check_out(out)
     with contextlib.nullcontext() if out is None else locks.alone(out):
-        return _run(target, settings, out, strength, sweep, max_drop, on_event)
+        return _run(target, settings, out, strength, sweep, max_drop, on_event, judged)
 
 
 def _run(
@@ -111,6 +115,7 @@ def _run(
     sweep: Sequence[float],
     max_drop: float | None,
     on_event: OnEvent,
+    judged: bool,
 ) -> MergeReport:
     strengths = (strength,) if strength is not None else tuple(sweep) or GRIDS[settings.method]
     for each in strengths:
@@ -126,12 +131,14 @@ def _run(
         judge = _Judge(source, settings, on_event)
         points = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
         baseline, chosen = judge.baseline_accuracy, _weakest(points, max_drop)
-    kept = None
+    kept = loss = None
     if chosen is not None and out is not None:
         kept = displacement.keep(chosen)
         how = {"method": settings.method, "strength": chosen, "damping": settings.damping}
-        losses = {point.strength: point.validation_loss for point in points}
-        result = {"kept": kept, "validation_loss": losses.get(chosen)}
+        loss = {point.strength: point.validation_loss for point in points}.get(chosen)
+        if judged:
+            loss = _performance(source, chosen).get("validation_loss")
+        result = {"kept": kept, "validation_loss": loss}
         source.write(
             out, {**how, "base": source.base_name, **result, **_measured_on(source, settings)}
         )
@@ -148,7 +155,19 @@ def _run(
         questions=0 if strength is not None else judge.questions,
         baseline_accuracy=baseline,
         points=tuple(points),
+        validation_loss=loss,
     )
+
+
+def _performance(source: sources.Source, strength: float) -> dict[str, float]:
+    """How well the task is done with the backbone's weights of now.
+
+    Raises:
+        Diverged: a figure that is not finite.
+    """
+    found = source.performance()
+    check_finite(found, f"at strength {strength:g}", "leave that strength out", 0)
+    return found
 
 
 def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, Any]:
@@ -188,8 +207,7 @@ class _Judge:
         """What the backbone's weights of now are worth."""
         after = probe.ask(self._source.backbone, self._asked, self._size)
         report = probe.compare(after, self._before, [], None)
-        performance = self._source.performance()
-        check_finite(performance, f"at strength {strength:g}", "leave that strength out", 0)
+        performance = _performance(self._source, strength)
         assert report.drop_points is not None and report.drop_interval is not None
         return MergePoint(
             strength, kept, report.accuracy, report.drop_points, report.drop_interval, **performance

@@ -21,7 +21,7 @@ from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data.vqa import sets
 from aegis_cli.merging.displacement import Keep
 from aegis_cli.merging.settings import MergeSettings
-from aegis_cli.merging.sources import Source
+from aegis_cli.merging.sources import Source, has_moved
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.base import weights
 from aegis_cli.models.backbones.base import Backbone
@@ -60,7 +60,7 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
 
 def _moved(source: Source, site: str) -> bool:
     pairs = zip(weights(source.backbone, site), weights(source.base, site), strict=True)
-    return any(now is not None and not torch.equal(now, before) for now, before in pairs)
+    return any(now is not None and has_moved(source, now, before) for now, before in pairs)
 
 
 def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:

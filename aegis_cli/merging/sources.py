@@ -10,6 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+from torch import Tensor
+
 from aegis_cli import recipes
 from aegis_cli.anchors import curvature, inputs
 from aegis_cli.common import artifacts, devices, files, machine
@@ -325,12 +328,22 @@ def _check_alike(tuned: Backbone, base: Backbone) -> None:
 
 def check_moved(source: Source) -> None:
     """Raise AegisError where nothing can be moved back."""
-    if source.backbone.fingerprint() == source.base.fingerprint():
+    pairs = zip(source.backbone.parameters(), source.base.parameters(), strict=True)
+    if not any(has_moved(source, now, before) for now, before in pairs):
         raise AegisError(
             "the same weights in the fine-tuned and the pre-trained model",
             "a backbone that has moved",
             "merge a run of a method that trains the backbone",
         )
+
+
+def has_moved(source: Source, now: Tensor, before: Tensor) -> bool:
+    """Whether a parameter is another one than before, and not but that one rounded.
+
+    A model that is stored in half precision may be fine-tuned from one in float32.
+    """
+    rounded = before.to(STORED_TYPES[source.backbone.stored]).to(now.dtype)
+    return not (torch.equal(now, before) or torch.equal(now, rounded))
 
 
 def check_out(out: Path) -> None:

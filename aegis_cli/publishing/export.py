@@ -26,6 +26,7 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import card
 from aegis_cli.training import checkpoint
+from aegis_cli.training import folder as run_folder
 
 SOURCE = "source"  # the type that the backbone was stored in before it was trained
 
@@ -97,6 +98,7 @@ def run(
     run = download.locate(run)
     policy, meta = checkpoint.load_policy(run)
     steps, planned = warn_of_steps_left(run, "export", on_event)
+    warn_of_a_merge(run, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
@@ -156,6 +158,20 @@ def warn_of_steps_left(
             text += f"; {commands.aegis('train', home)} goes on"
         on_event(Warned(stage, text))
     return steps, planned
+
+
+def warn_of_a_merge(run: Path, stage: str, on_event: OnEvent) -> None:
+    """Say so where `aegis run` has merged a run, of which the weights before are given to others.
+
+    What was measured is what it was merged into.
+    """
+    if lerobot_folder.is_policy(run):
+        return
+    home = checkpoint.run_of(checkpoint.chosen(run))
+    merged = None if home is None else run_folder.merged_in(home)
+    if merged is not None:
+        text = f"'{home}' has the weights before their merge; what was merged and measured"
+        on_event(Warned(stage, f"{text} is in '{merged}'"))
 
 
 def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:

@@ -119,6 +119,7 @@ def run(
             "give the run's folder",
         )
     export.warn_of_steps_left(run, "push", on_event)
+    export.warn_of_a_merge(run, "push", on_event)
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
         folder = Path(aside) / "policy"

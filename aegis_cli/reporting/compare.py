@@ -94,6 +94,7 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     evaluated = _one_of_each([_by_episodes(one) for _, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
     _warn_of_unfinished(rows, on_event)
+    _warn_of_merges(found, on_event)
     facts = [
         differences.of_run(path, row.steps, asked)
         for (path, _), row, asked in zip(found, rows, probed, strict=True)
@@ -122,6 +123,16 @@ def _warn_of_unfinished(rows: Sequence[ComparedRun], on_event: OnEvent) -> None:
     if left:
         text = f"not finished: {'; '.join(left)}; aegis train RUN goes on"
         on_event(Warned("compare", text))
+
+
+def _warn_of_merges(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
+    """Say which runs have been merged by `aegis run`, which has measured what came of that."""
+    given = {path.resolve() for path, _ in found}
+    for path, report in found:
+        merged = report.facts.get("merged_into")
+        if merged is not None and Path(merged).resolve() not in given:
+            text = f"'{path}' has the weights before their merge"
+            on_event(Warned("compare", f"{text}; what was merged and measured is in '{merged}'"))
 
 
 def _inspected(path: Path) -> InspectReport:
@@ -159,7 +170,7 @@ def _runs(path: Path) -> Iterator[Path]:
     if (path / table.NAME).is_file():
         found = table.load(path)
         if isinstance(found, PipelineReport):
-            yield from (path / row.method for row in found.rows)
+            yield from table.runs(found)
             return
     if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
         raise AegisError(

@@ -181,7 +181,7 @@ def _of_table(path: Path) -> Document:
     if not isinstance(found, PipelineReport):
         again = _command("aegis", "run", "RECIPE", "--out", path.parent)
         return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
-    runs = [run_document(path / row.method) for row in found.rows]
+    runs = [run_document(run) for run in table.runs(found)]
     # Each method's recipe names all methods of the job, with every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
     again = _command("aegis", "run", recipe, "--out", "NEW_FOLDER")
@@ -199,7 +199,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     """
     recipe = recipes.load(path / "recipe.yaml")
     found = inspection.run(path)
-    train = path / "train.json"
+    train = _jobs_report(path)
     about = path / machine.NAME
     anchor = _anchor(path, recipe, found)
     probes = results.probes(path)
@@ -229,6 +229,11 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     )
 
 
+def _jobs_report(path: Path) -> Path:
+    """What `aegis run` wrote of a run's training; no file where it has not trained it."""
+    return folder.trained_in(path) / folder.JOBS_REPORT
+
+
 def _anchor(
     path: Path, recipe: recipes.Recipe, found: inspection.InspectReport
 ) -> AnchorUse | None:
@@ -236,7 +241,7 @@ def _anchor(
     read = recipe.reads_anchor(str(found.facts["method"]))
     if not read and not any(probed.figures.get("layers") for probed in found.probes):
         return None
-    if (path / "train.json").is_file():  # by `aegis run`, which measures the recipe's own
+    if _jobs_report(path).is_file():  # by `aegis run`, which measures the recipe's own
         asked = f"questions of {recipe.anchor.vqa}"
         what = "robot frames" if recipe.anchor.source == "demos" else asked
         return AnchorUse(f"{recipe.anchor.samples} {what}", read)
@@ -318,7 +323,7 @@ def _seed(seed: int) -> tuple[object, ...]:
 
 def _beside(path: Path, name: str) -> str:
     """An input of a run as `aegis run` lays it; a word to fill in where it is elsewhere."""
-    found = path.parent / name
+    found = folder.trained_in(path).parent / name
     return str(found) if found.is_file() else name.partition(".")[0].upper()
 
 

@@ -26,7 +26,8 @@ class PipelineReport:
     """The recipe's table, also written to `table.json`.
 
     `gate_failed` names the methods past the recipe's `probe.max_drop`, and `verdict` is a sentence
-    on what the table says; "" where there is no naive to compare with, or no success.
+    on what the table says; "" where there is no naive to compare with, or no success. `merge` has
+    the recipe's keys of that name where each row is of what was merged after its training.
     """
 
     name: str
@@ -37,6 +38,7 @@ class PipelineReport:
     out: str
     gate_failed: list[str]
     verdict: str = ""
+    merge: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -96,6 +98,7 @@ def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> Pi
         str(folder),
         [] if limit is None else [row.method for row in rows if _past(row, limit)],
         verdict(rows),
+        None if recipe.merge.method is None else dataclasses.asdict(recipe.merge),
     )
     files.save_json(folder / "table.json", report.to_json())
     return report

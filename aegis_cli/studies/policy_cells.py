@@ -24,7 +24,6 @@ from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.evaluation import bench, probe, rollout, wrong_answers
 from aegis_cli.merging import merge
-from aegis_cli.merging import sources as merge_sources
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
 from aegis_cli.recipes import (
@@ -47,7 +46,6 @@ from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
-MERGED = "merged"  # the folder of a merge, in that of what it was made from
 # The files of a checkpoint that a probe or rollout reads.
 POLICY = ("backbone/model.safetensors", "expert.safetensors")
 
@@ -431,7 +429,7 @@ class PolicyRunner:
 
     def clear(self, label: str) -> None:
         """Remove the checkpoints, which are large and no result."""
-        for run in (self.folder / label, self.folder / label / MERGED):
+        for run in (self.folder / label, self.folder / label / run_folder.MERGED):
             shutil.rmtree(run / "checkpoints", ignore_errors=True)
 
     def tidy(self, labels: Iterable[str]) -> None:
@@ -446,6 +444,7 @@ class PolicyRunner:
         rolled out: its figures have neither success nor return.
         """
         trained = self.train(label, recipe)
+        _remove_misplaced(self.folder / label)
         if recipe.merge.method is not None:
             trained |= self.merge(label, recipe)
         asked = {
@@ -527,7 +526,7 @@ class PolicyRunner:
 
     def merge(self, label: str, recipe: Recipe) -> dict[str, float]:
         """Merge what the cell has trained; the merged policy's validation loss, by that name."""
-        trained, out = self.folder / label, self.folder / label / MERGED
+        trained, out = self.folder / label, self.folder / label / run_folder.MERGED
         recorded, measured = self.demos(recipe), self.anchor(recipe)
         settings = MergeSettings(
             method=str(recipe.merge.method),
@@ -536,7 +535,7 @@ class PolicyRunner:
             anchor=measured.path,
             frames=recipe.merge.frames,
         )
-        report = trained / "merge.json"
+        report = out / run_folder.MERGE_REPORT
         key = {
             "policy": _sha256(trained),
             "settings": dataclasses.asdict(recipe.merge),
@@ -545,10 +544,12 @@ class PolicyRunner:
         }
 
         def make(on_event: OnEvent) -> None:
-            shutil.rmtree(out, ignore_errors=True)
-            done = merge.run(str(trained), settings, out, recipe.merge.strength, on_event=on_event)
-            merged = merge_sources.PolicyRun(out, settings, on_event)
-            files.save_json(report, done.to_json() | merged.performance())
+            moved = run_folder.clear(out, ours=True)  # it lies in a run that is ours
+            if moved is not None:
+                on_event(Progress(f"merge (moved {moved.name} aside)", 1, 1, "stage"))
+            strength = recipe.merge.strength
+            done = merge.run(str(trained), settings, out, strength, on_event=on_event, judged=True)
+            files.save_json(report, done.to_json())
 
         outputs = [report, *(out / "checkpoints" / "last" / name for name in POLICY)]
         self.records.fresh(f"{label}/merge", key, outputs, make)
@@ -556,8 +557,8 @@ class PolicyRunner:
 
     def _policy(self, label: str, recipe: Recipe) -> Path:
         """The run whose policy is measured."""
-        merged = recipe.merge.method is not None
-        return self.folder / label / MERGED if merged else self.folder / label
+        merged, trained = recipe.merge.method is not None, self.folder / label
+        return trained / run_folder.MERGED if merged else trained
 
     def probe(
         self, label: str, recipe: Recipe, settings: Probe, number: int, validation: bool = False
@@ -570,7 +571,7 @@ class PolicyRunner:
         """
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
         name = name if number == 1 else f"{name}-{number}"
-        path, measured = self.folder / label / f"{name}.json", self.anchor(recipe)
+        path, measured = self._policy(label, recipe) / f"{name}.json", self.anchor(recipe)
         key = {
             "policy": _sha256(self._policy(label, recipe)),
             "anchor": measured.sha256,
@@ -613,7 +614,7 @@ class PolicyRunner:
     ) -> dict[str, Any]:
         """The cell's success on seen or held-out colours; without colours, its only figure."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
-        path, settings = self.folder / label / f"{name}-{colors}.json", recipe.rollout
+        path, settings = self._policy(label, recipe) / f"{name}-{colors}.json", recipe.rollout
         key = {
             "policy": _sha256(self._policy(label, recipe)),
             "episodes": settings.episodes,
@@ -670,6 +671,14 @@ def _probe_settings(settings: Probe) -> dict[str, Any]:
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
     return keys
+
+
+def _remove_misplaced(trained: Path) -> None:
+    """Remove what an earlier Aegis has left of a merged run's figures in the run around it."""
+    if (trained / run_folder.MERGE_REPORT).is_file():
+        for name in ("probe*.json", "rollout*.json", run_folder.MERGE_REPORT):
+            for path in trained.glob(name):
+                path.unlink()
 
 
 def _sha256(run: Path) -> list[str]:

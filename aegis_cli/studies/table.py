@@ -15,12 +15,13 @@ from aegis_cli.studies.comparison import (
 )
 from aegis_cli.studies.decoding import Misfit, decode
 from aegis_cli.studies.pipeline import PipelineReport
+from aegis_cli.training import folder
 
 NAME = "table.json"
 Report = PipelineReport | StudyReport | StreamStudyReport | RobotStreamStudyReport
 
 
-def load(folder: Path) -> Report:
+def load(at: Path) -> Report:
     """The report as `aegis run` would return it now.
 
     Its `out` is where it lies, wherever it was written.
@@ -28,22 +29,33 @@ def load(folder: Path) -> Report:
     Raises:
         AegisError: a study that has measured nothing yet, or a table of another version.
     """
-    path = folder / NAME
+    path = at / NAME
     if not path.is_file():
         raise AegisError(
-            f"no {NAME} in '{folder}': the study has measured nothing yet",
+            f"no {NAME} in '{at}': the study has measured nothing yet",
             "a study with its first cell",
             "look again later, or call its aegis run again",
         )
     raw = files.load_json(path)
     try:
-        return dataclasses.replace(decode(_kind(raw), raw), out=str(folder))
+        return dataclasses.replace(decode(_kind(raw), raw), out=str(at))
     except Misfit as misfit:
         raise AegisError(
             f"'{path}' is no table of this version: {misfit}",
             "what this version's aegis run writes",
             "call its aegis run again: what is finished is not measured again",
         ) from None
+
+
+def runs(report: PipelineReport) -> list[Path]:
+    """The run of each row: the one whose weights were measured."""
+    found = []
+    for row in report.rows:
+        trained = Path(report.out) / row.method
+        # An earlier Aegis did not say in its table that it had merged what it trained.
+        merged = report.merge is not None or folder.measured_in(trained) is None
+        found.append(trained / folder.MERGED if merged else trained)
+    return found
 
 
 def _kind(raw: object) -> type[Report]:

@@ -20,12 +20,15 @@ from aegis_cli.training import checkpoint, inputs
 
 METRICS = "metrics.jsonl"
 JOBS_REPORT = "train.json"  # in a run that `aegis run` has trained
+MERGED = "merged"  # in such a run: the run that `aegis run` has made of it by a merge
+MERGE_REPORT = "merge.json"  # in the merged run; an earlier Aegis wrote it into the one around it
 # What Aegis writes into a run's folder, beside its checkpoints.
 _FILES = (
     "recipe.yaml",
     METRICS,
     "*.safetensors",
-    *(JOBS_REPORT, "probe*.json", "rollout*.json", machine.NAME, inputs.NAME, "report.html"),
+    *(JOBS_REPORT, MERGE_REPORT, "probe*.json", "rollout*.json"),
+    *(machine.NAME, inputs.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )
 _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
@@ -192,12 +195,41 @@ def _is_foreign(path: Path, out: Path) -> bool:
     parts = path.relative_to(out).parts
     if parts[0] in _FOLDERS:
         return False  # a model's folder holds what its family writes
+    if parts[0] == MERGED and (len(parts) > 1 or (path / "recipe.yaml").is_file()):
+        return len(parts) > 1 and _is_foreign(path, out / MERGED)
     if parts[0] != "checkpoints":
         return len(parts) > 1 or not any(fnmatch(parts[0], name) for name in _FILES)
     step = parts[1] if len(parts) > 1 else checkpoint.LAST
     if not (step.isdecimal() or step == checkpoint.LAST or step.startswith(".")):
         return True
     return len(parts) > 2 and parts[2] not in checkpoint.PARTS
+
+
+def merged_in(run: Path) -> Path | None:
+    """The run that `aegis run` has made of a run by a merge; None where it has made none."""
+    merged = run / MERGED
+    return merged if (merged / "recipe.yaml").is_file() else None
+
+
+def trained_in(run: Path) -> Path:
+    """The run whose training a run is of: another one for what `aegis run` has merged."""
+    inside = run.name == MERGED and (run.parent / JOBS_REPORT).is_file()
+    return run.parent if inside else run
+
+
+def measured_in(run: Path) -> Path | None:
+    """Where the figures lie that `aegis run` has measured of a run, with its report of the merge.
+
+    An earlier Aegis left those of a merged run in the run around it.
+
+    Returns:
+        The folder; None for a run whose own figures `aegis run` has not measured, since it has
+        measured what it was merged into.
+    """
+    around = run.parent
+    if run.name == MERGED and (around / MERGE_REPORT).is_file():
+        return around
+    return None if (run / MERGE_REPORT).is_file() and merged_in(run) else run
 
 
 def begin(out: Path, recipe: Trained) -> None:

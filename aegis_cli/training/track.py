@@ -20,6 +20,7 @@ from aegis_cli import recipes
 from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe
+from aegis_cli.training import folder
 
 PROJECT = "aegis"
 Log = Callable[[Mapping[str, float]], None]  # one line of metrics.jsonl, its step included
@@ -236,8 +237,9 @@ def _tracker(module: Any, send: Callable[..., None]) -> Tracker:
 
 
 def _name(out: Path) -> str:
-    """A name that tells the run from others: its folder's last two parts."""
-    return "-".join(out.resolve().parts[-2:])
+    """A name that tells the run from others: its folder's last two parts, or three of a merge's."""
+    out = out.resolve()
+    return "-".join(out.parts[-2 if folder.trained_in(out) == out else -3 :])
 
 
 def _config(recipe: Recipe) -> dict[str, Any]:

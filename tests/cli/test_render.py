@@ -256,6 +256,7 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
                 baseline_accuracy=0.95,
                 majority_accuracy=0.3,
                 verdict="",
+                merge=None,
                 out="runs/n",
             )
         )

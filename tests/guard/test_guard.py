@@ -548,6 +548,117 @@ def test_after_an_overflow_an_optimizer_that_clears_less_than_what_learns_is_ref
     assert not torch.equal(vector(model), before) and len(guard.ledger) == 1
 
 
+def step_with_an_overflow_outside(
+    guard: Guard, optimizer: torch.optim.Optimizer, outside: nn.Parameter, by_guard: bool, bad: bool
+) -> None:
+    """One step with a scaler of its own, which skips it where a gradient outside overflows."""
+    scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
+    with guard.watch(batch(0)[2]):
+        loss = task_loss(guard._model, 0)
+    guard.backward(loss, scaler)
+    outside.grad = torch.full_like(outside, torch.inf if bad else 0.0)
+    if by_guard:
+        guard.step(optimizer, scaler)
+    else:
+        scaler.step(optimizer)
+    scaler.update()
+    optimizer.zero_grad()
+
+
+@pytest.mark.parametrize("by_guard", [True, False])
+@pytest.mark.parametrize("kind", [{}, {"foreach": True}, {"fused": True}])
+def test_a_step_that_is_skipped_for_others_gradients_has_no_row(
+    kind: dict[str, bool], by_guard: bool, tmp_path: Path
+) -> None:
+    """An action expert's overflow skips the VLM's step too, whose own gradients were finite."""
+    model, outside = make(dtype=torch.float32), nn.Parameter(torch.zeros(2))
+    path = measured(make(dtype=torch.float32), tmp_path / "anchor.safetensors")
+    guard = Guard(model, path, LAYERS)
+    optimizer = torch.optim.AdamW([*model.parameters(), outside], **kind)
+    for bad in (True, False, True, False, True):
+        step_with_an_overflow_outside(guard, optimizer, outside, by_guard, bad)
+    guard.remove()
+    assert guard.ledger.tensors()["step"].tolist() == [2, 4]
+
+
+def test_a_batch_that_is_left_out_after_its_backward_pass_has_no_row(anchor: Path) -> None:
+    model = make()
+    guard = Guard(model, anchor, LAYERS)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.01)
+    for number in range(4):
+        with guard.watch(batch(number)[2]):
+            loss = task_loss(model, number)
+        guard.backward(loss)
+        if number != 2:
+            optimizer.step()
+        optimizer.zero_grad()
+    assert guard.ledger.tensors()["step"].tolist() == [1, 2, 4]
+
+
+def test_only_the_projected_gradient_overflows(tmp_path: Path) -> None:
+    """In float16 a combination of two finite gradients may be none."""
+    model = make(dtype=torch.float16)
+    guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), LAYERS)
+    combine = guard._parts.combine
+
+    def large(*gram: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        of_task, of_anchor = combine(*gram)
+        return of_task * 1e9, of_anchor
+
+    guard._dual._parts = dataclasses.replace(guard._parts, combine=large)
+    optimizer = torch.optim.AdamW(model.parameters(), fused=True)
+    before, scaler = vector(model), torch.amp.GradScaler("cpu", init_scale=4.0)
+    for given in (scaler, None):
+        with guard.watch(batch(0)[2]):
+            loss = task_loss(model, 0)
+        if given is None:
+            with pytest.raises(Diverged):
+                guard.backward(loss)
+        else:
+            guard.backward(loss, scaler)
+            guard.step(optimizer, scaler)
+            scaler.update()
+            optimizer.zero_grad()
+    assert len(guard.ledger) == 0 and torch.equal(vector(model), before)
+    assert scaler.get_scale() == 2.0
+
+
+class AsksItsScaler(torch.optim.AdamW):
+    """An optimizer by the older contract: its step is given the scaler, and asks that."""
+
+    def __init__(self, parameters: Any, **settings: Any) -> None:
+        super().__init__(parameters, **settings)
+        self._step_supports_amp_scaling = True
+
+    def step(self, closure: Any = None, *, grad_scaler: Any = None) -> Any:
+        grad_scaler.unscale_(self)
+        if any(map(bool, grad_scaler._found_inf_per_device(self).values())):
+            return None
+        return super().step(closure)
+
+
+@pytest.mark.filterwarnings("ignore:GradScaler is going to stop passing itself:FutureWarning")
+@pytest.mark.parametrize("automatic", [True, False])
+def test_an_optimizer_that_asks_its_scaler_skips_the_step_too(
+    automatic: bool, anchor: Path
+) -> None:
+    """Nothing is constrained of it, nor is it counted."""
+    model = make()
+    guard = Guard(model, anchor, method="nullspace", vision="vision", every=2)
+    optimizer = AsksItsScaler(model.parameters(), lr=0.01)
+    scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
+    if automatic:
+        guard.automatic(scaler=scaler)
+    pending = []
+    for factor in (1.0, torch.inf, 1.0, torch.inf, 1.0):
+        before = vector(model)
+        scaled_step(model, guard, optimizer, scaler, factor)
+        optimizer.zero_grad()
+        pending.append(guard.pending)
+        assert torch.equal(before, vector(model)) == (factor == torch.inf)
+    assert pending == [1, 1, 0, 0, 1]
+
+
 def scaled_step(
     model: nn.Module,
     guard: Guard,

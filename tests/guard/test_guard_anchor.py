@@ -482,3 +482,50 @@ def test_a_matrix_beside_other_modules_is_not_taken_for_a_row(tmp_path: Path) ->
     path = few_questions(model, tmp_path / "anchor.safetensors")
     with pytest.raises(AegisError, match=r"a Text \(text\)"):
         Guard(model, path, method="nullspace", vision="vision")
+
+
+# --- a table with more rows -----------------------------------------------------------------------
+
+ADDED = 4
+
+
+def resized(model: Vlm) -> Vlm:
+    """The model after resize_token_embeddings: its tied table has rows after the old ones."""
+    old = model.text.words
+    words, width = old.weight.shape
+    model.text.words = nn.Embedding(words + ADDED, width).to(old.weight.dtype)
+    model.head = nn.Linear(width, words + ADDED, bias=False)
+    with torch.no_grad():
+        model.text.words.weight[:words] = old.weight
+    model.head.weight = model.text.words.weight
+    return model
+
+
+def test_a_table_that_was_resized_later_is_refused(anchor: Path) -> None:
+    for options in ({"layers": LAYERS}, {"method": "nullspace", "vision": "vision"}):
+        with pytest.raises(AegisError, match="the weights are not those that anchor"):
+            Guard(resized(make()), anchor, **options)
+        model = make()
+        guard = Guard(model, anchor, **options)
+        resized(model)
+        with pytest.raises(AegisError, match="text.words.weight.*put into the model later"):
+            guard.backward(model(*batch(0)).square().mean())
+
+
+def test_of_a_resized_table_what_questions_read_stays_and_new_rows_learn(tmp_path: Path) -> None:
+    model = resized(make())
+    path = measured(model, tmp_path / "anchor.safetensors")
+    guard = Guard(model, path, method="nullspace", vision="vision")
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    table = model.text.words.weight
+    before, asked = (
+        table.detach().clone(),
+        {int(w) for s in range(100, 103) for w in batch(s)[1].unique()},
+    )
+    pixels, ids, mask = batch(0)
+    ids[0, 0] = len(table) - ADDED
+    guard.backward((model(pixels, ids, mask) - 1).square().mean())
+    guard.step(optimizer)
+    moved = (table.detach() - before).norm(dim=1)
+    assert float(moved[sorted(asked - {0})].max()) < 1e-12
+    assert float(moved[len(table) - ADDED]) > 1e-3

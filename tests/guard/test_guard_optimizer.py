@@ -152,6 +152,7 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
     tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
     model = Foreign(tiny_folder)
+    gradients(model, 0)  # of a pass before the optimizer was made
     optimizer = make(model, "kfac", anchor, base)
     still = {name for name, p in model.named_parameters() if not p.requires_grad}
     assert still == {
@@ -161,6 +162,9 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
     }
     maps = {site for site, kind in base.sites().items() if kind in ("maps", "stem")}
     assert set(optimizer.protected) == maps - {"stem.position"}
+    before = values(model)
+    optimizer.step()
+    assert all(torch.equal(before[name], model.get_parameter(name)) for name in still)
 
 
 @pytest.mark.parametrize("decays_apart", [False, True])
@@ -256,21 +260,86 @@ def test_a_vlm_of_which_a_part_has_learned_is_refused(
     refused_at_the_first_step(model, optimizer, f"near {part}|with the values of layers.0.norm1")
 
 
-def test_norms_that_have_learned_are_refused(tmp_path: Path) -> None:
-    """Also where all maps are as they were."""
-    folder = tmp_path / "base"
+@pytest.fixture(scope="module")
+def trained_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A VLM whose normalisations have values of their own, and its anchor."""
+    folder = tmp_path_factory.mktemp("trained")
     trained = make_tiny()
     for number, module in enumerate(trained.modules()):
         if isinstance(module, nn.LayerNorm):
             nn.init.normal_(module.weight, 1.0, 0.1 + number / 1000)
     trained.save(folder)
-    own = backbones.load(str(folder))
-    path = measured(folder, tmp_path / "anchor.safetensors")
-    model = Foreign(folder)
-    train(model, make(model, "nullspace", path, own), range(1))
-    model = Foreign(folder)
-    learned(model.inner["vlm"].layers[0].norm1)
-    refused_at_the_first_step(model, make(model, "nullspace", path, own), "near layers.0.norm1")
+    measured(folder, folder / "anchor.safetensors")
+    return folder
+
+
+def made_of(folder: Path, model: nn.Module, method: str) -> ProtectedAdamW:
+    return make(model, method, folder / "anchor.safetensors", backbones.load(str(folder)))
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+@pytest.mark.parametrize("part", ["layers.0.norm1", "final_norm", "words", "text_position"])
+def test_norms_and_tables_that_have_learned_are_refused(
+    part: str, method: str, trained_folder: Path
+) -> None:
+    """Also where all maps are as they were: nothing would hold what has moved."""
+    model = Foreign(trained_folder)
+    train(model, made_of(trained_folder, model, method), range(1))
+    model = Foreign(trained_folder)
+    with torch.no_grad():
+        for parameter in model.inner["vlm"].get_submodule(part).parameters():
+            parameter.mul_(1.01).add_(0.001)
+    optimizer = made_of(trained_folder, model, method)
+    refused_at_the_first_step(model, optimizer, f"near {part}")
+    model.inner["vlm"].get_submodule(part).requires_grad_(False)
+    optimizer = made_of(trained_folder, model, method)
+    train(model, optimizer, range(1))  # they stay as they are
+
+
+def test_the_norms_of_missing_layers_are_not_looked_for(trained_folder: Path) -> None:
+    """An expert's, of the same size, may be near them."""
+    model = Foreign(trained_folder)
+    layer = model.inner["vlm"].layers[-1]
+    del model.inner["vlm"].layers[-1]
+    model.expert_norm = copy.deepcopy(layer.norm1)
+    with torch.no_grad():
+        model.expert_norm.weight.mul_(1.01)
+    optimizer = made_of(trained_folder, model, "kfac")
+    before = values(model)
+    train(model, optimizer, range(1))
+    assert not torch.equal(before["expert_norm.weight"], model.expert_norm.weight)
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_resized_table_is_refused_unless_it_is_frozen(method: str, trained_folder: Path) -> None:
+    """As after resize_token_embeddings: no method knows its old rows in the larger table."""
+    model = Foreign(trained_folder)
+    vlm = model.inner["vlm"]
+    larger = nn.Embedding(len(vlm.words.weight) + 5, vlm.words.weight.shape[1])
+    with torch.no_grad():
+        larger.weight[: len(vlm.words.weight)] = vlm.words.weight
+    vlm.words = larger
+    optimizer = made_of(trained_folder, model, method)
+    refused_at_the_first_step(model, optimizer, "whose first rows are near words")
+    larger.requires_grad_(False)
+    model.zero_grad()
+    before = larger.weight.clone()
+    train(model, made_of(trained_folder, model, method), range(2))
+    assert torch.equal(larger.weight, before)
+
+
+def test_what_kfac_has_frozen_may_not_learn_again(
+    tiny_folder: Path, base: Backbone, anchor: Path
+) -> None:
+    model = Foreign(tiny_folder)
+    optimizer = make(model, "kfac", anchor, base)
+    train(model, optimizer, range(1))
+    model.requires_grad_(True)
+    before = values(model)
+    gradients(model, 1)
+    with pytest.raises(AegisError, match="learn again"):
+        optimizer.step()
+    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
 
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
@@ -419,6 +488,31 @@ def train_rounded(model: nn.Module, optimizer: torch.optim.Optimizer, steps: ran
                 parameter.grad.copy_(parameter.grad.bfloat16())
         optimizer.step()
         optimizer.zero_grad()
+
+
+@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_vlm_that_the_program_has_rounded_is_known_as_the_bases(
+    method: str, wide: bool, trained_folder: Path
+) -> None:
+    """Its base is stored in float32, and LeRobot loads it in bfloat16."""
+    model = Foreign(trained_folder)
+    whole = made_of(trained_folder, model, method)
+    train(model, whole, range(1))
+    model = Foreign(trained_folder)
+    model.inner.to(torch.bfloat16)
+    if wide:
+        model.inner.float()
+    optimizer = made_of(trained_folder, model, method)
+    still = {name for name, p in model.named_parameters() if not p.requires_grad}
+    before = values(model)
+    train(model, optimizer, range(3))
+    assert optimizer.protected == whole.protected and len(optimizer.protected) > 10
+    assert all(torch.equal(before[name], model.get_parameter(name)) for name in still)
+    assert bool(still) == (method == "kfac")
+    assert not torch.equal(
+        before["inner.vlm.layers.0.up.weight"], model.inner.vlm.layers[0].up.weight
+    )
 
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])

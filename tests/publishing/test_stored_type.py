@@ -19,6 +19,7 @@ from samples.small_run import recipe as small
 
 from aegis_cli import load_policy
 from aegis_cli.common import artifacts, files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.evaluation import probe, rollout
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
@@ -214,6 +215,15 @@ def test_a_merged_model_has_the_type_of_the_fine_tuned_one(
     merge.run(str(tuned), settings, tmp_path / "merged", strength=0.5)
     assert backbone_types(tmp_path / "merged") == {torch.bfloat16}
     assert "stored in bfloat16" in (tmp_path / "merged" / "README.md").read_text()
+
+
+def test_a_model_that_was_but_rounded_has_not_moved(tmp_path: Path) -> None:
+    """The base is stored in float32, and what was fine-tuned from it in bfloat16."""
+    base = write("smolvlm", tmp_path / "base")
+    tuned = write("smolvlm", tmp_path / "tuned", dtype=torch.bfloat16)
+    settings = MergeSettings("linear", base=str(base))
+    with pytest.raises(AegisError, match="the same weights in the fine-tuned and the pre-trained"):
+        merge.run(str(tuned), settings, tmp_path / "merged", strength=0.5)
 
 
 def test_a_merged_run_is_exported_in_the_sources_type(

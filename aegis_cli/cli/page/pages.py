@@ -237,7 +237,7 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     header = ["Method", "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
     cells = [
         [
-            row["method"],
+            run["label"],
             share(row["accuracy"]),
             [decimal(row["drop_points"]), between(row["drop_interval"], decimal)],
             decimal(row["cross_entropy"], 3),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from shlex import quote
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -79,6 +80,8 @@ def _measured(report: Any) -> list[RenderableType]:
         parts.append(_evaluated(report.open_loops))
     if report.probes:
         parts.append(_known(report.probes))
+    if not parts and (into := report.facts.get("merged_into")):
+        return [Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")]
     if not parts:
         does = "aegis probe, aegis rollout and aegis evaluate do that"
         return [Text(f"nothing is measured yet: {does}")]

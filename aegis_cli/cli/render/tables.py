@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -167,7 +167,8 @@ def pipeline(report: Any) -> RenderableType:
         ("validation_loss", partial(fixed, digits=4), False),
     ]
     drawn = [_marked_column(report.rows, *column) for column in columns]
-    rows = zip([r.method for r in report.rows], *drawn, strict=True)
+    named = [r.method if report.merge is None else f"{r.method}, merged" for r in report.rows]
+    rows = zip(named, *drawn, strict=True)
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
     return Group(
@@ -177,8 +178,15 @@ def pipeline(report: Any) -> RenderableType:
         Text(f"{before}; {majority}"),
         *([Text(MARKS)] if len(report.rows) > 1 else []),
         *([Text(report.verdict)] if report.verdict else []),
+        *([] if report.merge is None else [Text(_merged(report.merge))]),
         Text(f"files: {report.out}"),
     )
+
+
+def _merged(merge: Mapping[str, Any]) -> str:
+    """What was done to each policy between its training and its measuring."""
+    how = f"merged by {merge['method']}, strength {merge['strength']:g}, after the training"
+    return f"{how}: the policies are those in METHOD/merged"
 
 
 def _marked_column(
