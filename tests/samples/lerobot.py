@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from aegis_cli import sim
 from aegis_cli.data.lerobot import dataset, rows, source, write
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.write import Limits, NewEpisode, Spec
@@ -185,3 +186,32 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 
 def replaced(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
     return table.set_column(table.schema.names.index(name), name, values)
+
+
+class ReachArm:
+    """What LeRobot's robots have, of `reach`'s arm that does not move.
+
+    Attributes:
+        sent: the actions, as they came.
+    """
+
+    def __init__(self) -> None:
+        self.spec = sim.make("reach").spec
+        self.is_connected, self.sent = False, list[dict[str, float]]()
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+    def get_observation(self) -> dict[str, Any]:
+        assert self.is_connected
+        seen = dict.fromkeys(reversed(self.spec.proprio_names), 0.1)
+        return {**seen, self.spec.camera: np.zeros((48, 64, 3), np.uint8)}
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        assert self.is_connected and tuple(action) == self.spec.action_names
+        assert all(type(x) is float for x in action.values())
+        self.sent.append(action)
+        return action
