@@ -188,6 +188,25 @@ def replaced(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
     return table.set_column(table.schema.names.index(name), name, values)
 
 
+def otherwise(folder: Path, copy: Path, names: dict[str, str]) -> Path:
+    """A copy of a dataset whose features and joints have other names.
+
+    Its pictures are in its data files.
+    """
+    shutil.copytree(folder, copy)
+
+    def rename(info: dict[str, Any]) -> None:
+        for feature in info["features"].values():
+            if isinstance(feature["names"], list):
+                feature["names"] = [names.get(name, name) for name in feature["names"]]
+        info["features"] = {names.get(name, name): f for name, f in info["features"].items()}
+
+    edit_info(copy, rename)
+    for path in data_files(copy):
+        edit_table(path, lambda t: t.rename_columns([names.get(n, n) for n in t.schema.names]))
+    return copy
+
+
 class ReachArm:
     """What LeRobot's robots have, of `reach`'s arm that does not move.
 
