@@ -4,6 +4,11 @@
     policy.reset()  # a new episode
     action = policy.select_action(frame, "go to the red target", positions)
 
+An observation of LeRobot, or what a robot of LeRobot's sees, stands for pictures and positions:
+
+    action = policy.select_action(robot.get_observation(), "go to the red target")
+    robot.send_action(policy.named(action))
+
 The methods are named as those of LeRobot's policies. All values are in the units of the
 demonstrations.
 """
@@ -13,6 +18,7 @@ from __future__ import annotations
 import copy
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +29,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
-from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.evaluation.rollout import Acting, load_run
 from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.recipes import is_robot_stream_run
@@ -31,6 +37,16 @@ from aegis_cli.training import checkpoint
 
 _ORDER = "the order is: pictures, instruction, positions"
 Pictures = np.ndarray | Mapping[str, np.ndarray]
+Positions = Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a policy acts on: pictures in the backbone's order, text, and positions [P] float32."""
+
+    pictures: list[np.ndarray]
+    instruction: str
+    positions: np.ndarray
 
 
 class DeployedPolicy:
@@ -105,52 +121,99 @@ class DeployedPolicy:
         self._generator.manual_seed(self._seed)
 
     def select_action(
-        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
+        self,
+        pictures: Pictures | Mapping[str, Any],
+        instruction: str | None = None,
+        positions: Positions | None = None,
     ) -> np.ndarray:
         """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
         Another instruction than that of the chunk predicts at once, and drops what is left of it.
 
+        Args:
+            pictures, instruction, positions: see `predict_action_chunk`.
+
         Raises:
             AegisError: what `predict_action_chunk` finds wrong, at each call: a robot whose sensor
                 fails does not move on by an older prediction.
         """
-        self._checked(pictures, instruction, positions)
-        if instruction != self._follows:
+        seen = self._checked(pictures, instruction, positions)
+        if seen.instruction != self._follows:
             self._ahead.clear()
         if not self._ahead:
-            chunk = self.predict_action_chunk(pictures, instruction, positions)
-            self._ahead.extend(chunk[: self.replan])
-            self._follows = instruction
+            self._ahead.extend(self._predicted(seen)[: self.replan])
+            self._follows = seen.instruction
         return self._ahead.popleft()
 
     def predict_action_chunk(
-        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
+        self,
+        pictures: Pictures | Mapping[str, Any],
+        instruction: str | None = None,
+        positions: Positions | None = None,
     ) -> np.ndarray:
         """The next actions [H, A] float32.
 
         Args:
             pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the size that the
                 backbone was trained on; one picture, or a mapping of the cameras' names to theirs,
-                with or without LeRobot's `observation.images.` before them.
-            instruction: a text in words that the backbone knows.
-            positions: proprioception [P], in the demonstrations' order.
+                with or without LeRobot's `observation.images.` before them. Without positions, a
+                whole observation as `data.lerobot.observation` reads it.
+            instruction: a text in words that the backbone knows; None: the observation's `task`.
+            positions: proprioception [P], in the demonstrations' order; None: the observation's.
 
         Raises:
             AegisError: other pictures or numbers than it was trained on, words that the backbone
                 does not know, or predicted actions that are not finite.
         """
-        shown, given = self._checked(pictures, instruction, positions)
-        frames = [torch.from_numpy(self._fitted(p, camera)) for camera, p in enumerate(shown)]
+        return self._predicted(self._checked(pictures, instruction, positions))
+
+    def named(self, action: np.ndarray) -> dict[str, float]:
+        """The numbers of an action [A] by their names, as a robot's `send_action` takes them.
+
+        Raises:
+            AegisError: the policy does not know the names, or these are not its numbers.
+        """
+        if self.action_names is None:
+            raise AegisError(
+                "a policy that does not know the names of its actions",
+                "demonstrations that name each number of their actions",
+                "name the numbers in your program, in the demonstrations' order",
+            )
+        if np.shape(action) != (self.actions,):
+            raise AegisError(
+                f"an action of shape {np.shape(action)}",
+                f"({self.actions},): {', '.join(self.action_names)}",
+                "give one action; a chunk has one a row",
+            )
+        return {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
+
+    def _predicted(self, seen: _Seen) -> np.ndarray:
+        """The next actions [H, A] float32."""
+        frames = [torch.from_numpy(self._fitted(p, i)) for i, p in enumerate(seen.pictures)]
         images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
-        proprio = torch.from_numpy(given)[None]
-        acted = self._policy.act(images, [instruction], proprio, self._generator)[0]
+        proprio = torch.from_numpy(seen.positions)[None]
+        acted = self._policy.act(images, [seen.instruction], proprio, self._generator)[0]
         return check_actions(acted.cpu()).numpy()
 
     def _checked(
-        self, pictures: Pictures, instruction: str, positions: Sequence[float] | np.ndarray
-    ) -> tuple[list[np.ndarray], np.ndarray]:
-        """The pictures in the backbone's order, and the positions [P] float32."""
+        self,
+        pictures: Pictures | Mapping[str, Any],
+        instruction: str | None,
+        positions: Positions | None,
+    ) -> _Seen:
+        if positions is None:
+            if not isinstance(pictures, Mapping):
+                raise AegisError("no positions", f"numbers [{self.positions}]", _ORDER)
+            seen = observation.read(pictures, self.cameras, self.state_names)
+            pictures, positions = seen.pictures, seen.positions
+            if instruction is None:
+                instruction = seen.task
+            if instruction is None:
+                raise AegisError(
+                    "no instruction",
+                    "a text: the second argument, or 'task' in the observation",
+                    'give one, as in select_action(observation, "go to the red target")',
+                )
         given = _numbers(positions)
         if given.shape != (self.positions,):
             raise AegisError(
@@ -167,7 +230,7 @@ class DeployedPolicy:
         if not isinstance(instruction, str):
             found = f"an instruction of type {type(instruction).__name__}"
             raise AegisError(found, "a text", f"give one str; {_ORDER}")
-        return [_picture(shown) for shown in self._in_order(pictures)], given
+        return _Seen([_picture(shown) for shown in self._in_order(pictures)], instruction, given)
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
         """The pictures in the order in which the backbone takes them."""
@@ -199,7 +262,7 @@ class DeployedPolicy:
         return np.ascontiguousarray(fit(picture, *self.sizes[camera]) if self.sizes else picture)
 
 
-def _numbers(given: Sequence[float] | np.ndarray) -> np.ndarray:
+def _numbers(given: Positions) -> np.ndarray:
     """The positions as float32.
 
     Raises:

@@ -248,6 +248,75 @@ def test_actions_that_are_not_finite_are_refused() -> None:
     np.testing.assert_array_equal(own.select_action(frame(), TEXT, POSITIONS), expected)
 
 
+# --- observations in one mapping ------------------------------------------------------------------
+
+NAMES = {"action_names": ["pan.pos", "lift.pos"], "proprio_names": ["a.pos", "b.pos", "c.pos"]}
+
+
+def lemotors() -> dict[str, Any]:
+    """As LeRobot's preprocessing gives an observation."""
+    shown = torch.from_numpy(frame()).permute(2, 0, 1).float() / 255
+    state = torch.tensor([POSITIONS])
+    return {"observation.images.top": shown[None], "observation.state": state, "task": [TEXT]}
+
+
+def motors() -> dict[str, Any]:
+    """As a robot gives it."""
+    return {"top": frame(), "c.pos": POSITIONS[2], "a.pos": POSITIONS[0], "b.pos": POSITIONS[1]}
+
+
+def test_lerobots_observations_and_a_robots_are_acted_on_as_pictures_text_and_positions() -> None:
+    own = deployed(cameras=("observation.images.top",), recorded=NAMES)
+    expected = own.predict_action_chunk(frame(), TEXT, POSITIONS)
+    for given in ((lemotors(),), (lemotors() | {"task": OTHER}, TEXT), (motors(), TEXT)):
+        np.testing.assert_array_equal(own.begin().predict_action_chunk(*given), expected)
+        acting = own.begin()
+        taken = [acting.select_action(*given) for _ in range(REPLAN)]
+        np.testing.assert_array_equal(taken, expected[:REPLAN])
+
+
+def test_another_task_in_the_observation_drops_the_chunk_of_the_one_before() -> None:
+    own, other = deployed(cameras=("top",)), deployed()
+    other.predict_action_chunk(frame(), TEXT, POSITIONS)
+    expected = other.predict_action_chunk(frame(), OTHER, POSITIONS)
+    own.select_action(lemotors())
+    np.testing.assert_array_equal(own.select_action(lemotors() | {"task": OTHER}), expected[0])
+
+
+def test_an_action_has_the_names_that_a_robot_takes() -> None:
+    own = deployed(recorded=NAMES)
+    assert own.named(np.array([1.5, -2.0], np.float32)) == {"pan.pos": 1.5, "lift.pos": -2.0}
+    assert all(type(x) is float for x in own.named(np.zeros(2, np.float32)).values())
+    with pytest.raises(AegisError, match=r"shape \(4, 2\)"):
+        own.named(np.zeros((4, 2)))
+    with pytest.raises(AegisError, match="names of its actions"):
+        deployed().named(np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ((frame(),), "no positions"),
+        ((frame(), TEXT), "no positions"),
+        (({"top": frame()}, TEXT), "the positions (none)"),
+        ((motors(),), "no instruction"),
+        ((motors() | {"b.pos": math.nan}, TEXT), "not finite"),
+        ((motors() | {"wrist": frame()}, TEXT), "the cameras top, wrist"),
+        ((motors() | {"top": frame()[0]}, TEXT), "a picture of shape (64, 3)"),
+        ((lemotors() | {"observation.state": POSITIONS[:2]},), "positions of shape (2,)"),
+        ((lemotors() | {"task": "go to the xylophone"},), "xylophone"),
+    ],
+)
+def test_an_observation_that_does_not_fit_is_one_error(given: Any, told: str) -> None:
+    """At the call that predicts, and at one that goes on with a chunk."""
+    begun = deployed(cameras=("top",), recorded=NAMES)
+    begun.select_action(motors(), TEXT)
+    for policy in (deployed(cameras=("top",), recorded=NAMES), begun):
+        with pytest.raises(AegisError) as caught:
+            policy.select_action(*given)
+        assert told in str(caught.value)
+
+
 # --- precision ------------------------------------------------------------------------------------
 
 

@@ -20,7 +20,7 @@ from aegis_cli.common.ranks import Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.data import demonstrations
+from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.selection import ALL, Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -216,6 +216,7 @@ def _on_frames(
     files.check_utf8(out, "choose another --out")
     files.check_writable(out)
     files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
+    mixture.check_rename((demos,), selection.rename)
     model = backbones.load(backbone).to(devices.pick())
     # None: all episodes are held out from training, so that all their frames are in `validation`.
     found = demonstrations.load(

@@ -51,6 +51,7 @@ from aegis_cli.cli.options import (
     RecipeAction,
     RecipeArg,
     RecipeOrRunArg,
+    Rename,
     Resume,
     Set,
     SkipBad,
@@ -67,6 +68,7 @@ from aegis_cli.cli.options import (
     numbers,
     port_number,
     positive,
+    renaming,
     seed_number,
     share_or_one,
     strengths,
@@ -218,6 +220,7 @@ def anchor(
             help="Episodes of --demos to read, as demos.only names them; default: all.",
         ),
     ] = None,
+    rename: Rename = None,
     samples: Annotated[
         int,
         Option(
@@ -280,10 +283,15 @@ def anchor(
     Example: aegis anchor --samples 3000 --out anchor.safetensors
     Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
-    if demos is None and (camera or only):
-        option, what = ("--camera", "a camera") if camera else ("--only", "episodes")
-        fix = f"give the LeRobot folder as --demos, or leave {option} out"
-        raise AegisError(f"{option} without --demos", f"demonstrations to choose {what} of", fix)
+    of_demos = {
+        "--camera": (camera, "demonstrations to choose a camera of"),
+        "--only": (only, "demonstrations to choose episodes of"),
+        "--rename": (rename, "demonstrations with names of their own"),
+    }
+    for option, (value, wanted) in of_demos.items():
+        if demos is None and value:
+            fix = f"give the LeRobot folder as --demos, or leave {option} out"
+            raise AegisError(f"{option} without --demos", wanted, fix)
     chosen = given(ctx)
     if demos is not None and (unused := {"--vqa", "--ask", "--skip-bad"} & set(chosen)):
         found = f"{', '.join(sorted(unused))} with --demos"
@@ -316,7 +324,7 @@ def anchor(
         settings,
         out,
         demos=demos,
-        selection=Selection(cameras, only),
+        selection=Selection(cameras, only, rename=renaming(rename)),
         device=device,
         as_json=as_json,
     )
@@ -875,6 +883,7 @@ def evaluate(
     frames: Annotated[
         int, Option(help="Frames to predict at, at most, spread evenly.", callback=positive)
     ] = 1000,
+    rename: Rename = None,
     seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
     batch_size: BatchSize = 64,
     plot: Annotated[
@@ -908,6 +917,7 @@ def evaluate(
         batch_size,
         plot is not None,
         keep=True,
+        rename=renaming(rename),
         device=device,
         as_json=as_json,
     )

@@ -13,6 +13,7 @@ from typer import Argument, Option
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data import episodes
+from aegis_cli.data.renaming import Renaming
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED, WITH_PLACE
 
@@ -158,6 +159,24 @@ def listed_episodes(listed: str | None) -> list[int] | None:
     return None if listed is None else episodes.listed(listed)
 
 
+def renamed(param: typer.CallbackParam, value: list[str] | None) -> list[str] | None:
+    """Pairs NAME=NAME, each name given once; None where the option was not given."""
+    old = [one.partition("=")[0].strip() for one in value or ()]
+    for one, name in zip(value or (), old, strict=True):
+        if not name or not one.partition("=")[2].strip():
+            expected = "a name of the demonstrations, '=' and the policy's"
+            raise _refused(param, one, expected, "overhead=top")
+        if old.count(name) > 1:
+            raise _refused(param, f"{one}, and '{name}' again", "each name once", "overhead=top")
+    return value
+
+
+def renaming(pairs: list[str] | None) -> Renaming:
+    """The renaming that `renamed` has let pass."""
+    parts = (pair.partition("=") for pair in pairs or ())
+    return tuple((old.strip(), new.strip()) for old, _, new in parts)
+
+
 def names(listed: str | None) -> list[str]:
     """The names of a list with commas; none of None."""
     return [] if listed is None else [part.strip() for part in listed.split(",")]
@@ -301,6 +320,16 @@ BatchSize = Annotated[int, Option(help=f"{_SAMPLES}.", callback=positive)]
 OwnBatchSize = Annotated[
     int | None,
     Option(help=f"{_SAMPLES}; default: a run's own probe.batch_size, else 64.", callback=positive),
+]
+Rename = Annotated[
+    list[str] | None,
+    Option(
+        "--rename",
+        metavar="NAME=NAME",
+        help="A camera, feature or joint of --demos, and the policy's name of it, as demos.rename "
+        "has them; repeatable.",
+        callback=renamed,
+    ),
 ]
 PolicyArg = Annotated[
     Path,

@@ -40,6 +40,7 @@ _TYPES: dict[Any, str] = {
     bool: "true or false",
     str: "text",
     dict: "keys and values",
+    dict[str, str] | None: "names with names",
     str | tuple[str, ...]: "text or list of words",
     str | tuple[str, ...] | None: "text or list of words",
     tuple[int, ...]: "list of whole numbers",

@@ -19,7 +19,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
-from aegis_cli.data import relative
+from aegis_cli.data import relative, renaming
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.data.fitted import FittedFrames
 from aegis_cli.data.joined_frames import JoinedFrames
@@ -28,6 +28,7 @@ from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.lerobot.source import Source
+from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import ALL, Selection, listed
 
 # The scale of relative actions is fitted to so many at most: each frame has a chunk of them.
@@ -272,7 +273,7 @@ def locate(path: Path, selection: Selection | None = None) -> Path:
     if selection is None:
         return folder
     # What cannot be learned from is found before anything large is downloaded.
-    found = dataset.load(folder)
+    found = dataset.load(folder, selection.rename)
     for feature in selection.vectors:
         found.size(feature)
     cameras = found.cameras(selection.camera)
@@ -312,7 +313,7 @@ def load(
         return found if here == path else replace(found, datasets=(str(path),))
     artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
     selection.check_file(here)
-    return _load_file(here, split)
+    return _load_file(here, split, selection.rename)
 
 
 def digest(path: Path, selection: Selection = ALL) -> str:
@@ -320,7 +321,7 @@ def digest(path: Path, selection: Selection = ALL) -> str:
     path = locate(path, selection)
     if not path.is_dir():
         return artifacts.sha256_file(path)
-    found = dataset.load(path)
+    found = dataset.load(path, selection.rename)
     cameras = found.cameras(selection.camera)
     return sources.joined_digest(sources.digests(_source(found, selection.only), cameras))
 
@@ -354,7 +355,9 @@ def count_episodes(path: Path) -> int:
     return len(artifacts.load(path, "demos").tensors["episode_starts"]) - 1
 
 
-def playable_task(path: Path, camera: str | tuple[str, ...] | None) -> str | None:
+def playable_task(
+    path: Path, camera: str | tuple[str, ...] | None, rename: Renaming = ()
+) -> str | None:
     """The simulated task that a policy of these demonstrations can act in.
 
     It is None where another robot was recorded, or by cameras that the task does not have.
@@ -362,14 +365,14 @@ def playable_task(path: Path, camera: str | tuple[str, ...] | None) -> str | Non
     path = locate(path)
     if not path.is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
-    found = dataset.load(path)
-    task, names = found.info.task, found.cameras(camera)
+    found = dataset.load(path, rename)
+    task, names = found.info.task, [*map(found.called, found.cameras(camera))]
     if task is None or len(names) == 1:
         return task
     return task if {layout.short(name) for name in names} <= {*sim.cameras(task)} else None
 
 
-def _load_file(path: Path, split: Split) -> Demonstrations:
+def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
@@ -385,8 +388,8 @@ def _load_file(path: Path, split: Split) -> Demonstrations:
         validation,
         watched.sha256[path],
         watched=(watched,),
-        action_names=tuple(meta.get("action_names", ())),
-        proprio_names=tuple(meta.get("proprio_names", ())),
+        action_names=renaming.joints(rename, meta.get("action_names", ()), f"'{path}'"),
+        proprio_names=renaming.joints(rename, meta.get("proprio_names", ()), f"'{path}'"),
         fps=float(meta["control_hz"]) if "control_hz" in meta else None,
     )
 
@@ -400,7 +403,7 @@ def _load_folder(
     cache: bool,
     on_event: OnEvent,
 ) -> Demonstrations:
-    found = dataset.load(path)
+    found = dataset.load(path, selection.rename)
     cameras = found.cameras(selection.camera)
     starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
     episode_of, train, validation = _split(path, starts, split, found.info.splits)
@@ -431,7 +434,7 @@ def _load_folder(
         train,
         validation,
         sources.joined_digest(digests),
-        cameras,
+        tuple(map(found.called, cameras)),
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
         (WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
         action_names,

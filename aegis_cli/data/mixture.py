@@ -18,10 +18,11 @@ import torch
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
-from aegis_cli.data import demonstrations, joints
+from aegis_cli.data import demonstrations, joints, renaming
 from aegis_cli.data.demonstrations import Demonstrations, Member
 from aegis_cli.data.joined_frames import JoinedFrames
 from aegis_cli.data.lerobot import dataset, layout
+from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import ALL, Paths, Selection, listed
 
 _INPUT = "demos"  # the name of the demonstrations' digest in an artifact's header
@@ -58,10 +59,11 @@ def load(
 
     Raises:
         AegisError: besides what is wrong with one of them, sets that are not of one robot, one set
-            twice, or episodes that are chosen of several.
+            twice, episodes that are chosen of several, or a renaming of what no set has.
     """
     chosen = each(paths)
     _check_each_once(chosen)
+    check_rename(chosen, selection.rename)
     if len(chosen) > 1:
         _check_selection(chosen, selection)
         _check_alike(chosen, selection)
@@ -135,9 +137,11 @@ def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
     return torch.tensor([places[text] for text in own.instructions])[own.instruction_of]
 
 
-def playable_task(paths: Paths, camera: str | tuple[str, ...] | None) -> str | None:
+def playable_task(
+    paths: Paths, camera: str | tuple[str, ...] | None, rename: Renaming = ()
+) -> str | None:
     """The simulated task that a policy of these can act in, as `demonstrations` knows it of one."""
-    tasks = (demonstrations.playable_task(path, camera) for path in each(paths))
+    tasks = (demonstrations.playable_task(path, camera, rename) for path in each(paths))
     return next((task for task in tasks if task is not None), None)
 
 
@@ -282,11 +286,15 @@ def _robot(path: Path, selection: Selection) -> _Robot:
         artifact = artifacts.load(here, "demos")
         meta = artifact.header.meta
         sizes = artifact.tensors["proprio"].shape[1], artifact.tensors["actions"].shape[1]
-        names = {name: tuple(meta.get(name, ())) for name in ("action_names", "proprio_names")}
+        names = {
+            name: renaming.joints(selection.rename, meta.get(name, ()), f"'{path}'")
+            for name in ("action_names", "proprio_names")
+        }
         fps = float(meta["control_hz"]) if "control_hz" in meta else None
         return _Robot((), sizes, _complete(names, sizes), fps, meta["task"])
-    found = dataset.load(here)
-    cameras = tuple(layout.short(camera) for camera in found.cameras(selection.camera))
+    found = dataset.load(here, selection.rename)
+    own = found.cameras(selection.camera)
+    cameras = tuple(layout.short(found.called(camera)) for camera in own)
     positions, actions = listed(selection.state), listed(selection.action)
     sizes = sum(map(found.size, positions)), sum(map(found.size, actions))
     names = {"action_names": found.names(actions), "proprio_names": found.names(positions)}
@@ -299,6 +307,21 @@ def _complete(
     """The names of numbers each of which has one."""
     counts = {"proprio_names": sizes[0], "action_names": sizes[1]}
     return {kind: own for kind, own in names.items() if all(own) and len(own) == counts[kind] > 0}
+
+
+def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
+    """Raise AegisError for a name of the renaming that occurs in none of these sets."""
+    if not rename:
+        return
+    names = set[str]()
+    for path in paths:
+        here = demonstrations.locate(path)
+        if here.is_dir():
+            names |= dataset.load(here).all_names
+        else:
+            meta = artifacts.read_header(here, "demos").meta
+            names |= {*meta.get("action_names", ()), *meta.get("proprio_names", ())}
+    renaming.check_known(rename, names, said(tuple(paths)))
 
 
 def _check_alike(paths: Sequence[Path], selection: Selection) -> None:
@@ -323,8 +346,8 @@ def _check_robot(path: Path, robot: _Robot, known_path: Path, known: _Robot) -> 
         raise AegisError(
             f"the camera {', '.join(robot.cameras)} of '{path}'",
             f"{', '.join(known.cameras)}, as in '{known_path}'",
-            "choose cameras that all sets have with demos.camera, or give a feature of "
-            f"'{path}' the name of the same camera there",
+            "choose cameras that all sets have with demos.camera; give a camera that is called "
+            f"otherwise in '{path}' the same name with --set 'demos.rename={{ITS NAME: NAME}}'",
         )
     if None not in (robot.fps, known.fps) and robot.fps != known.fps:
         raise AegisError(
@@ -353,7 +376,7 @@ def _refuse_names(path: Path, known_path: Path, other: joints.Difference) -> Non
         f"{other.what} named {found} in '{path}'",
         f"{known}, as in '{known_path}'",
         "give demonstrations of the same robot; where these are the same joints in the same order, "
-        "give them the same names in the dataset's meta/info.json",
+        "give them the same names with --set 'demos.rename={ITS NAME: NAME, ...}'",
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot.layout import ACTION, STATE
+from aegis_cli.data.renaming import Renaming
 
 # One set of demonstrations, or several in the order in which their frames are numbered.
 Paths = Path | tuple[Path, ...]
@@ -26,12 +27,15 @@ class Selection:
         only: the episodes, as `demos.only` names them; None: all.
         state, action: the features that are proprioception and actions; several are joined, and ()
             reads none.
+        rename: what the policy calls cameras, features and joints; the names above are the
+            policy's.
     """
 
     camera: str | tuple[str, ...] | None = None
     only: str | None = None
     state: str | tuple[str, ...] = STATE
     action: str | tuple[str, ...] = ACTION
+    rename: Renaming = ()
 
     @property
     def vectors(self) -> tuple[str, ...]:

@@ -19,9 +19,10 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
-from aegis_cli.data import demonstrations, joints, mixture
+from aegis_cli.data import demonstrations, joints, mixture, renaming
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
@@ -156,6 +157,7 @@ def run(
     traced: bool = False,
     on_event: OnEvent = ignore,
     keep: bool = False,
+    rename: Renaming = (),
 ) -> OpenLoopReport:
     """Compare a run's predictions with demonstrations, frame by frame.
 
@@ -170,6 +172,8 @@ def run(
         batch_size: frames per forward pass.
         traced: whether the report has what a plot shows.
         keep: write the report into the run's folder, if it is that of a run or a checkpoint of it.
+        rename: what the policy calls cameras, features and joints of these demonstrations, besides
+            what the training renamed.
 
     Raises:
         AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
@@ -178,7 +182,8 @@ def run(
     run, data = Path(run), Path(data)
     source = _Source.find(run)
     policy, meta = checkpoint.load_policy(source.checkpoint)
-    learned = source.selection(meta, data)
+    mixture.check_rename((data,), rename)
+    learned = source.selection(meta, data, rename)
     split, chosen, trained_on = source.choose(learned, data, episodes)
     # The frames of the episodes that were learned from may have been decoded by the training.
     only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
@@ -217,6 +222,7 @@ def run(
         path = data.absolute()
         settings = {"episodes": None if episodes is None else list(episodes), "frames": frames}
         settings |= {"seed": seed, "path": str(path if path.exists() else data)}
+        settings |= {"rename": dict(rename)} if rename else {}
         name = f"{results.OPEN_LOOP}-{split}-{path.name}"
         results.keep_if_possible(run, name, report.kept(), settings, on_event)
     return report
@@ -258,24 +264,33 @@ class _Source:
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
         return cls(name, chosen, recipe, mixture.digests(header.inputs))
 
-    def selection(self, meta: Mapping[str, Any], data: Path) -> Selection:
+    def selection(self, meta: Mapping[str, Any], data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
+
+        Args:
+            rename: names that the training did not meet.
 
         Raises:
             AegisError: a folder of several cameras, and not those of the training.
         """
-        known = {name: meta[name] for name in ("only", "state", "action") if name in meta}
+        own = ("only", "state", "action", "rename")
+        known = {name: meta[name] for name in own if name in meta}
         if self.recipe is not None:
             known = recipes.selected(self.recipe)
         known = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
+        known["rename"] = renaming.of(known.get("rename", {}) | dict(rename))
         at = demonstrations.locate(data)
-        return Selection(self._camera(meta, at) if at.is_dir() else None, **known)
+        camera = self._camera(meta, at, known["rename"]) if at.is_dir() else None
+        return Selection(camera, **known)
 
-    def _camera(self, meta: Mapping[str, Any], data: Path) -> str | tuple[str, ...] | None:
+    def _camera(
+        self, meta: Mapping[str, Any], data: Path, rename: Renaming
+    ) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
         if self.recipe is not None and self.recipe.demos.camera is not None:
             return self.recipe.demos.camera
-        named, known = meta.get("cameras", ()), layout.read_info(data).cameras
+        own = layout.read_info(data).cameras
+        named, known = meta.get("cameras", ()), [renaming.feature(rename, name) for name in own]
         by_name = {layout.short(camera): camera for camera in known}
         found = tuple(by_name.get(layout.short(camera)) for camera in named)
         if found and None not in found:
@@ -284,8 +299,8 @@ class _Source:
             raise AegisError(
                 f"the cameras {', '.join(known)} in '{data}'",
                 f"{', '.join(named) or 'the only one that there was'}, as the policy was trained",
-                "give demonstrations with these cameras alone, or train by a recipe that names "
-                "them (--set demos.camera=NAME)",
+                "give demonstrations with these cameras alone, say what is called otherwise with "
+                "--rename, or train by a recipe that names them (--set demos.camera=NAME)",
             )
         return None
 
@@ -378,7 +393,7 @@ def _check_names(
         text = (
             f"the {other.what} in '{data}' are named {found}, and those that the policy was "
             f"trained on {known}: the errors mean something only if these are the same joints in "
-            "the same order"
+            "the same order; --rename says which is which"
         )
         on_event(Warned("evaluate", text))
 

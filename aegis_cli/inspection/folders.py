@@ -135,6 +135,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["dataset"] = dataset_id
     if isinstance(settings.demos.path, tuple):
         facts["demos"] = list(settings.demos.path)
+    if settings.demos.rename is not None:
+        facts["rename"] = dict(settings.demos.rename)
     if settings.demos.weights is not None:
         facts["weights"] = list(settings.demos.weights)
     if base_model := header.meta.get("base_model"):

@@ -47,6 +47,7 @@ _SAID = (
     "pictures",
     "state",
     "action",
+    "rename",
     "action_names",
     "proprio_names",
     "action_std",

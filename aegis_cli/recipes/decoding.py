@@ -28,6 +28,7 @@ _PHRASES: dict[Any, str] = {
     tuple[float, ...] | None: "a list of numbers such as [2, 1]",
     tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
     dict: "a section of keys and values",
+    dict[str, str] | None: "names with theirs, such as {overhead: top}",
 }
 
 

@@ -58,6 +58,14 @@ BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
 NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
+NAMES = Check(
+    "texts that are not empty, each with another",
+    lambda v: (
+        bool(v)
+        and all(isinstance(x, str) and x.strip() for pair in v.items() for x in pair)
+        and all(old != new for old, new in v.items())
+    ),
+)
 FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatch(r"\w[\w.-]*", v)))
 
 

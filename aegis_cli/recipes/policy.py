@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import re
 
+from aegis_cli.data import renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     EVEN,
     FOLDER_NAME,
+    NAMES,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
@@ -133,6 +135,14 @@ class Demos:
         later=True,
         doc="Feature of a LeRobot dataset that has the actions; a list joins several.",
     )
+    rename: dict[str, str] | None = key(
+        NAMES,
+        None,
+        later=True,
+        doc="Names of cameras, features or joints in the demonstrations, each with the policy's, "
+        "such as {overhead: top}. Each is renamed in every set where it occurs; `camera`, `state` "
+        "and `action` have the policy's names.",
+    )
     only: str | None = key(
         NOT_EMPTY,
         None,
@@ -158,7 +168,8 @@ class Demos:
     @property
     def selection(self) -> Selection:
         """What is learned from the demonstrations in `path`."""
-        return Selection(self.camera, self.only, self.state, self.action)
+        rename = renaming.of(self.rename)
+        return Selection(self.camera, self.only, self.state, self.action, rename)
 
 
 @section

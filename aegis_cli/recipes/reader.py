@@ -197,7 +197,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
 def selected(recipe: Recipe) -> dict[str, Any]:
     """What is learned of the demonstrations' frames, as far as it is not at its default."""
     changes = changed(recipe.demos)
-    return {name: changes[name] for name in ("only", "state", "action") if name in changes}
+    own = ("only", "state", "action", "rename")
+    return {name: changes[name] for name in own if name in changes}
 
 
 def drawn(recipe: Recipe) -> dict[str, Any]:

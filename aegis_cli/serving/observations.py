@@ -1,4 +1,8 @@
-"""What a client sends and is told: the keys of an observation, and of the greeting."""
+"""What a client sends and is told: the keys of an observation, and of the greeting.
+
+The keys are openpi's. LeRobot's observation, and what a robot's `get_observation()` returns, are
+read as well.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
-from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.deploy import DeployedPolicy, Pictures
 
 STATE, PROMPT, IMAGE = "observation/state", "prompt", "observation/image"
@@ -64,6 +68,8 @@ class Reader:
         """
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
+        if STATE not in message and observation.is_one(message, self._policy.state_names):
+            return self._lerobots(message)
         if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
             message = {next(iter(self.images)): message[IMAGE], **message}  # its own key wins
         wanted = [*self.images, STATE, *([PROMPT] if self._prompt is None else [])]
@@ -75,6 +81,19 @@ class Reader:
         pictures = named if len(named) > 1 else next(iter(named.values()))
         return Observation(pictures, self._text(message), self._positions(message[STATE]))
 
+    def _lerobots(self, message: Mapping[Any, Any]) -> Observation:
+        """The observation of a message with LeRobot's keys, or with the motors' names."""
+        policy = self._policy
+        seen = observation.read(message, policy.cameras, policy.state_names)
+        if seen.task is None and PROMPT not in message and self._prompt is None:
+            raise AegisError(
+                f"no instruction in an observation of {', '.join(map(str, message))}",
+                f"a text at '{observation.TASK}' or '{PROMPT}'",
+                "send one, or give aegis serve --prompt",
+            )
+        text = self._text(message if seen.task is None else {PROMPT: seen.task})
+        return Observation(seen.pictures, text, self._finite("positions", seen.positions))
+
     def _text(self, message: Mapping[Any, Any]) -> str:
         text = message.get(PROMPT, self._prompt)
         if not isinstance(text, str):
@@ -82,9 +101,11 @@ class Reader:
         return text
 
     def _positions(self, state: Any) -> np.ndarray:
-        found = self._array(STATE, state)
+        return self._finite(f"'{STATE}'", self._array(STATE, state))
+
+    def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
         if found.dtype.kind not in "iuf" or not np.isfinite(found).all():
-            raise self._wrong(f"'{STATE}' of type {found.dtype} that holds no finite numbers")
+            raise self._wrong(f"{what} of type {found.dtype} that holds no finite numbers")
         return found.astype(np.float32)
 
     def _array(self, key: str, value: Any) -> np.ndarray:

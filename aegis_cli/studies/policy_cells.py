@@ -216,10 +216,10 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
 
 
 def _check_playable(trials: Sequence[Recipe]) -> None:
-    named = ((r.demos.path, r.demos.camera) for r in trials if r.demos.path is not None)
-    for path, camera in dict.fromkeys(named):
+    named = ((r.demos.path, r.demos.selection) for r in trials if r.demos.path is not None)
+    for path, chosen in dict.fromkeys(named):
         given = mixture.at(path)
-        if mixture.playable_task(given, camera) is None:
+        if mixture.playable_task(given, chosen.camera, chosen.rename) is None:
             raise AegisError(
                 f"'tuning' with demonstrations in {mixture.said(given)}, whose policies cannot be "
                 "rolled out here",
@@ -338,8 +338,9 @@ class PolicyRunner:
         key = {"backbone": self.backbone_sha256(recipe), **recipes.recorded(recipe.anchor)}
         shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
         key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
-        only = None if shown is None else recipe.demos.only
-        key |= {} if only is None else {"only": only}
+        if shown is not None:
+            chosen = recipes.selected(recipe)
+            key |= {name: chosen[name] for name in ("only", "rename") if name in chosen}
 
         def make(out: Path, on_event: OnEvent) -> object:
             frames = None if shown is None else shown.path

@@ -252,7 +252,7 @@ def build(
     _check_parts(method, measured, recipe)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
-        _warn_of_other_cameras(anchor, demos, recorded.cameras, on_event)
+        _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
     # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
@@ -364,6 +364,7 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
         return
     belonging = {
         "camera": ("a LeRobot folder, to choose of", "set demos.path to it"),
+        "rename": ("demonstrations with names of their own", "set demos.path to them"),
         "only": ("demonstrations, to choose of", "set demos.path to it"),
         "weights": ("several sets of demonstrations", "set demos.path to a list of them"),
     }
@@ -494,7 +495,11 @@ def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> No
 
 
 def _warn_of_other_cameras(
-    path: Path, demos: Path, shown: Sequence[str], on_event: OnEvent
+    path: Path,
+    demos: Path,
+    shown: Sequence[str],
+    rename: Mapping[str, str] | None,
+    on_event: OnEvent,
 ) -> None:
     """Warn of an anchor of robot frames from other cameras than those that are learned from.
 
@@ -506,7 +511,10 @@ def _warn_of_other_cameras(
     unnamed = not (own and shown) and max(len(own), len(shown)) < 2
     if "demos" not in meta or own == list(shown) or unnamed:
         return
-    names = shlex.join(word for camera in shown for word in ("--camera", camera))
+    words = [word for camera in shown for word in ("--camera", camera)]
+    for old, new in (rename or {}).items():
+        words += ["--rename", f"{old}={new}"]
+    names = shlex.join(words)
     text = (
         f"the anchor '{path}' was measured on frames of {', '.join(own) or 'no camera by name'}, "
         f"and the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "

@@ -415,6 +415,8 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
     for name in ("state", "action"):
         if not isinstance(meta.get(name, ""), str | list):
             raise ValueError(f"'{name}' is {meta[name]!r}")
+    if not isinstance(meta.get("rename", {}), dict):
+        raise ValueError(f"'rename' is {meta['rename']!r}")
     if "replan" in meta and meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
     if meta.get("stored", FLOAT32) not in STORED_TYPES:

@@ -50,6 +50,7 @@ from samples.guarded_models import (
     small_batches,
     small_vlm,
 )
+from samples.lerobot import ReachArm
 from torch.nn import functional as F
 
 Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
@@ -324,6 +325,9 @@ def test_the_blocks_of_a_page(
                     warnings.simplefilter("ignore")  # what others' trainers warn of is theirs
                 exec(compile(block.text, f"{page}:{block.line}", "exec"), namespace)
     assert undocumented([*shell.said, *documents(page_folder)]) == set()
+    if page == "docs/own-robot.md":
+        robot = namespace["robot"]
+        assert (len(robot.sent), robot.is_connected) == (namespace["steps"], False)
 
 
 def is_run(block: Block) -> bool:
@@ -336,6 +340,7 @@ def is_run(block: Block) -> bool:
 def own_names(page: str, folder: Path) -> dict[str, Any]:
     """The names that a page's Python blocks leave to their reader."""
     names: dict[str, Any] = {"frame": np.zeros((48, 64, 3), np.uint8), "positions": [0.0] * 6}
+    names |= {"robot": ReachArm(), "steps": 3}
     if not any(
         block.language == "python" and "Guard" in block.text
         for block in tried(page)

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from aegis_cli import sim
 from aegis_cli.data.lerobot import dataset, rows, source, write
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.write import Limits, NewEpisode, Spec
@@ -185,3 +186,51 @@ def edit_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 
 def replaced(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
     return table.set_column(table.schema.names.index(name), name, values)
+
+
+def otherwise(folder: Path, copy: Path, names: dict[str, str]) -> Path:
+    """A copy of a dataset whose features and joints have other names.
+
+    Its pictures are in its data files.
+    """
+    shutil.copytree(folder, copy)
+
+    def rename(info: dict[str, Any]) -> None:
+        for feature in info["features"].values():
+            if isinstance(feature["names"], list):
+                feature["names"] = [names.get(name, name) for name in feature["names"]]
+        info["features"] = {names.get(name, name): f for name, f in info["features"].items()}
+
+    edit_info(copy, rename)
+    for path in data_files(copy):
+        edit_table(path, lambda t: t.rename_columns([names.get(n, n) for n in t.schema.names]))
+    return copy
+
+
+class ReachArm:
+    """What LeRobot's robots have, of `reach`'s arm that does not move.
+
+    Attributes:
+        sent: the actions, as they came.
+    """
+
+    def __init__(self) -> None:
+        self.spec = sim.make("reach").spec
+        self.is_connected, self.sent = False, list[dict[str, float]]()
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+    def get_observation(self) -> dict[str, Any]:
+        assert self.is_connected
+        seen = dict.fromkeys(reversed(self.spec.proprio_names), 0.1)
+        return {**seen, self.spec.camera: np.zeros((48, 64, 3), np.uint8)}
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        assert self.is_connected and tuple(action) == self.spec.action_names
+        assert all(type(x) is float for x in action.values())
+        self.sent.append(action)
+        return action

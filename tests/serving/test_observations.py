@@ -84,3 +84,45 @@ def test_a_missing_key_is_named_with_those_that_are_there(missing: str) -> None:
 def test_other_keys_are_ignored() -> None:
     seen = observation() | {"observation/wrist_image": 1, "extra": None}
     assert Reader(deployed()).read(seen).prompt == TEXT
+
+
+# --- LeRobot's ------------------------------------------------------------------------------------
+
+MOTORS = {"proprio_names": ["a.pos", "b.pos", "c.pos"]}
+LEROBOTS = {
+    "observation.images.top": observation()["observation/image"].transpose(2, 0, 1)[None] / 255,
+    "observation.images.wrist": observation()["observation/image"] + 1,
+    "observation.state": [[1, 2, 3]],
+}
+ROBOTS = {
+    "wrist": observation()["observation/image"] + 1,
+    "top": observation()["observation/image"],
+} | {"c.pos": 3.0, "b.pos": 2.0, "a.pos": 1.0}
+
+
+@pytest.mark.parametrize("seen", [LEROBOTS, ROBOTS])
+@pytest.mark.parametrize("text", [{"task": TEXT}, {"prompt": TEXT}])
+def test_lerobots_observations_and_a_robots_are_read_as_openpis(
+    seen: dict[str, Any], text: dict[str, str]
+) -> None:
+    policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
+    found, expected = Reader(policy).read(seen | text), Reader(policy).read(several())
+    for name in CAMERAS:
+        np.testing.assert_array_equal(found.pictures[name], expected.pictures[name])
+    assert (found.prompt, found.state.tolist()) == (TEXT, [1, 2, 3])
+    assert found.state.dtype == np.float32
+    assert Reader(policy, "hold").read(seen).prompt == "hold"
+
+
+@pytest.mark.parametrize("seen", [LEROBOTS, ROBOTS])
+def test_lerobots_observation_without_a_text_or_a_camera_is_one_error(seen: dict[str, Any]) -> None:
+    policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
+    with pytest.raises(AegisError, match="no instruction"):
+        Reader(policy).read(seen)
+    one = {name: value for name, value in seen.items() if not name.endswith("top")}
+    with pytest.raises(AegisError, match="the cameras wrist"):
+        Reader(policy).read(one | {"prompt": TEXT, b"other": 1})
+    unknown = {"observation.state": [[np.nan] * 3], "a.pos": np.nan}
+    bad = {name: value for name, value in unknown.items() if name in seen}
+    with pytest.raises(AegisError, match="positions of type float"):
+        Reader(policy).read(seen | bad | {"task": TEXT})

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data import renaming
 from aegis_cli.data.lerobot import layout, version_2, version_3
 from aegis_cli.data.lerobot.layout import EpisodeIndex, Info
+from aegis_cli.data.renaming import Renaming
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,15 @@ class Dataset:
     Attributes:
         tasks: texts, in the order of their `task_index`.
         episodes: in the order of their frames, which are numbered through from 0.
+        rename: what cameras, features and joints are called by who reads it. `info`, and what is
+            kept in files, has the dataset's own names.
     """
 
     folder: Path
     info: Info
     tasks: tuple[str, ...]
     episodes: tuple[EpisodeIndex, ...]
+    rename: Renaming = ()
 
     @cached_property
     def stats(self) -> Mapping[str, Mapping[str, Any]] | None:
@@ -44,20 +49,32 @@ class Dataset:
         reader = version_2 if self.info.has_episode_files else version_3
         return reader.table_files(self.folder)
 
+    def called(self, feature: str) -> str:
+        """What a feature of the dataset is called by who reads it."""
+        return renaming.feature(self.rename, feature)
+
+    def own(self, feature: str) -> str:
+        """The dataset's own name of a feature; the name itself where it has none."""
+        return self._own_names.get(feature, feature)
+
+    @cached_property
+    def _own_names(self) -> dict[str, str]:
+        return {self.called(own): own for own in self.info.features}
+
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
-        """The features that one or several names stand for, in their order.
+        """The dataset's own features that one or several names stand for, in their order.
 
         None stands for the only one there is.
 
         Raises:
             AegisError: no such camera, one twice, or several to choose among.
         """
-        cameras = self.info.cameras
+        cameras = tuple(map(self.called, self.info.cameras))
         if names is None:
             if len(cameras) != 1:
                 found = f"'{self.folder}' has {len(cameras)} cameras{_list(cameras)}"
                 raise AegisError(found, "the cameras to learn from", _choose(cameras))
-            return cameras
+            return self.info.cameras
         listed = (names,) if isinstance(names, str) else names
         found = tuple(self._camera(name) for name in listed)
         if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
@@ -69,10 +86,10 @@ class Dataset:
         return found
 
     def _camera(self, name: str) -> str:
-        cameras = self.info.cameras
+        cameras = tuple(map(self.called, self.info.cameras))
         for camera in (name, layout.CAMERA + name):
             if camera in cameras:
-                return camera
+                return self.own(camera)
         listed = ", ".join(cameras) or "no camera at all"
         raise AegisError(
             f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras)
@@ -84,9 +101,9 @@ class Dataset:
         Raises:
             AegisError: the feature is missing, or is no vector.
         """
-        found = self.info.features.get(feature)
+        found = self.info.features.get(self.own(feature))
         if found is None:
-            features = ", ".join(self.info.features)
+            features = ", ".join(self._own_names)
             raise AegisError(
                 f"no feature '{feature}' in '{self.folder}'; it has {features}",
                 "the features with the robot's positions and with its actions",
@@ -101,9 +118,22 @@ class Dataset:
         return found.shape[0]
 
     def names(self, features: Sequence[str]) -> tuple[str, ...]:
-        """What the numbers of features side by side are called; empty where one has no names."""
-        named = [self.info.features[feature].components for feature in features]
-        return tuple(itertools.chain(*named)) if all(map(any, named)) else ()
+        """What the numbers of features side by side are called; empty where one has no names.
+
+        Raises:
+            AegisError: two of them would be called alike.
+        """
+        named = [self.info.features[self.own(feature)].components for feature in features]
+        if not all(map(any, named)):
+            return ()
+        return renaming.joints(self.rename, tuple(itertools.chain(*named)), f"'{self.folder}'")
+
+    @property
+    def all_names(self) -> set[str]:
+        """The dataset's own names of its features, its cameras in short, and its numbers."""
+        features = self.info.features
+        numbers = (f.components for name, f in features.items() if name not in self.info.cameras)
+        return {*features, *map(layout.short, self.info.cameras), *itertools.chain(*numbers)}
 
 
 def _list(cameras: tuple[str, ...]) -> str:
@@ -124,16 +154,19 @@ def _choose(cameras: tuple[str, ...]) -> str:
     )
 
 
-def load(folder: Path) -> Dataset:
+def load(folder: Path, rename: Renaming = ()) -> Dataset:
     """Read the meta folder and check that its parts agree.
 
     Raises:
-        AegisError: no dataset, another version, a missing or damaged file, or counts that do not
-            agree.
+        AegisError: no dataset, another version, a missing or damaged file, counts that do not
+            agree, or two features that would be called alike.
     """
     folder = Path(folder)
     info = layout.read_info(folder)
     layout.require_pyarrow()
     reader = version_2 if info.has_episode_files else version_3
     tasks, episodes = reader.read_tasks(folder), reader.read_episodes(folder, info)
-    return Dataset(folder, info, tasks, episodes)
+    found = Dataset(folder, info, tasks, episodes, rename)
+    features = tuple(info.features)
+    renaming.check_apart(rename, features, [*map(found.called, features)], f"'{folder}'")
+    return found

@@ -61,7 +61,7 @@ def read_vectors(source: Source, feature: str) -> np.ndarray:
         AegisError: a file that is missing or damaged, vectors of another size, or numbers that are
             not finite.
     """
-    size = source.dataset.size(feature)
+    size, feature = source.dataset.size(feature), source.dataset.own(feature)
     vectors = np.zeros((source.dataset.info.frames, size), np.float32)
     for file in source.data:
         rows = _matrix(_read(file, feature), size, feature, file.path)

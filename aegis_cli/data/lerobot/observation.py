@@ -1,0 +1,184 @@
+"""What a robot sees at one step in one mapping, as LeRobot has it.
+
+Two kinds are read:
+
+- LeRobot's observation, of a dataset's frame or out of its processors: `observation.images.top`,
+  `observation.state`, `task`.
+- What a robot's `get_observation()` returns: a number for each motor (`shoulder_pan.pos`) and a
+  picture for each camera (`top`). LeRobot's `hw_to_dataset_features` makes a dataset's features of
+  these: the motors' names are those of `observation.state`, and a camera's name has
+  `observation.images.` before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import layout
+
+TASK = "task"
+_OBSERVED = "observation."  # what LeRobot's names of observations begin with
+_PICTURES = "observation.image"  # and those of pictures: `observation.images.top`, or PushT's
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a policy acts on.
+
+    Attributes:
+        pictures: of each camera by its name in the policy, or the only one, as `picture` gives it.
+        positions: [P] numbers.
+        task: the instruction, if the observation has one.
+    """
+
+    pictures: Any
+    positions: Any
+    task: str | None
+
+
+def is_one(mapping: Mapping[Any, Any], state_names: Sequence[str] | None) -> bool:
+    """Whether a mapping has a key of LeRobot's observation, or that of a motor."""
+    motors = state_names or ()
+    keys = (key for key in mapping if isinstance(key, str))
+    return any(key.startswith(_OBSERVED) or key in motors for key in keys)
+
+
+def read(
+    observation: Mapping[str, Any], cameras: Sequence[str], state_names: Sequence[str] | None
+) -> Observed:
+    """The pictures, the positions and the task of an observation of either kind.
+
+    Other texts than the task are ignored, and of LeRobot's observation every key that is no
+    picture, such as `action` or `timestamp` of a dataset's frame.
+
+    Args:
+        cameras: the policy's, in its order; empty for one picture of any name.
+        state_names: of the policy's positions, in their order; None where it does not know them.
+
+    Raises:
+        AegisError: cameras or positions that are missing, or that the policy does not know.
+    """
+    observation = {key: value for key, value in observation.items() if isinstance(key, str)}
+    if layout.STATE in observation:
+        positions = _unbatched(_array(observation[layout.STATE]), 1)
+        shown = {name: v for name, v in observation.items() if _is_picture(name, cameras)}
+        _check(shown, cameras, [layout.STATE], [layout.STATE])
+    else:
+        if state_names is None:
+            raise AegisError(
+                f"an observation of {_listed(observation)}, and a policy that does not know the "
+                "names of its positions",
+                f"'{layout.STATE}' in the observation",
+                f"put the positions there, in the demonstrations' order, and the pictures at "
+                f"'{layout.CAMERA}NAME'",
+            )
+        kinds = {name: _dimensions(value) for name, value in observation.items()}
+        shown = {name: observation[name] for name, count in kinds.items() if count > 1}
+        told = [name for name, count in kinds.items() if 0 <= count < 2 and name != TASK]
+        _check(shown, cameras, told, state_names)
+        positions = np.array([_number(name, observation[name]) for name in state_names], np.float32)
+    own = {layout.short(name): name for name in cameras}
+    named = {own.get(layout.short(n), n): picture(n, value) for n, value in shown.items()}
+    pictures = named if cameras else next(iter(named.values()))
+    return Observed(pictures, positions, _task(observation))
+
+
+def picture(name: str, given: Any) -> np.ndarray:
+    """RGB [H, W, 3] uint8 of a picture as cameras give it, or of one as LeRobot's processors do.
+
+    Args:
+        given: [H, W, 3] uint8, or [3, H, W] of floats in [0, 1] or uint8; each with or without a
+            leading dimension of 1.
+
+    Raises:
+        AegisError: floats of another range or shape.
+    """
+    found = _unbatched(_array(given), 3)
+    if found.dtype.kind != "f":
+        first = found.ndim == 3 and found.shape[0] == 3 != found.shape[2]
+        return np.ascontiguousarray(found.transpose(1, 2, 0)) if first else found
+    # A comparison with NaN is false, too.
+    if found.ndim != 3 or found.shape[0] != 3 or not ((found >= 0) & (found <= 1)).all():
+        span = f" from {found.min():g} to {found.max():g}" if found.size else ""
+        raise AegisError(
+            f"'{name}' of shape {found.shape} and type {found.dtype}{span}",
+            "[H, W, 3] uint8, or [3, H, W] floats from 0 to 1",
+            "give it as the camera or LeRobot's processor does, without normalizing it",
+        )
+    return np.ascontiguousarray((found * 255).round().astype(np.uint8).transpose(1, 2, 0))
+
+
+def _is_picture(name: str, cameras: Sequence[str]) -> bool:
+    """Whether a key of LeRobot's observation is that of a picture."""
+    return name.startswith(_PICTURES) or name in cameras
+
+
+def _array(given: Any) -> np.ndarray:
+    if isinstance(given, torch.Tensor):
+        held = given.detach().cpu()
+        return (held.float() if held.is_floating_point() else held).numpy()
+    try:
+        return np.asarray(given)
+    except ValueError as error:  # lists of several lengths
+        found = f"a value of an observation that is no array: {error}"
+        raise AegisError(found, "an array or a tensor", "give what the robot gives") from error
+
+
+def _unbatched(given: np.ndarray, dimensions: int) -> np.ndarray:
+    """The only one of a batch; everything else as it is."""
+    return given[0] if given.ndim == dimensions + 1 and len(given) == 1 else given
+
+
+def _dimensions(value: Any) -> int:
+    """How many dimensions a robot's value has; -1 for a text, and 0 for what is no array."""
+    if isinstance(value, str):
+        return -1
+    return int(getattr(value, "ndim", 0))
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(_array(value).item())
+    except (TypeError, ValueError) as error:
+        raise AegisError(
+            f"'{name}' is {type(value).__name__}", "a number", "give what the robot gives"
+        ) from error
+
+
+def _task(observation: Mapping[str, Any]) -> str | None:
+    """The text at `task`, which LeRobot's processors put into a list; None for an empty one."""
+    found = observation.get(TASK)
+    if isinstance(found, list | tuple) and len(found) == 1:
+        found = found[0]
+    return found if isinstance(found, str) and found.strip() else None
+
+
+def _check(
+    shown: Iterable[str], cameras: Sequence[str], told: Sequence[str], positions: Sequence[str]
+) -> None:
+    """Raise AegisError unless there are the policy's cameras and positions, and no others."""
+    seen = [layout.short(name) for name in shown]
+    wanted = [layout.short(name) for name in cameras]
+    is_only = not cameras and len(seen) == 1
+    if sorted(told) == sorted(positions) and (is_only or sorted(seen) == sorted(wanted)):
+        return
+    missing = [name for name in (*wanted, *positions) if name not in {*seen, *told}]
+    other = [name for name in (*seen, *told) if name not in {*wanted, *positions}]
+    steps = [f"add {_listed(missing)}"] if missing else []
+    steps += [f"leave out or rename {_listed(other)}"] if other and not is_only else []
+    raise AegisError(
+        f"an observation with the cameras {_listed(seen)} and the positions {_listed(told)}",
+        f"the cameras {_listed(wanted) if cameras else '(one of any name)'} and the positions "
+        f"{_listed(positions)}",
+        "; ".join(steps) or "give each camera once",
+    )
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(map(str, names)) or "(none)"
