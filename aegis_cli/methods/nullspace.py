@@ -55,7 +55,7 @@ def start(setting: Setting) -> Parts:
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
     if not chosen:
         raise AegisError(
-            f"nothing that learns is of the kinds {', '.join(options['protect'])}",
+            f"nothing that learns is of the kinds {', '.join(options['protect']) or '(none)'}",
             "a map to protect",
             "name kinds that learn in nullspace.protect, or freeze less",
         )

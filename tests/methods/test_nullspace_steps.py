@@ -19,6 +19,7 @@ from samples.nullspace import (
 )
 from torch import nn
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import allowed
 from aegis_cli.core.spectrum import Spectrum
@@ -49,7 +50,7 @@ def start(
     )
 
 
-def train(toy: Toy, parts: Parts, optimizer: str, data: Inputs, steps: int = STEPS) -> None:
+def train(toy: nn.Module, parts: Parts, optimizer: str, data: Inputs, steps: int = STEPS) -> None:
     """Fit the outputs on `data` to targets that lie far away, as methods constrain it."""
     learning = dict(toy.named_parameters())
     make, clip = OPTIMIZERS[optimizer]
@@ -128,16 +129,47 @@ def test_full_rank_inputs_at_share_one_freeze_the_map(
         torch.testing.assert_close(now, before, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("protect", [("maps",), ("norms",), ()])
-def test_only_the_kinds_asked_for_are_protected(protect: tuple[str, ...]) -> None:
+class Two(nn.Module):
+    """A map of a protected kind beside one of another kind; both read the same."""
+
+    def __init__(self, toy: Toy) -> None:
+        super().__init__()
+        self.held, self.free = copy.deepcopy(toy), copy.deepcopy(toy)
+
+    def forward(self, *data: torch.Tensor) -> torch.Tensor:
+        return torch.stack([self.held(*data), self.free(*data)])
+
+
+@pytest.mark.parametrize("other", ["norms", "embeddings", "stem"])
+def test_only_the_kinds_asked_for_are_protected(other: str) -> None:
+    case = CASES["linear"]
+    toy = case.model()
+    two = Two(toy)
+    kinds = {f"held.{SITE}": "maps", f"free.{SITE}": other}
+    (spectrum,) = measure(toy.map, case.vqa()).values()
+    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": ("maps",), "keeps": "weights"}
+    parts = METHODS["nullspace"].start(
+        Setting(
+            two,
+            {"both": list(two.parameters())},
+            kinds,
+            options,
+            Anchor(inputs=dict.fromkeys(kinds, spectrum)),
+        )
+    )
+    protected = case.vqa()
+    said = two(*protected).detach()
+    train(two, parts, "momentum", case.any())
+    held, free = (two(*protected) - said).abs().amax(dim=tuple(range(1, said.dim())))
+    assert held < 1e-10 < 1e-3 < free
+
+
+@pytest.mark.parametrize("protect", [("norms",), ()])
+def test_kinds_of_which_nothing_learns_are_refused(protect: tuple[str, ...]) -> None:
     case = CASES["linear"]
     toy = case.model()
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": protect, "keeps": "weights"}
     anchor = Anchor(inputs=measure(toy.map, case.vqa()))
-    parts = METHODS["nullspace"].start(
-        Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, anchor)
-    )
-    protected = case.vqa()
-    said = toy(*protected).detach()
-    train(toy, parts, "momentum", case.any())
-    assert ((toy(*protected) - said).abs().max() < 1e-10) == ("maps" in protect)
+    setting = Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, anchor)
+    with pytest.raises(AegisError, match="nothing that learns is of the kinds"):
+        METHODS["nullspace"].start(setting)
