@@ -23,7 +23,6 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import joint, nullspace
 from aegis_cli.core.joint import Pair
@@ -41,11 +40,7 @@ from aegis_cli.methods.base import (
 
 
 def start(setting: Setting) -> Parts:
-    """Project every site of the kinds in `protect`; energy 0 protects nothing.
-
-    Raises:
-        AegisError: no site of these kinds.
-    """
+    """Project every site of the kinds in `protect`; energy 0 protects nothing."""
     options = setting.options
     hard = options["energy"]
     if hard == 0:
@@ -53,12 +48,6 @@ def start(setting: Setting) -> Parts:
     strength = Strength(soft=options["soft"]) if hard is None else Strength(hard)
     assert setting.anchor is not None
     chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
-    if not chosen:
-        raise AegisError(
-            f"nothing that learns is of the kinds {', '.join(options['protect']) or '(none)'}",
-            "a map to protect",
-            "name kinds that learn in nullspace.protect, or freeze less",
-        )
     likes = {site: weights(setting.backbone, site)[0] for site in chosen}
     here = {site: rows_here(like) for site, like in likes.items()}
     protections = nullspace.protections(setting.anchor, here, strength)

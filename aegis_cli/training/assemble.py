@@ -567,7 +567,7 @@ def _start(
     setting = Setting(
         backbone,
         backbone.learning_groups(),
-        {site: kind for site, kind in sites.items() if not structure.frozen(backbone, site)},
+        _learning_sites(backbone, sites, options),
         options,
         anchor,
         vqa_loss,
@@ -577,6 +577,25 @@ def _start(
         owners,
     )
     return method.start(setting)
+
+
+def _learning_sites(
+    backbone: Backbone, sites: Mapping[str, str], options: Mapping[str, Any]
+) -> dict[str, str]:
+    """The sites that learn.
+
+    Raises:
+        AegisError: a site of which only a half learns, or none of the kinds that are protected.
+    """
+    found = {site: kind for site, kind in sites.items() if not structure.frozen(backbone, site)}
+    kinds = options.get("protect", ())
+    if any(kind in kinds for kind in sites.values()) and not set(found.values()) & set(kinds):
+        raise AegisError(
+            f"nothing that learns is of the kinds {', '.join(kinds)}",
+            "a map to protect",
+            "name kinds that learn in nullspace.protect, or freeze less",
+        )
+    return found
 
 
 def _vqa_loss(

@@ -19,7 +19,6 @@ from samples.nullspace import (
 )
 from torch import nn
 
-from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import allowed
 from aegis_cli.core.spectrum import Spectrum
@@ -162,14 +161,3 @@ def test_only_the_kinds_asked_for_are_protected(other: str) -> None:
     train(two, parts, "momentum", case.any())
     held, free = (two(*protected) - said).abs().amax(dim=tuple(range(1, said.dim())))
     assert held < 1e-10 < 1e-3 < free
-
-
-@pytest.mark.parametrize("protect", [("norms",), ()])
-def test_kinds_of_which_nothing_learns_are_refused(protect: tuple[str, ...]) -> None:
-    case = CASES["linear"]
-    toy = case.model()
-    options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": protect, "keeps": "weights"}
-    anchor = Anchor(inputs=measure(toy.map, case.vqa()))
-    setting = Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, anchor)
-    with pytest.raises(AegisError, match="nothing that learns is of the kinds"):
-        METHODS["nullspace"].start(setting)

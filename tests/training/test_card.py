@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from aegis_cli import methods
@@ -20,3 +22,19 @@ def test_an_anchor_is_named_where_the_method_reads_one(name: str, reads: bool) -
     said = card.text(Recipe("x"), method, 3, data, INPUTS, Ledger(["layers.0"], ["layers.0"]))
     assert ("- anchor: `aaa" in said) is reads and ("--anchor ANCHOR" in said) is reads
     assert "- demos: `ddd" in said
+
+
+@pytest.mark.parametrize(
+    ("freeze", "said"),
+    [
+        (None, ""),
+        ("vision", "Of the backbone `vision` did not learn."),
+        (("vision", "layers.0-3"), "Of the backbone `vision`, `layers.0-3` did not learn."),
+    ],
+)
+def test_what_was_frozen_is_named(freeze: str | tuple[str, ...] | None, said: str) -> None:
+    plain = Recipe("x")
+    recipe = replace(plain, train=replace(plain.train, freeze=freeze))
+    method, data = methods.get("naive"), card.Data("reach", (), 90, 10)
+    text = card.text(recipe, method, 3, data, INPUTS, Ledger([], []))
+    assert said in text and ("did not learn" in text) is bool(said)

@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 import torch
+from samples.command import refused
 from samples.merges import QUESTIONS, SAMPLES, Place, parameters
 from samples.small_run import recipe as small
+from samples.small_run import write
 from samples.tiny import make_tiny
 from samples.training import (
     double_policy,
@@ -263,6 +265,17 @@ def test_a_name_that_no_part_has_is_refused_with_those_that_there_are(
     assert found in caught.value.found and fix in caught.value.fix
     for name in ("vision, embeddings, final_norm, head", "layers.0 to layers.1", "model.connector"):
         assert name in caught.value.expected
+
+
+def test_a_wrong_name_ends_a_command_before_anything_is_written(
+    aegis: Callable[..., tuple[int, str, str]], demos_file: Path, tmp_path: Path
+) -> None:
+    written = write(tmp_path, "embedded", freeze="vision")
+    words = ("train", written, "--method", "naive", "--demos", demos_file)
+    for more in ((), ("--dry-run",)):
+        said = refused(aegis(*words, "--out", tmp_path / "run", *more))
+        assert "train.freeze: 'vision'" in said and "--set train.freeze=stem" in said
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
