@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 from typing import Any, Self
@@ -237,6 +238,39 @@ def boolean(mask: Tensor, what: str) -> Tensor:
             "give it as [B, T] booleans",
         )
     return mask.bool()
+
+
+# --- what maps read -------------------------------------------------------------------------------
+
+
+@dataclass
+class SharedInput:
+    """A tensor that linear maps have read one after the other, or a convolution.
+
+    Attributes:
+        x: the tensor itself.
+        module: its first reader.
+        sites: names of its readers so far.
+    """
+
+    x: Tensor
+    module: nn.Module
+    sites: list[str]
+
+    @property
+    def of_convolution(self) -> bool:
+        """Whether its reader is a convolution; then no other map reads the same rows."""
+        return not isinstance(self.module, nn.Linear)
+
+    def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
+        """Whether this is also what a module reads that has been called with x."""
+        return (
+            x is self.x
+            and not self.of_convolution
+            and isinstance(module, nn.Linear)
+            and (module.bias is None) == (self.module.bias is None)
+            and site not in self.sites
+        )
 
 
 # --- parameters in use ----------------------------------------------------------------------------
