@@ -196,6 +196,25 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
             "the same tokens in every layer",
             "give layers= of one kind",
         )
+    valid = _valid(mask, shape, device)
+    if image is None:
+        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
+    is_image = boolean(image, "an image mask").to(device)
+    if is_image.shape not in (shape, shape[1:]):
+        raise AegisError(
+            f"an image mask {list(is_image.shape)}",
+            f"{list(shape)} or {list(shape[1:])}",
+            "mark each token the layers see",
+        )
+    return Pass(0, None, hidden, valid, is_image)
+
+
+def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tensor:
+    """Which of the layers' tokens count, [B, T] bool; one at least.
+
+    Raises:
+        AegisError: a mask of other tokens, or of none.
+    """
     if mask is None:
         valid = torch.ones(shape, dtype=torch.bool, device=device)
     else:
@@ -211,16 +230,7 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
         raise AegisError(
             "a mask without a single valid token", "at least one", "leave empty batches out"
         )
-    if image is None:
-        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
-    is_image = boolean(image, "an image mask").to(device)
-    if is_image.shape not in (shape, shape[1:]):
-        raise AegisError(
-            f"an image mask {list(is_image.shape)}",
-            f"{list(shape)} or {list(shape[1:])}",
-            "mark each token the layers see",
-        )
-    return Pass(0, None, hidden, valid, is_image)
+    return valid
 
 
 def boolean(mask: Tensor, what: str) -> Tensor:
