@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.anchors import inputs, passes
-from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
+from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
@@ -33,36 +33,20 @@ _SURE = 0.01
 
 
 @dataclass
-class Reading:
-    """One tensor and the linear maps that have read it, or the convolution.
+class Weighed(SharedInput):
+    """What linear maps have read, and how strongly the answers depend on it.
 
     Attributes:
-        x: the tensor itself.
-        module: its first reader.
-        readers: names of the sites so far.
-        arrived: how many of them a backward pass has come to.
+        arrived: how many of its readers a backward pass has come to.
         weight: |g|, over the outputs of all that it has come to, [n, 1].
     """
 
-    x: Tensor
-    module: nn.Module
-    readers: list[str]
     arrived: int = 0
     weight: Tensor | None = None
 
-    def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
-        """Whether this is also what a module reads that has been called with x."""
-        return (
-            x is self.x
-            and isinstance(module, nn.Linear)
-            and isinstance(self.module, nn.Linear)
-            and (module.bias is None) == (self.module.bias is None)
-            and site not in self.readers
-        )
-
 
 @dataclass
-class Surety:
+class AnswerEntropy:
     """How sure a model is of the answers that a recorder has gone back from.
 
     Attributes:
@@ -113,7 +97,7 @@ class CurvatureRecorder:
 
     Attributes:
         unmeasured: maps that have been used in a way that no hook sees -> how.
-        surety: of the answers so far.
+        entropy: of the answers so far.
     """
 
     def __init__(
@@ -136,10 +120,10 @@ class CurvatureRecorder:
             temperature: what the answers' scores are divided by.
         """
         self._model, self._follow_uses = model, follow_uses
-        self._temperature, self.surety = temperature, Surety()
+        self._temperature, self.entropy = temperature, AnswerEntropy()
         self._sums = SecondMoments(whole)
-        self._last: Reading | None = None
-        self._open: list[Reading] = []  # those that a backward pass has come to in part
+        self._last: Weighed | None = None
+        self._open: list[Weighed] = []  # those that a backward pass has come to in part
         self._graph = _Graph()
         self._generator = torch.Generator().manual_seed(seed)
         self.unmeasured: dict[str, str] = {}
@@ -187,7 +171,7 @@ class CurvatureRecorder:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
             keep: keep the graph, for other scores of the same pass.
         """
-        self.surety.add(scores)
+        self.entropy.add(scores)
         self.follow(_log_likelihood(scores / self._temperature, self._generator), keep)
 
     def follow(self, total: Tensor, keep: bool = True) -> None:
@@ -261,13 +245,13 @@ class CurvatureRecorder:
         self._note_entry(module, arguments, named, output)
         read = arguments[0] if arguments else next(iter(named.values()))
         if self._last is not None and self._last.serves(site, module, read):
-            self._last.readers.append(site)
+            self._last.sites.append(site)
         else:
-            self._last = Reading(read, module, [site])
+            self._last = Weighed(read, module, [site])
         output.register_hook(partial(self._count, self._last, site, module))
 
     @torch.no_grad()
-    def _count(self, reading: Reading, site: str, module: nn.Module, gradient: Tensor) -> None:
+    def _count(self, reading: Weighed, site: str, module: nn.Module, gradient: Tensor) -> None:
         """Add what one call of the module says by the gradient at its output."""
         x, g = inputs.dense_rows(module, reading.x), _output_rows(module, gradient)
         g = g.to(torch.promote_types(g.dtype, torch.float32))
@@ -279,17 +263,16 @@ class CurvatureRecorder:
         reading.arrived += 1
         if reading.arrived == 1:
             self._open.append(reading)
-        if reading.arrived == len(reading.readers):
+        if reading.arrived == len(reading.sites):
             self._count_inputs(reading)
             self._open = [other for other in self._open if other is not reading]
 
-    def _count_inputs(self, reading: Reading) -> None:
+    def _count_inputs(self, reading: Weighed) -> None:
         """Add |g|^2 x x^T of what was read, when a backward pass has come to all its readers."""
         assert reading.weight is not None
         rows = inputs.dense_rows(reading.module, reading.x.detach()) * reading.weight
-        names = [f"{site}.{SIDES[0]}" for site in reading.readers]
-        convolution = not isinstance(reading.module, nn.Linear)
-        self._sums.add_rows(names, rows, convolution)
+        names = [f"{site}.{SIDES[0]}" for site in reading.sites]
+        self._sums.add_rows(names, rows, reading.of_convolution)
         reading.arrived, reading.weight = 0, None
 
     def _note_use(
@@ -314,7 +297,7 @@ def measure(
     whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
     temperature: float = 1.0,
-    surety: Surety | None = None,
+    entropy: AnswerEntropy | None = None,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
@@ -323,7 +306,7 @@ def measure(
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes; each draws words of its own.
         temperature: what the answers' scores are divided by before words are drawn from them.
-        surety: what is to count the answers of this process.
+        entropy: what is to count the answers of this process.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -335,7 +318,7 @@ def measure(
         recorder = CurvatureRecorder(
             model, maps, own, follow_uses=False, whole=whole, temperature=temperature
         )
-        recorder.surety = surety or recorder.surety
+        recorder.entropy = entropy or recorder.entropy
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():

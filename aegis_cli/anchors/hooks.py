@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 from typing import Any, Self
@@ -195,6 +196,25 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
             "the same tokens in every layer",
             "give layers= of one kind",
         )
+    valid = _valid(mask, shape, device)
+    if image is None:
+        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
+    is_image = boolean(image, "an image mask").to(device)
+    if is_image.shape not in (shape, shape[1:]):
+        raise AegisError(
+            f"an image mask {list(is_image.shape)}",
+            f"{list(shape)} or {list(shape[1:])}",
+            "mark each token the layers see",
+        )
+    return Pass(0, None, hidden, valid, is_image)
+
+
+def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tensor:
+    """Which of the layers' tokens count, [B, T] bool; one at least.
+
+    Raises:
+        AegisError: a mask of other tokens, or of none.
+    """
     if mask is None:
         valid = torch.ones(shape, dtype=torch.bool, device=device)
     else:
@@ -210,16 +230,7 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
         raise AegisError(
             "a mask without a single valid token", "at least one", "leave empty batches out"
         )
-    if image is None:
-        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
-    is_image = boolean(image, "an image mask").to(device)
-    if is_image.shape not in (shape, shape[1:]):
-        raise AegisError(
-            f"an image mask {list(is_image.shape)}",
-            f"{list(shape)} or {list(shape[1:])}",
-            "mark each token the layers see",
-        )
-    return Pass(0, None, hidden, valid, is_image)
+    return valid
 
 
 def boolean(mask: Tensor, what: str) -> Tensor:
@@ -237,6 +248,39 @@ def boolean(mask: Tensor, what: str) -> Tensor:
             "give it as [B, T] booleans",
         )
     return mask.bool()
+
+
+# --- what maps read -------------------------------------------------------------------------------
+
+
+@dataclass
+class SharedInput:
+    """A tensor that linear maps have read one after the other, or a convolution.
+
+    Attributes:
+        x: the tensor itself.
+        module: its first reader.
+        sites: names of its readers so far.
+    """
+
+    x: Tensor
+    module: nn.Module
+    sites: list[str]
+
+    @property
+    def of_convolution(self) -> bool:
+        """Whether its reader is a convolution; then no other map reads the same rows."""
+        return not isinstance(self.module, nn.Linear)
+
+    def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
+        """Whether this is also what a module reads that has been called with x."""
+        return (
+            x is self.x
+            and not self.of_convolution
+            and isinstance(module, nn.Linear)
+            and (module.bias is None) == (self.module.bias is None)
+            and site not in self.sites
+        )
 
 
 # --- parameters in use ----------------------------------------------------------------------------

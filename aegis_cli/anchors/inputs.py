@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aegis_cli.anchors import passes
-from aegis_cli.anchors.hooks import describe_use, modules_of_sites, watch_uses
+from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
@@ -28,36 +28,17 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     from aegis_cli.data.vqa.dataset import VQASet
 
 
-@dataclass(frozen=True)
-class Reading:
+@dataclass
+class Reading(SharedInput):
     """What a dense map has just read, until another tensor is read: others may read it as well.
 
     Attributes:
-        x: the tensor itself.
-        bias: whether its readers have one.
-        convolution: whether its reader is one; then no other map reads the same rows.
         keep: which of its rows count, [rows] bool; None: all.
         rows: a copy of what counts, [n, d].
-        sites: its readers so far.
     """
 
-    x: Tensor
-    bias: bool
-    convolution: bool
     keep: Tensor | None
     rows: Tensor
-    sites: list[str]
-
-    def serves(self, site: str, module: nn.Module, x: Tensor, keep: Tensor | None) -> bool:
-        """Whether this is also what a module reads that is now called with x."""
-        return (
-            x is self.x
-            and not self.convolution
-            and isinstance(module, nn.Linear)
-            and self.bias == (module.bias is not None)
-            and site not in self.sites
-            and _same(keep, self.keep)
-        )
 
 
 @dataclass(frozen=True)
@@ -267,22 +248,22 @@ class InputRecorder:
     def _read(self, site: str, module: nn.Module, x: Tensor, keep: Tensor | None) -> None:
         """Note what a linear map or convolution reads."""
         self._sums.note(site)
-        if self._reading is not None and self._reading.serves(site, module, x, keep):
-            self._reading.sites.append(site)
+        last = self._reading
+        if last is not None and last.serves(site, module, x) and _same(keep, last.keep):
+            last.sites.append(site)
             return
         self._count_reading()
-        rows, bias = dense_rows(module, x), getattr(module, "bias", None) is not None
+        rows = dense_rows(module, x)
         rows = self._drawn.of(rows if keep is None else rows[keep], self._generator)
         if rows.data_ptr() == x.data_ptr():
             rows = rows.clone()  # the model may go on in place
-        convolution = not isinstance(module, nn.Linear)
-        self._reading = Reading(x, bias, convolution, keep, rows, [site])
+        self._reading = Reading(x, module, [site], keep, rows)
 
     def _count_reading(self) -> None:
         """Add what was read last, now that all its readers have come."""
         if self._reading is not None:
             done, self._reading = self._reading, None
-            self._sums.add_rows(done.sites, done.rows, done.convolution)
+            self._sums.add_rows(done.sites, done.rows, done.of_convolution)
 
     def _rows(self, name: str, x: Tensor) -> Tensor | None:
         """Which of a map's rows are tokens that count; None: all.

@@ -188,8 +188,8 @@ def _on_questions(
     asked = source.choose(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
-    surety = curvature.Surety()
-    anchor, seconds = _PartMeasurement(model, asked, settings, on_event, ranks, surety).parts()
+    entropy = curvature.AnswerEntropy()
+    anchor, seconds = _PartMeasurement(model, asked, settings, on_event, ranks, entropy).parts()
     return _Measured(
         anchor,
         model.fingerprint(),
@@ -198,7 +198,7 @@ def _on_questions(
         seconds,
         source.sha256,
         {"vqa": source.name} | ({} if source.ask == sets.PLAIN else {"ask": source.ask}),
-        surety.mean(ranks) if anchor.curvature else None,
+        entropy.mean(ranks) if anchor.curvature else None,
     )
 
 
@@ -271,7 +271,7 @@ class _PartMeasurement:
     """The questions that each part is measured on, and what with.
 
     Attributes:
-        surety: what counts the answers of the curvature.
+        entropy: what counts the answers of the curvature.
     """
 
     model: Backbone
@@ -279,7 +279,7 @@ class _PartMeasurement:
     settings: Settings
     on_event: OnEvent
     ranks: Ranks
-    surety: curvature.Surety
+    entropy: curvature.AnswerEntropy
 
     def parts(self) -> tuple[Anchor, dict[str, float]]:
         """The parts asked for, always in one order, and the seconds each took."""
@@ -328,7 +328,7 @@ class _PartMeasurement:
             self.settings.exact_width,
             self.ranks,
             self.settings.temperature,
-            self.surety,
+            self.entropy,
         )
 
     def _fisher(self) -> dict[str, Tensor]:

@@ -77,8 +77,8 @@ class SecondMoments:
         for moment in self._rows.values():
             ranks.add_up(moment.parts())
         ranks.add_up(list(self._small.values()))
-        counts = ranks.gathered(list(self._counts.values()))
-        self._counts = dict(zip(self._counts, map(sum, zip(*counts, strict=True)), strict=True))
+        counts = ranks.gathered(self._counts)
+        self._counts = {name: sum(own[name] for own in counts) for name in self._counts}
 
     def check(self, names: Iterable[str]) -> None:
         """Raise AegisError unless each of them has rows."""
@@ -117,9 +117,10 @@ class SecondMoments:
                     whole = moment_sums.merged([self._rows[readers] for readers in sums])
                     shared[sums] = whole.spectrum(self._counts[name], energy)
                 found[name] = shared[sums]
-                for readers in sums if release else ():
-                    if last_use[readers] == name:
-                        del self._rows[readers]
+                if release:
+                    for readers in sums:
+                        if last_use[readers] == name:
+                            del self._rows[readers]
         return found
 
 

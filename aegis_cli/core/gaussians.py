@@ -72,7 +72,8 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     values, vectors = rising.flip(0), vectors.flip(1)
     values = (1 - shrinkage) * values + shrinkage * rising.mean()
     # A direction that never varies would make every other value infinitely unlikely.
-    values = values.clamp(min=torch.finfo(torch.float32).eps * float(wide.square().mean()))
+    rounding = torch.finfo(torch.float32).eps * float(wide.square().mean())
+    values = values.clamp(min=rounding)
     taken = min(rank, size - 1)  # at least one is left, for the noise to be a mean of
     directions = vectors[:, :taken].contiguous()
     variances, noise = values[:taken].clone(), values[taken:].mean()

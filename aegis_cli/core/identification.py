@@ -140,7 +140,9 @@ def basis(matrices: Sequence[Tensor]) -> Tensor:
     """Orthonormal columns [d, k] float64 that span what the columns of matrices [d, r] span."""
     joined = torch.cat([m.detach().double() for m in matrices], dim=1)
     left, values, _ = torch.linalg.svd(joined, full_matrices=False)
-    return left[:, values > values.max().clamp(min=torch.finfo(torch.float64).tiny) * 1e-6]
+    # Of matrices of zeros nothing is above the smallest number, and so they span nothing.
+    largest = values.max().clamp(min=torch.finfo(torch.float64).tiny)
+    return left[:, values > 1e-6 * largest]
 
 
 def off(matrix: Tensor, columns: Tensor) -> Tensor:

@@ -107,7 +107,8 @@ class Router(nn.Module):
         """Draw the parameters behind the logits, if there is a `top` to choose."""
         if self.top is None or len(self.experts) == 1:
             return
-        drawn, width = (self.bias, 1) if self.constant else (self.read, self.read.shape[1])
+        drawn = self.bias if self.constant else self.read
+        width = 1 if self.constant else self.read.shape[1]
         # A sum over `width` inputs has a spread of 1 then, whatever the width.
         drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 

@@ -86,7 +86,7 @@ def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEv
     asked = asked.sized(base.image_size)
     if part == "inputs":
         return Anchor(inputs=inputs.measure(base, asked, 1.0, settings.batch_size, on_event))
-    surety = curvature.Surety()
+    entropy = curvature.AnswerEntropy()
     measured = curvature.measure(
         base,
         asked,
@@ -95,10 +95,10 @@ def _measured(base: Backbone, settings: MergeSettings, part: str, on_event: OnEv
         settings.batch_size,
         on_event,
         temperature=settings.temperature,
-        surety=surety,
+        entropy=entropy,
     )
     curvature.warn_of_sure_answers(
-        surety.mean(),
+        entropy.mean(),
         settings.temperature,
         "merge",
         "a merge may return less of what others ask: merge with --temperature 4, which takes "

@@ -500,16 +500,7 @@ class PolicyRunner:
         ]
 
         def make(on_event: OnEvent) -> None:
-            # A run of other settings, or finished and then damaged, cannot be continued, nor one
-            # whose process was stopped while it wrote the recipe.
-            begun = self.records.key_of(f"{label}/{BEGUN}")
-            finished = self.records.key_of(f"{label}/train") == digest(key)
-            if begun != digest(key) or finished or not (out / "recipe.yaml").exists():
-                moved = run_folder.clear(out, ours=begun is not None)
-                if moved is not None:
-                    on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
-                self.records.forget(f"{label}/train")
-                self.records.keep(f"{label}/{BEGUN}", key, [])
+            self._clear_other_run(label, key, on_event)
             report = leading.together(
                 train.run,
                 recipe,
@@ -524,6 +515,26 @@ class PolicyRunner:
 
         self.records.fresh(f"{label}/train", key, outputs, make)
         return files.load_json(out / run_folder.JOBS_REPORT)
+
+    def _clear_other_run(self, label: str, key: Mapping[str, Any], on_event: OnEvent) -> None:
+        """Let the cell begin anew where its folder holds no run that can be continued.
+
+        A run of other settings cannot, nor one that was finished and then damaged, nor one whose
+        process was stopped while it wrote the recipe.
+
+        Args:
+            key: what shapes the training.
+        """
+        out, train_record, begun_record = self.folder / label, f"{label}/train", f"{label}/{BEGUN}"
+        begun = self.records.key_of(begun_record)
+        finished = self.records.key_of(train_record) == digest(key)
+        if begun == digest(key) and not finished and (out / "recipe.yaml").exists():
+            return
+        moved = run_folder.clear(out, ours=begun is not None)
+        if moved is not None:
+            on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
+        self.records.forget(train_record)
+        self.records.keep(begun_record, key, [])
 
     def merge(self, label: str, recipe: Recipe) -> dict[str, float]:
         """Merge what the cell has trained; the merged policy's validation loss, by that name."""
@@ -585,30 +596,37 @@ class PolicyRunner:
         }
 
         def make(on_event: OnEvent) -> None:
-            asked = self.questions(recipe, settings, split)
-            before = self.before(recipe, settings, split)
-            anchor = None
-            if "moments" in recipe.anchor.parts:
-                anchor = measured.path, backbones.load(recipe.backbone).fingerprint()
-            after, layers, image_size = leading.together(
-                probe.answers,
-                str(self._policy(label, recipe)),
-                asked,
-                settings.batch_size,
-                anchor,
-                on_event=on_event,
-            )
-            between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
-            report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
-            probe.check_trained(report, recipe.train.steps)
-            probe.warn_of_few_questions(report, settings.max_drop, on_event)
-            wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
-            own = probe.by_image(after, before, asked.names)
-            files.save_json(path, report.to_json() | own | wrong)
+            report, examples = self._probed(label, recipe, settings, split, on_event)
+            files.save_json(path, report.to_json() | examples)
             track.tell(recipe, path.parent, name, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
+
+    def _probed(
+        self, label: str, recipe: Recipe, settings: Probe, split: str, on_event: OnEvent
+    ) -> tuple[probe.ProbeReport, dict[str, Any]]:
+        """The cell's answers compared with those of before, and what is kept of single images."""
+        measured = self.anchor(recipe)
+        asked = self.questions(recipe, settings, split)
+        before = self.before(recipe, settings, split)
+        anchor = None
+        if "moments" in recipe.anchor.parts:
+            anchor = measured.path, backbones.load(recipe.backbone).fingerprint()
+        after, layers, image_size = leading.together(
+            probe.answers,
+            str(self._policy(label, recipe)),
+            asked,
+            settings.batch_size,
+            anchor,
+            on_event=on_event,
+        )
+        between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
+        report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
+        probe.check_trained(report, recipe.train.steps)
+        probe.warn_of_few_questions(report, settings.max_drop, on_event)
+        wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
+        return report, probe.by_image(after, before, asked.names) | wrong
 
     def rollout(
         self, label: str, recipe: Recipe, colors: str, validation: bool = False

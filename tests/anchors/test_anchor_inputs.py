@@ -528,10 +528,10 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
             )
 
 
-def test_surety_is_the_mean_entropy_of_the_answers_words() -> None:
+def test_entropy_is_the_mean_entropy_of_the_answers_words() -> None:
     model, asked = make_tiny(), make_set()
-    counted = curvature.Surety()
-    curvature.measure(model, asked, 1.0, seed=0, temperature=4.0, surety=counted)
+    counted = curvature.AnswerEntropy()
+    curvature.measure(model, asked, 1.0, seed=0, temperature=4.0, entropy=counted)
     found = []
     for row in range(len(asked.questions)):
         (ids, prompt), image = (
