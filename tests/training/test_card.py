@@ -20,3 +20,12 @@ def test_an_anchor_is_named_where_the_method_reads_one(name: str, reads: bool) -
     said = card.text(Recipe("x"), method, 3, data, INPUTS, Ledger(["layers.0"], ["layers.0"]))
     assert ("- anchor: `aaa" in said) is reads and ("--anchor ANCHOR" in said) is reads
     assert "- demos: `ddd" in said
+
+
+def test_nobody_is_told_where_the_backbone_lies() -> None:
+    method, data = methods.get("naive"), card.Data("reach", (), 90, 10)
+    ledger = Ledger(["layers.0"], ["layers.0"])
+    said = card.text(Recipe("x", backbone="/home/ann/vlm"), method, 3, data, INPUTS, ledger)
+    assert "model `vlm` as" in said and "--baseline vlm\n" in said and "/home" not in said
+    said = card.text(Recipe("x", backbone="org/vlm"), method, 3, data, INPUTS, ledger)
+    assert "model `org/vlm` as" in said
