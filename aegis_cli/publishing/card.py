@@ -21,6 +21,7 @@ from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, freezing
+from aegis_cli.training.card import without_folders
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
@@ -121,7 +122,7 @@ def text(
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {found.method}",
-        backbone=recipe.backbone,
+        backbone=without_folders(recipe.backbone),
         version=__version__,
         method=recipe.train.method,
         summary=methods.get(recipe.train.method).summary,
@@ -160,7 +161,8 @@ def _use(
 def _probe_command(repo: str, recipe: Recipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
-    return shlex.join(["aegis", "probe", repo, "--baseline", recipe.backbone, *probe.asking])
+    words = map(without_folders, (recipe.backbone, *probe.asking))
+    return shlex.join(["aegis", "probe", repo, "--baseline", *words])
 
 
 def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str:
@@ -224,7 +226,7 @@ def _probe_row(result: Result, recipe: Recipe) -> str:
         drop = f"{figures['drop_points']:.2f} points ({low:.2f} to {high:.2f})"
     before = figures.get("baseline_accuracy")
     cells = [
-        f"`{asked}`",
+        f"`{without_folders(asked)}`",
         f"{figures['questions']:,}",
         "not measured" if before is None else _percent(before),
         _share(figures["accuracy"], figures["interval"]),

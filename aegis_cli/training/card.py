@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from aegis_cli import recipes
@@ -95,7 +96,7 @@ def text(
         name=recipe.name,
         steps=steps,
         method=method.name,
-        backbone=recipe.backbone,
+        backbone=without_folders(recipe.backbone),
         version=__version__,
         summary=method.summary,
         options=json.dumps(options, sort_keys=True),
@@ -114,6 +115,11 @@ def text(
         drift=_drift(ledger.tensors()),
         anchor=" --anchor ANCHOR" if "anchor" in read else "",
     )
+
+
+def without_folders(name: str) -> str:
+    """What a card calls a model or a file of questions: it tells nobody where these lie."""
+    return Path(name).name if Path(name).is_absolute() else name
 
 
 def _drift(ledger: Mapping[str, Any]) -> str:

@@ -491,6 +491,22 @@ def test_a_completion_that_cannot_be_written_ends_without_a_traceback(
     assert ("No space left on device" in done.stderr) is (code == 2)
 
 
+def test_ctrl_c_while_the_commands_are_loaded_ends_without_a_traceback(tmp_path: Path) -> None:
+    program = """
+import os, signal, sys
+class Pressed:
+    def find_spec(self, name, path=None, target=None):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Pressed())
+from aegis_cli.__main__ import main
+main()
+"""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def test_a_process_of_many_commands_wraps_its_output_once() -> None:
     def full(*_: str) -> None:
         raise OSError(errno.ENOSPC, "full")

@@ -163,6 +163,17 @@ def test_the_energys_title_is_its_finding_and_its_scale_a_log() -> None:
     assert figure.axes[1].get_yscale() == "log"
 
 
+def test_a_scale_within_a_decade_has_plain_numbers_and_steps_are_whole() -> None:
+    figure = plots._energy(energies([[0.06, 0.03], [0.04, 0.02]]))
+    figure.draw_without_rendering()
+    labels = [
+        text.get_text()
+        for axes in figure.axes
+        for text in axes.yaxis.get_minorticklabels() + figure.axes[1].get_xticklabels()
+    ]
+    assert "3" in labels and not any("times" in label or "." in label for label in labels)
+
+
 @pytest.mark.parametrize("shares", [[[0.0, 0.0]], [[0.3]], [[1e-9, 0.5]]])
 def test_energies_of_any_size_are_drawn(shares: list[list[float]]) -> None:
     figure = plots._energy(energies(shares))
@@ -245,6 +256,13 @@ def test_each_predicted_chunk_is_a_line_beside_what_was_recorded() -> None:
         predicted = np.concatenate([line.get_ydata() for line in chunks])
         np.testing.assert_array_equal(predicted, trace.predicted[:, row])
         assert [*np.ravel([dot.get_xdata() for dot in dots])] == [0, 3, 6]
+
+
+def test_the_open_loop_plots_finding_has_room_beside_a_single_episode() -> None:
+    drawn = open_loops._drawn(open_loop_report(columns=1))
+    drawn.draw_without_rendering()
+    title = drawn._suptitle.get_window_extent()
+    assert title.x0 >= 0 and title.x1 <= drawn.bbox.x1
 
 
 def test_the_open_loop_plot_says_its_finding_and_what_was_trained_on() -> None:

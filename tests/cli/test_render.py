@@ -214,6 +214,8 @@ def test_values_of_several_sets_stand_in_brackets_under_names_that_can_be_read()
     assert line.split(maxsplit=1)[1] == (
         "arm (training frames 355, share 0.75), more (training frames 90)"
     )
+    (line,) = text_of(pairs({"pictures": [[48, 64], [96, 128]]})).splitlines()
+    assert line.split(maxsplit=1)[1] == "48 x 64, 96 x 128"
 
 
 @pytest.mark.parametrize(
@@ -484,7 +486,7 @@ def test_a_merge_is_told_without_what_was_not_measured() -> None:
 
 def test_a_single_episode_is_no_number_of_episodes() -> None:
     shown = text_of(open_loop(open_loop_report(episodes=[3])))
-    assert re.search(r"^episode +3$", shown, re.M) and "episodes " not in shown
+    assert re.search(r"^episode +3 *$", shown, re.M) and "episodes " not in shown
 
 
 def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:

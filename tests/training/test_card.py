@@ -38,3 +38,12 @@ def test_what_was_frozen_is_named(freeze: str | tuple[str, ...] | None, said: st
     method, data = methods.get("naive"), card.Data("reach", (), 90, 10)
     text = card.text(recipe, method, 3, data, INPUTS, Ledger([], []))
     assert said in text and ("did not learn" in text) is bool(said)
+
+
+def test_nobody_is_told_where_the_backbone_lies() -> None:
+    method, data = methods.get("naive"), card.Data("reach", (), 90, 10)
+    ledger = Ledger(["layers.0"], ["layers.0"])
+    said = card.text(Recipe("x", backbone="/home/ann/vlm"), method, 3, data, INPUTS, ledger)
+    assert "model `vlm` as" in said and "--baseline vlm\n" in said and "/home" not in said
+    said = card.text(Recipe("x", backbone="org/vlm"), method, 3, data, INPUTS, ledger)
+    assert "model `org/vlm` as" in said

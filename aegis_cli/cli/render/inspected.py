@@ -13,7 +13,6 @@ from rich.text import Text
 
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.tables import pairs
-from aegis_cli.inspection import steps_taken
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
@@ -68,7 +67,13 @@ def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
         left["merge"] = told
     if None in (planned, steps) or steps >= planned:
         return left
-    return left | {"steps": steps_taken(steps, planned)}
+    return left | {"steps": _steps_taken(steps, planned)}
+
+
+def _steps_taken(steps: int | None, planned: int | None) -> str:
+    from aegis_cli.inspection import steps_taken  # which loads safetensors, not for --help
+
+    return steps_taken(steps, planned)
 
 
 def _measured(report: Any) -> list[RenderableType]:
@@ -217,7 +222,7 @@ def compared(report: Any) -> RenderableType:
     apart = {*(_OF_QUESTIONS if several else ()), *([_OPEN_LOOP] if elsewhere else [])}
     better = {name: of for name, of in better.items() if name not in apart}
     columns: dict[str, Callable[[Any], str]] = {
-        "Steps": lambda r: steps_taken(r.steps, r.planned_steps),
+        "Steps": lambda r: _steps_taken(r.steps, r.planned_steps),
         "Questions": lambda r: (r.vqa or "-") if several else "-",
         "VQA %": lambda r: percent(r.accuracy),
         "Before %": lambda r: percent(r.baseline_accuracy),

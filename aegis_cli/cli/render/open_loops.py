@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from aegis_cli.cli.render.plots import figure, save_figure
 from aegis_cli.cli.render.tables import pairs
 
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
+_TITLE_CHARACTERS = 44  # of a line of the title, for each episode beside another
 _ROWS = 8  # of the table by steps ahead
 _INSTRUCTIONS = 10  # rows of the table by instruction
 _SPLITS = {
@@ -126,7 +128,8 @@ def _drawn(report: Any) -> Any:
                 axis.set_ylabel(f"{dimension.name}{unit}", fontsize=8)
         panels[0][column].set_title(_titled(report, trace), fontsize=9)
         panels[-1][column].set_xlabel("frame", fontsize=8)
-    drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    finding = textwrap.fill(_finding(report), _TITLE_CHARACTERS * columns)
+    drawn.suptitle(finding, x=0.01, ha="left", fontsize=11, fontweight="bold")
     _explain(drawn, report.traces[0].replan)
     return drawn
 

@@ -70,13 +70,16 @@ def figure(**options: Any) -> Any:
 
 def _energy(report: Any) -> Any:
     """A heat map of layers and steps above the course of all layers, which share their steps."""
+    from matplotlib.ticker import LogFormatter
+
     count, bins = len(report.layers), report.over_time
     drawn = figure(figsize=(9.5, 3.6 + 0.24 * count), layout="constrained")
     top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * count), 0.8))
     edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]
     drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
     heat, least = _energy_of_layers(top, report, edges)
-    drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
+    bar = drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
+    bar.ax.yaxis.set_minor_formatter(LogFormatter())  # of scales within a decade
     _energy_of_all(below, report, edges, least)
     return drawn
 
@@ -112,6 +115,7 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
 def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float) -> None:
     """The course of the energy shed by all layers together, with its mean as a dashed line."""
     import numpy as np
+    from matplotlib.ticker import LogFormatter, MaxNLocator
 
     course = 100 * np.array([b.energy_shed for b in report.over_time])
     axes.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
@@ -129,7 +133,9 @@ def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float)
             fontsize=9,
         )
     axes.set(xlabel="training step", ylabel="all groups (%)", xlim=(edges[0], edges[-1]))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
     axes.grid(alpha=0.3)
 
 

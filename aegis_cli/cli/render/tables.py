@@ -346,10 +346,15 @@ def _cell(value: Any, name: str = "") -> str:
     if isinstance(value, dict):
         return _list([f"{k} {_within(v)}" for k, v in value.items()])
     if isinstance(value, (tuple, list)):
-        return _list([_cell(v) for v in value]) or "-"
+        return _list([_one_of(v) for v in value]) or "-"
     if isinstance(value, float):
         return percent(value) if _is_share(name) else number(value)
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
+
+
+def _one_of(value: Any) -> str:
+    """A value of a list; one that is a list itself is a size, as of a picture."""
+    return " x ".join(map(_cell, value)) if isinstance(value, (tuple, list)) else _cell(value)
 
 
 def _within(value: Any) -> str:
