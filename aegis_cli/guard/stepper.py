@@ -54,7 +54,9 @@ class GuardedStepper:
         self._stepping, self._count = False, 0
         self._counted: int | None = None  # the optimizer whose step was counted since the last pass
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
-        self._slowed: SlowedStep | None = None  # of a step of the loop's own
+        # Of a step of the loop's own, and how often each weight had been written to before it.
+        self._slowed: SlowedStep | None = None
+        self._begun_at: list[int] = []
         # Steps inside each other: of an optimizer that calls its base class's, or another one's.
         self._depth, self._in_closure = 0, False
         # Whether an optimizer has moved the weights in `step`; None: no hook has told of any.
@@ -86,6 +88,7 @@ class GuardedStepper:
         Raises:
             AegisError: they were replaced or moved, or further ones learn.
         """
+        self._end_broken_step()
         self._stepper.known.check()
         if structure.learning(self._model).keys() - self._learning.keys():
             self._refuse_other_parameters()
@@ -105,6 +108,7 @@ class GuardedStepper:
         Raises:
             AegisError: it left no gradient in the model.
         """
+        self._end_broken_step()
         if not self._sums_late:
             check_reached(self._learning.values())
         self._stepped, self._counted = set(), None
@@ -179,14 +183,15 @@ class GuardedStepper:
             _take(optimizer, scaler)
         finally:
             self._stepping = False
-        # A scaler leaves a step out that overflowed, and a trainer's optimizer those in between.
-        # What is drawn back in such a step would be so without an update that asked for it.
-        if self._has_moved(optimizer, versions):
-            self._count += 1
-            slowed.go_back()
-            self._stepper.end(self._count)
-        else:
-            self._stepper.take_none()
+            # A scaler leaves a step out that overflowed, and a trainer's optimizer those in
+            # between. What is drawn back in such a step would be so without an update that asked
+            # for it. One that raises an exception may have moved some of the weights.
+            if self._has_moved(optimizer, versions):
+                self._count += 1
+                slowed.go_back()
+                self._stepper.end(self._count)
+            else:
+                self._stepper.take_none()
 
     def _has_moved(self, optimizer: Optimizer, versions: Sequence[int]) -> bool:
         """Whether the weights have moved in `step`.
@@ -243,9 +248,16 @@ class GuardedStepper:
 
     def settle(self) -> None:
         """Constrain the steps since the last time, whatever their turn."""
-        if self._slowed is not None:  # a step that raised an exception
-            self._end()
+        self._end_broken_step()
         self._stepper.settle()
+
+    def _end_broken_step(self) -> None:
+        """End a step of the loop's own that has raised an exception, if there was one.
+
+        An optimizer that calls its closure goes on with its step after it.
+        """
+        if self._slowed is not None and not self._in_closure:
+            self._end(self._begun_at != self._versions())
 
     # --- every optimizer of the process -----------------------------------------------------------
 
@@ -295,7 +307,7 @@ class GuardedStepper:
             self._refuse_unreached()
             self._refuse_second(optimizer)
             self._stepper.begin(self._by_name(self._automatic()))
-            self._slowed = SlowedStep(self._parts)
+            self._slowed, self._begun_at = SlowedStep(self._parts), self._versions()
 
     def after_step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
         """The weights have moved, and go on to move where this step lies inside another one.
@@ -314,7 +326,7 @@ class GuardedStepper:
         if self._slowed is not None and not self._depth:
             self._end(moved)
 
-    def _end(self, moved: bool = True) -> None:
+    def _end(self, moved: bool) -> None:
         """Constrain a step of the loop's own, if it has moved the weights."""
         assert self._slowed is not None
         slowed, self._slowed = self._slowed, None

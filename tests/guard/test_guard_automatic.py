@@ -525,3 +525,52 @@ def test_a_trainer_with_closures_beside_a_guard_is_refused(
     refused(lambda: optimizer.step(closure), "guard")
     refused(lambda: optimizer.step(closure=closure), "guard")
     assert torch.equal(vector(model), before)
+
+
+# --- a step that raises an exception --------------------------------------------------------------
+
+
+class Interrupted(Exception):
+    """Raised inside a step."""
+
+
+class BreakingSGD(torch.optim.SGD):
+    """Raises in its step, before it has moved the weights or after it."""
+
+    breaks: str | None = None
+
+    def step(self, closure: Any = None) -> Any:
+        if self.breaks == "before":
+            raise Interrupted
+        super().step(closure)
+        if self.breaks == "after":
+            raise Interrupted
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("by_itself", [True, False])
+@pytest.mark.parametrize("name", ["nullspace", "kfac"])
+def test_what_a_broken_step_has_moved_is_constrained_and_nothing_else(
+    name: str, by_itself: bool, when: str, anchors: dict[str, Path]
+) -> None:
+    """The next steps are those of a loop where it ended well, or was left out."""
+    found = []
+    for breaks in (True, False):
+        model, guard = automatic(name, anchors) if by_itself else guarded(name, anchors)
+        optimizer = BreakingSGD([p for p in model.parameters() if p.requires_grad], lr=0.05)
+        for seed in range(4):
+            optimizer.breaks = when if breaks and seed == 1 else None
+            if not breaks and seed == 1 and when == "before":
+                continue
+            with contextlib.suppress(Interrupted):
+                loss = task_loss(model, seed)
+                if by_itself:
+                    loss.backward()
+                    optimizer.step()
+                else:
+                    guard.backward(loss)
+                    guard.step(optimizer)
+            optimizer.zero_grad()
+        guard.settle()
+        found.append(vector(model))
+    assert torch.equal(*found)
