@@ -24,6 +24,7 @@ from aegis_cli.models import structure
 
 Scaler = torch.amp.GradScaler
 Closure = Callable[[], Any]
+_AT_WORK: weakref.WeakSet[GuardedStepper] = weakref.WeakSet()  # those that were not removed
 
 
 class GuardedStepper:
@@ -68,6 +69,7 @@ class GuardedStepper:
         # step; and how often each weight had been written to.
         self._took, self._tells = False, False
         self._written: list[int] = []
+        _AT_WORK.add(self)
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
             register_optimizer_step_pre_hook(before),
@@ -106,15 +108,35 @@ class GuardedStepper:
         """Note a guarded backward pass, which every optimizer may follow with one step.
 
         Raises:
-            AegisError: it left no gradient in the model.
+            AegisError: it left no gradient in the model, or another guard is at work on it.
         """
         self._end_broken_step()
+        self._refuse_another_guard()
         if not self._sums_late:
             check_reached(self._learning.values())
         self._stepped, self._counted = set(), None
         self._took, self._written = False, self._versions()
         if not self._in_closure:
             self._depth = 0  # a step that raised an exception has left it as it was
+
+    def _refuse_another_guard(self) -> None:
+        """Refuse a second guard of the same kind on a parameter: it would undo what one has held.
+
+        One may project gradients, and another one constrain the updates that are made of them.
+        """
+        mine = {id(p) for p in self._learning.values()}
+        for other in _AT_WORK:
+            used = other is not self and other._stepped is not None
+            if not used or other._parts.constrains != self._parts.constrains:
+                continue
+            shared = [name for name, p in other._learning.items() if id(p) in mine]
+            if shared:
+                raise AegisError(
+                    f"two guards at work on {len(shared)} parameters, first '{shared[0]}'",
+                    "one for each parameter: a second one moves again what the first has held",
+                    "guard.remove() for one that is done; freeze what two guarded models share; or "
+                    "measure one anchor on the questions of both",
+                )
 
     def may_have_moved(self, skips: bool) -> bool:
         """Whether a step may have moved the weights since the last guarded backward pass.
@@ -152,6 +174,7 @@ class GuardedStepper:
 
     def remove(self) -> None:
         """Let every step pass."""
+        _AT_WORK.discard(self)
         for hook in self._hooks:
             hook.remove()
 

@@ -574,3 +574,33 @@ def test_what_a_broken_step_has_moved_is_constrained_and_nothing_else(
         guard.settle()
         found.append(vector(model))
     assert torch.equal(*found)
+
+
+# --- two guards -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["aegis", "nullspace", "kfac"])
+def test_two_guards_on_a_shared_parameter_are_refused(name: str, anchors: dict[str, Path]) -> None:
+    """What the second one leaves lies again in the directions that the first one holds."""
+    one, first = automatic(name, anchors)
+    task_loss(one, 0).backward()
+    one.zero_grad()
+    other = make()
+    other.text.layers[0].up = one.text.layers[0].up  # of the same values, as pre-trained
+    second = Guard(other, anchors[name], method=name, **METHODS[name]).automatic(mask="mask")
+    with pytest.raises(AegisError, match="two guards at work on 2 parameters.*up.weight"):
+        task_loss(other, 0).backward()
+    first.remove()
+    other.zero_grad()
+    second.discard()
+    task_loss(other, 0).backward()
+
+
+def test_one_guard_of_the_gradient_and_one_of_the_update_go_together(
+    anchors: dict[str, Path],
+) -> None:
+    model, guard = automatic("nullspace", anchors)
+    other = Guard(model, anchors["aegis"], LAYERS).automatic(mask="mask")
+    plain_steps(model)
+    guard.settle()
+    assert len(other.ledger) == 3
