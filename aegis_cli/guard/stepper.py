@@ -365,7 +365,12 @@ class GuardedStepper:
         return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
-        """Whether an optimizer has all that learns, and no other one's step belongs to its own."""
+        """Whether an optimizer has all that learns, and no other one's step belongs to its own.
+
+        One that is none of PyTorch's does not tell.
+        """
+        if not isinstance(optimizer, Optimizer):
+            return False
         mine = {id(p) for p in self._learning.values()}
         return mine <= {id(p) for group in optimizer.param_groups for p in group["params"]}
 
