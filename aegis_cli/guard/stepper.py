@@ -51,6 +51,7 @@ class GuardedStepper:
         self._averaging = averaging or {}
         self._learning = structure.learning(model)
         self._device = next(iter(self._learning.values())).device
+        self._types = [p.dtype for p in self._learning.values()]
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
         self._stepping, self._count = False, 0
         self._counted: int | None = None  # the optimizer whose step was counted since the last pass
@@ -94,7 +95,7 @@ class GuardedStepper:
         self._stepper.known.check()
         if structure.learning(self._model).keys() - self._learning.keys():
             self._refuse_other_parameters()
-        self._refuse_another_device()
+        self._refuse_another_place()
         if at_work := [name for name, module in self._averaging.items() if module.training]:
             raise AegisError(
                 f"'{at_work[0]}' first of {len(at_work)} modules in training mode, whose running "
@@ -194,7 +195,7 @@ class GuardedStepper:
             _take(optimizer, scaler)
             return
         self._refuse_other_parameters()
-        self._refuse_another_device()
+        self._refuse_another_place()
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
         self._refuse_unreached()
@@ -231,14 +232,28 @@ class GuardedStepper:
         """How often each parameter was written to, as PyTorch counts it."""
         return [p._version for p in self._learning.values()]
 
-    def _refuse_another_device(self) -> None:
-        """Refuse a model that has moved away from what its updates are constrained by."""
+    def _refuse_another_place(self) -> None:
+        """Refuse a model that is elsewhere, or of another type, than what constrains it."""
         device = next(iter(self._learning.values())).device
         if self._parts.constrains and device != self._device:
             raise AegisError(
                 f"a model that was on {self._device} when the guard was made, and is on {device}",
                 "one and the same",
                 f"model.to('{device}') before Guard(...), also where a trainer would do it",
+            )
+        types = [p.dtype for p in self._learning.values()]
+        if self._parts.constrains and types != self._types:
+            place = next(
+                i
+                for i, (now, then) in enumerate(zip(types, self._types, strict=True))
+                if now != then
+            )
+            raise AegisError(
+                f"'{list(self._learning)[place]}', which was in {self._types[place]} when the "
+                f"guard was made, and is in {types[place]}",
+                "one and the same: rounding to half precision is as large as an update",
+                "leave the model as it was, with torch.autocast for fast products; of Lightning, "
+                "precision='bf16-mixed'",
             )
 
     def _refuse_second(self, optimizer: Optimizer) -> None:

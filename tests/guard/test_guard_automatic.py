@@ -604,3 +604,20 @@ def test_one_guard_of_the_gradient_and_one_of_the_update_go_together(
     plain_steps(model)
     guard.settle()
     assert len(other.ledger) == 3
+
+
+@pytest.mark.parametrize("by_itself", [True, False])
+@pytest.mark.parametrize("name", ["nullspace", "kfac"])
+def test_a_model_that_is_cast_later_is_refused_before_anything_moves(
+    name: str, by_itself: bool, anchors: dict[str, Path]
+) -> None:
+    """As Lightning does with precision='bf16-true'."""
+    model, guard = automatic(name, anchors) if by_itself else guarded(name, anchors)
+    model.bfloat16()
+    before = vector(model)
+    with pytest.raises(AegisError, match="was in torch.float64 .* and is in torch.bfloat16"):
+        if by_itself:
+            task_loss(model, 0)
+        else:
+            guard.backward(task_loss(model, 0))
+    assert torch.equal(before, vector(model))
