@@ -103,8 +103,8 @@ class ProtectedAdamW(torch.optim.AdamW):
         # come, tells what they are; the first step asks again.
         with contextlib.suppress(AegisError):
             self._found = _match(self._base, self._ordered())
-        # What no longer learns, and the VLM's values of what should not and was not found.
-        self._frozen: list[Tensor] = []
+        # What does not learn, by name, and the VLM's values of what should not and was not found.
+        self._frozen: list[tuple[str, Tensor]] = []
         self._lost: dict[str, Tensor] = {}
         if method == "kfac" and self._options["weight"] > 0:
             self._frozen, self._lost = _freeze(base, self._base, self.param_groups)
@@ -127,7 +127,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         Raises:
             AegisError: at the first step, where none of the VLM's maps is among the parameters,
                 they cannot be told, some have learned or are tables of another size, or half of one
-                is frozen; at any, where something learns again that `kfac` has frozen.
+                is frozen; at any, where something of the VLM learns that was frozen at the first.
         """
         if overflowed(self):
             return None
@@ -157,14 +157,30 @@ class ProtectedAdamW(torch.optim.AdamW):
         with wide_step.loading(self, state_dict):
             super().load_state_dict(state_dict)
 
-    def _refuse_thawed(self) -> None:
-        """Refuse a step of what was frozen at the start."""
-        if any(parameter.requires_grad for parameter in self._frozen):
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add a group, as AdamW does, before the first step.
+
+        Raises:
+            AegisError: the method has started, and would not hold what is the VLM's among them.
+        """
+        if getattr(self, "_stepper", None) is not None:
             raise AegisError(
-                f"normalisations or tables of the base model that learn again, of "
-                f"{len(self._frozen)} parameters that were frozen",
-                "what kfac holds: linear maps and convolutions alone",
-                "leave them frozen after the optimizer is made; aegis_nullspace protects them too",
+                "a group of parameters that is added after the first step",
+                "all of them before it: what is the VLM's among them could not be held",
+                "make a new optimizer of all parameters, which continues with this one's state",
+            )
+        super().add_param_group(param_group)
+
+    def _refuse_thawed(self) -> None:
+        """Refuse a step of what was frozen at the start, which nothing holds."""
+        thawed = [name for name, parameter in self._frozen if parameter.requires_grad]
+        if thawed:
+            raise AegisError(
+                f"{len(thawed)} parameters of the base model that were frozen and learn again, "
+                f"first '{thawed[0]}'",
+                "what learned at the first step",
+                "let all maps that are to learn do so from the first step on; kfac holds nothing "
+                "but linear maps and convolutions, and normalisations and tables stay frozen",
             )
 
     def _ordered(self) -> list[Tensor]:
@@ -179,6 +195,8 @@ class ProtectedAdamW(torch.optim.AdamW):
         found |= _match(absent, self._ordered(), _ids(found))
         _refuse_half_frozen(found)
         learning = {site: pair for site, pair in found.items() if pair[0].requires_grad}
+        for site in found.keys() - learning.keys():
+            self._frozen.append((site, found[site][0]))
         if not learning:
             raise AegisError(
                 f"none of the {len(self._base)} maps of the base model is among what learns",
@@ -500,7 +518,7 @@ def _in_each_type(tensor: Tensor) -> Iterator[str]:
 
 def _freeze(
     base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
-) -> tuple[list[Tensor], dict[str, Tensor]]:
+) -> tuple[list[tuple[str, Tensor]], dict[str, Tensor]]:
     """Let nothing learn of the VLM besides its protected maps.
 
     Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
@@ -511,24 +529,25 @@ def _freeze(
         groups: the optimizer's.
 
     Returns:
-        What was frozen; and by name those of the VLM that have too few parameters of their values,
-        on the CPU. They may have learned before.
+        What was frozen, with its name; and by name those of the VLM that have too few parameters of
+        their values, on the CPU. They may have learned before.
     """
     held = {id(t) for site in protected for t in weights(base, site) if t is not None}
     in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
     given = Counter(value for _, values in in_groups for value in values)
-    sequence = []
-    for parameter in base.parameters():
+    named, sequence = list(base.named_parameters()), []
+    for _, parameter in named:
         known = next((v for v in _in_each_type(parameter) if v in given), "")
         sequence.append((known or _values(parameter), id(parameter) in held))
     others = Counter(value for value, is_held in sequence if not is_held)
     held_values = {value for value, is_held in sequence if is_held}
     lost: dict[str, Tensor] = {}
-    for (name, parameter), (value, is_held) in zip(base.named_parameters(), sequence, strict=True):
+    for (name, parameter), (value, is_held) in zip(named, sequence, strict=True):
         if not is_held and given[value] < others[value]:
             lost[name] = _on_cpu(parameter)
     unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
-    frozen: list[Tensor] = []
+    names = {value: name for (name, _), (value, _) in zip(named, sequence, strict=True)}
+    frozen: list[tuple[str, Tensor]] = []
     for parameters, values in in_groups:
         others_here = _in_order(sequence, values) if unclear & set(values) else set()
         for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
@@ -536,7 +555,7 @@ def _freeze(
             if is_other:
                 parameter.requires_grad_(False)
                 parameter.grad = None  # AdamW would step by one that was there before
-                frozen.append(parameter)
+                frozen.append((names[value], parameter))
     return frozen, lost
 
 

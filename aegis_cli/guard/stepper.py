@@ -24,6 +24,7 @@ from aegis_cli.models import structure
 
 Scaler = torch.amp.GradScaler
 Closure = Callable[[], Any]
+_AT_WORK: weakref.WeakSet[GuardedStepper] = weakref.WeakSet()  # those that were not removed
 
 
 class GuardedStepper:
@@ -50,11 +51,14 @@ class GuardedStepper:
         self._averaging = averaging or {}
         self._learning = structure.learning(model)
         self._device = next(iter(self._learning.values())).device
+        self._types = [p.dtype for p in self._learning.values()]
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
         self._stepping, self._count = False, 0
         self._counted: int | None = None  # the optimizer whose step was counted since the last pass
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
-        self._slowed: SlowedStep | None = None  # of a step of the loop's own
+        # Of a step of the loop's own, and how often each weight had been written to before it.
+        self._slowed: SlowedStep | None = None
+        self._begun_at: list[int] = []
         # Steps inside each other: of an optimizer that calls its base class's, or another one's.
         self._depth, self._in_closure = 0, False
         # Whether an optimizer has moved the weights in `step`; None: no hook has told of any.
@@ -66,6 +70,7 @@ class GuardedStepper:
         # step; and how often each weight had been written to.
         self._took, self._tells = False, False
         self._written: list[int] = []
+        _AT_WORK.add(self)
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
             register_optimizer_step_pre_hook(before),
@@ -86,10 +91,11 @@ class GuardedStepper:
         Raises:
             AegisError: they were replaced or moved, or further ones learn.
         """
+        self._end_broken_step()
         self._stepper.known.check()
         if structure.learning(self._model).keys() - self._learning.keys():
             self._refuse_other_parameters()
-        self._refuse_another_device()
+        self._refuse_another_place()
         if at_work := [name for name, module in self._averaging.items() if module.training]:
             raise AegisError(
                 f"'{at_work[0]}' first of {len(at_work)} modules in training mode, whose running "
@@ -103,14 +109,35 @@ class GuardedStepper:
         """Note a guarded backward pass, which every optimizer may follow with one step.
 
         Raises:
-            AegisError: it left no gradient in the model.
+            AegisError: it left no gradient in the model, or another guard is at work on it.
         """
+        self._end_broken_step()
+        self._refuse_another_guard()
         if not self._sums_late:
             check_reached(self._learning.values())
         self._stepped, self._counted = set(), None
         self._took, self._written = False, self._versions()
         if not self._in_closure:
             self._depth = 0  # a step that raised an exception has left it as it was
+
+    def _refuse_another_guard(self) -> None:
+        """Refuse a second guard of the same kind on a parameter: it would undo what one has held.
+
+        One may project gradients, and another one constrain the updates that are made of them.
+        """
+        mine = {id(p) for p in self._learning.values()}
+        for other in _AT_WORK:
+            used = other is not self and other._stepped is not None
+            if not used or other._parts.constrains != self._parts.constrains:
+                continue
+            shared = [name for name, p in other._learning.items() if id(p) in mine]
+            if shared:
+                raise AegisError(
+                    f"two guards at work on {len(shared)} parameters, first '{shared[0]}'",
+                    "one for each parameter: a second one moves again what the first has held",
+                    "guard.remove() for one that is done; freeze what two guarded models share; or "
+                    "measure one anchor on the questions of both",
+                )
 
     def may_have_moved(self, skips: bool) -> bool:
         """Whether a step may have moved the weights since the last guarded backward pass.
@@ -148,6 +175,7 @@ class GuardedStepper:
 
     def remove(self) -> None:
         """Let every step pass."""
+        _AT_WORK.discard(self)
         for hook in self._hooks:
             hook.remove()
 
@@ -167,7 +195,7 @@ class GuardedStepper:
             _take(optimizer, scaler)
             return
         self._refuse_other_parameters()
-        self._refuse_another_device()
+        self._refuse_another_place()
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
         self._refuse_unreached()
@@ -179,14 +207,15 @@ class GuardedStepper:
             _take(optimizer, scaler)
         finally:
             self._stepping = False
-        # A scaler leaves a step out that overflowed, and a trainer's optimizer those in between.
-        # What is drawn back in such a step would be so without an update that asked for it.
-        if self._has_moved(optimizer, versions):
-            self._count += 1
-            slowed.go_back()
-            self._stepper.end(self._count)
-        else:
-            self._stepper.take_none()
+            # A scaler leaves a step out that overflowed, and a trainer's optimizer those in
+            # between. What is drawn back in such a step would be so without an update that asked
+            # for it. One that raises an exception may have moved some of the weights.
+            if self._has_moved(optimizer, versions):
+                self._count += 1
+                slowed.go_back()
+                self._stepper.end(self._count)
+            else:
+                self._stepper.take_none()
 
     def _has_moved(self, optimizer: Optimizer, versions: Sequence[int]) -> bool:
         """Whether the weights have moved in `step`.
@@ -203,14 +232,28 @@ class GuardedStepper:
         """How often each parameter was written to, as PyTorch counts it."""
         return [p._version for p in self._learning.values()]
 
-    def _refuse_another_device(self) -> None:
-        """Refuse a model that has moved away from what its updates are constrained by."""
+    def _refuse_another_place(self) -> None:
+        """Refuse a model that is elsewhere, or of another type, than what constrains it."""
         device = next(iter(self._learning.values())).device
         if self._parts.constrains and device != self._device:
             raise AegisError(
                 f"a model that was on {self._device} when the guard was made, and is on {device}",
                 "one and the same",
                 f"model.to('{device}') before Guard(...), also where a trainer would do it",
+            )
+        types = [p.dtype for p in self._learning.values()]
+        if self._parts.constrains and types != self._types:
+            place = next(
+                i
+                for i, (now, then) in enumerate(zip(types, self._types, strict=True))
+                if now != then
+            )
+            raise AegisError(
+                f"'{list(self._learning)[place]}', which was in {self._types[place]} when the "
+                f"guard was made, and is in {types[place]}",
+                "one and the same: rounding to half precision is as large as an update",
+                "leave the model as it was, with torch.autocast for fast products; of Lightning, "
+                "precision='bf16-mixed'",
             )
 
     def _refuse_second(self, optimizer: Optimizer) -> None:
@@ -243,9 +286,16 @@ class GuardedStepper:
 
     def settle(self) -> None:
         """Constrain the steps since the last time, whatever their turn."""
-        if self._slowed is not None:  # a step that raised an exception
-            self._end()
+        self._end_broken_step()
         self._stepper.settle()
+
+    def _end_broken_step(self) -> None:
+        """End a step of the loop's own that has raised an exception, if there was one.
+
+        An optimizer that calls its closure goes on with its step after it.
+        """
+        if self._slowed is not None and not self._in_closure:
+            self._end(self._begun_at != self._versions())
 
     # --- every optimizer of the process -----------------------------------------------------------
 
@@ -295,7 +345,7 @@ class GuardedStepper:
             self._refuse_unreached()
             self._refuse_second(optimizer)
             self._stepper.begin(self._by_name(self._automatic()))
-            self._slowed = SlowedStep(self._parts)
+            self._slowed, self._begun_at = SlowedStep(self._parts), self._versions()
 
     def after_step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
         """The weights have moved, and go on to move where this step lies inside another one.
@@ -314,7 +364,7 @@ class GuardedStepper:
         if self._slowed is not None and not self._depth:
             self._end(moved)
 
-    def _end(self, moved: bool = True) -> None:
+    def _end(self, moved: bool) -> None:
         """Constrain a step of the loop's own, if it has moved the weights."""
         assert self._slowed is not None
         slowed, self._slowed = self._slowed, None
@@ -330,7 +380,12 @@ class GuardedStepper:
         return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
-        """Whether an optimizer has all that learns, and no other one's step belongs to its own."""
+        """Whether an optimizer has all that learns, and no other one's step belongs to its own.
+
+        One that is none of PyTorch's does not tell.
+        """
+        if not isinstance(optimizer, Optimizer):
+            return False
         mine = {id(p) for p in self._learning.values()}
         return mine <= {id(p) for group in optimizer.param_groups for p in group["params"]}
 

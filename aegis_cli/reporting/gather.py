@@ -332,7 +332,7 @@ def _command(*words: object) -> str:
 
 
 def _videos(path: Path) -> list[Video]:
-    """The films in a folder and in those right below it."""
-    listed = [*path.glob("*"), *path.glob("*/*")]
+    """The films in a folder, in those right below it, and in the merged runs in these."""
+    listed = [*path.glob("*"), *path.glob("*/*"), *path.glob(f"*/{folder.MERGED}/*")]
     found = sorted(p for p in listed if p.suffix.lower() in _VIDEOS and p.is_file())
     return [Video(p.relative_to(path).as_posix(), p.stat().st_size) for p in found]

@@ -595,6 +595,30 @@ def test_a_batch_that_is_left_out_after_its_backward_pass_has_no_row(anchor: Pat
     assert guard.ledger.tensors()["step"].tolist() == [1, 2, 4]
 
 
+class NotTorchs:
+    """An optimizer that is none of PyTorch's, and writes past PyTorch's count."""
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model = model
+
+    def step(self) -> None:
+        for parameter in self._model.parameters():
+            parameter.data.sub_(0.01 * parameter.grad)
+
+
+def test_steps_of_an_optimizer_that_tells_nothing_have_their_rows(anchor: Path) -> None:
+    model = make()
+    guard, optimizer = Guard(model, anchor, LAYERS), NotTorchs(model)
+    for number in range(3):
+        with guard.watch(batch(number)[2]):
+            loss = task_loss(model, number)
+        guard.backward(loss)
+        guard.step(optimizer)
+        model.zero_grad()
+    guard.remove()
+    assert len(guard.ledger) == 3
+
+
 def test_only_the_projected_gradient_overflows(tmp_path: Path) -> None:
     """In float16 a combination of two finite gradients may be none."""
     model = make(dtype=torch.float16)

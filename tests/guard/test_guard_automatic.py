@@ -525,3 +525,99 @@ def test_a_trainer_with_closures_beside_a_guard_is_refused(
     refused(lambda: optimizer.step(closure), "guard")
     refused(lambda: optimizer.step(closure=closure), "guard")
     assert torch.equal(vector(model), before)
+
+
+# --- a step that raises an exception --------------------------------------------------------------
+
+
+class Interrupted(Exception):
+    """Raised inside a step."""
+
+
+class BreakingSGD(torch.optim.SGD):
+    """Raises in its step, before it has moved the weights or after it."""
+
+    breaks: str | None = None
+
+    def step(self, closure: Any = None) -> Any:
+        if self.breaks == "before":
+            raise Interrupted
+        super().step(closure)
+        if self.breaks == "after":
+            raise Interrupted
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("by_itself", [True, False])
+@pytest.mark.parametrize("name", ["nullspace", "kfac"])
+def test_what_a_broken_step_has_moved_is_constrained_and_nothing_else(
+    name: str, by_itself: bool, when: str, anchors: dict[str, Path]
+) -> None:
+    """The next steps are those of a loop where it ended well, or was left out."""
+    found = []
+    for breaks in (True, False):
+        model, guard = automatic(name, anchors) if by_itself else guarded(name, anchors)
+        optimizer = BreakingSGD([p for p in model.parameters() if p.requires_grad], lr=0.05)
+        for seed in range(4):
+            optimizer.breaks = when if breaks and seed == 1 else None
+            if not breaks and seed == 1 and when == "before":
+                continue
+            with contextlib.suppress(Interrupted):
+                loss = task_loss(model, seed)
+                if by_itself:
+                    loss.backward()
+                    optimizer.step()
+                else:
+                    guard.backward(loss)
+                    guard.step(optimizer)
+            optimizer.zero_grad()
+        guard.settle()
+        found.append(vector(model))
+    assert torch.equal(*found)
+
+
+# --- two guards -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["aegis", "nullspace", "kfac"])
+def test_two_guards_on_a_shared_parameter_are_refused(name: str, anchors: dict[str, Path]) -> None:
+    """What the second one leaves lies again in the directions that the first one holds."""
+    one, first = automatic(name, anchors)
+    task_loss(one, 0).backward()
+    one.zero_grad()
+    other = make()
+    other.text.layers[0].up = one.text.layers[0].up  # of the same values, as pre-trained
+    second = Guard(other, anchors[name], method=name, **METHODS[name]).automatic(mask="mask")
+    with pytest.raises(AegisError, match="two guards at work on 2 parameters.*up.weight"):
+        task_loss(other, 0).backward()
+    first.remove()
+    other.zero_grad()
+    second.discard()
+    task_loss(other, 0).backward()
+
+
+def test_one_guard_of_the_gradient_and_one_of_the_update_go_together(
+    anchors: dict[str, Path],
+) -> None:
+    model, guard = automatic("nullspace", anchors)
+    other = Guard(model, anchors["aegis"], LAYERS).automatic(mask="mask")
+    plain_steps(model)
+    guard.settle()
+    assert len(other.ledger) == 3
+
+
+@pytest.mark.parametrize("by_itself", [True, False])
+@pytest.mark.parametrize("name", ["nullspace", "kfac"])
+def test_a_model_that_is_cast_later_is_refused_before_anything_moves(
+    name: str, by_itself: bool, anchors: dict[str, Path]
+) -> None:
+    """As Lightning does with precision='bf16-true'."""
+    model, guard = automatic(name, anchors) if by_itself else guarded(name, anchors)
+    model.bfloat16()
+    before = vector(model)
+    with pytest.raises(AegisError, match="was in torch.float64 .* and is in torch.bfloat16"):
+        if by_itself:
+            task_loss(model, 0)
+        else:
+            guard.backward(task_loss(model, 0))
+    assert torch.equal(before, vector(model))

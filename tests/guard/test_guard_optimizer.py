@@ -335,11 +335,33 @@ def test_what_kfac_has_frozen_may_not_learn_again(
     optimizer = make(model, "kfac", anchor, base)
     train(model, optimizer, range(1))
     model.requires_grad_(True)
-    before = values(model)
-    gradients(model, 1)
-    with pytest.raises(AegisError, match="learn again"):
-        optimizer.step()
-    assert all(torch.equal(before[name], p) for name, p in model.named_parameters())
+    refused_at_the_first_step(model, optimizer, "13 parameters .* were frozen and learn again")
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_maps_that_learn_later_are_refused(method: str, trained_folder: Path) -> None:
+    """Nothing would hold them: the method has started without them."""
+    model = Foreign(trained_folder)
+    layer = model.inner["vlm"].layers[1].requires_grad_(False)
+    optimizer = made_of(trained_folder, model, method)
+    train(model, optimizer, range(1))
+    layer.up.requires_grad_(True)
+    refused_at_the_first_step(model, optimizer, "learn again, first 'layers.1.up'")
+    layer.up.requires_grad_(False)
+    with pytest.raises(AegisError, match="added after the first step"):
+        optimizer.add_param_group({"params": [nn.Parameter(torch.zeros(2))]})
+
+
+def test_a_resumed_training_may_let_more_maps_learn(trained_folder: Path) -> None:
+    model = Foreign(trained_folder)
+    layer = model.inner["vlm"].layers[1].requires_grad_(False)
+    optimizer = made_of(trained_folder, model, "nullspace")
+    train(model, optimizer, range(1))
+    layer.requires_grad_(True)
+    further = made_of(trained_folder, model, "nullspace")
+    further.load_state_dict(optimizer.state_dict())
+    train(model, further, range(1, 3))
+    assert {"layers.0.up", "layers.1.up"} <= set(further.protected)
 
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])

@@ -92,6 +92,10 @@ def test_a_job_stands_for_what_was_merged(job: Path, aegis: Aegis) -> None:
     (compared,) = compare.run([job]).rows
     assert (compared.run, compared.method) == (str(job / "naive/merged"), "naive, merged")
     assert compared.accuracy == row.accuracy and compared.validation_loss == row.validation_loss
+    film = job / "naive/merged/reach.mp4"
+    film.write_bytes(b"film")
+    assert [video.name for video in gather.run(job).videos] == ["naive/merged/reach.mp4"]
+    film.unlink()
     (told,) = gather.run(job).runs
     assert (told.label, told.path) == ("naive, merged", str(job / "naive/merged"))
     assert told.train["step_s"] == row.step_s and told.anchor is not None
