@@ -29,6 +29,8 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
+from aegis_cli.core import ensemble as temporal
+from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.evaluation.rollout import Acting, load_run
 from aegis_cli.models.policy import Policy, check_actions
@@ -60,6 +62,8 @@ class DeployedPolicy:
             that is not known, or the backbone reads squares of `image_size`.
         positions, actions: P and A, how many numbers each of them has.
         chunk: how many actions are predicted at once, of which `replan` are executed.
+        ensemble: the decay of the temporal ensemble (see `core.ensemble`), which predicts at every
+            step; None without one.
         action_names, state_names: of the A actions and the P positions, in their order; None where
             the demonstrations had none, or the policy is older than these names.
         fps: actions per second, as many as the demonstrations had frames; None where that is not
@@ -75,15 +79,18 @@ class DeployedPolicy:
         seed: int = 0,
         sizes: Sequence[tuple[int, int]] = (),
         recorded: Mapping[str, Any] | None = None,
+        ensemble: float | None = None,
     ) -> None:
         """Begin the first episode.
 
         Args:
             recorded: what a checkpoint's meta says of the demonstrations: `action_names`,
                 `proprio_names` and `fps`, each only where it is known.
+            ensemble: decay of a temporal ensemble; then `replan` is 1 whatever is given.
         """
         self._policy, self._generator = policy, torch.Generator()
-        self.task, self.cameras, self.replan, self._seed = task, tuple(cameras), replan, seed
+        self.task, self.cameras, self._seed = task, tuple(cameras), seed
+        self.ensemble, self.replan = ensemble, replan if ensemble is None else 1
         self.sizes = tuple(sizes)
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
         self.chunk = policy.expert.shape.chunk
@@ -117,6 +124,7 @@ class DeployedPolicy:
     def reset(self) -> None:
         """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[np.ndarray] = deque()
+        self._averaged = None if self.ensemble is None else TemporalEnsemble(self.ensemble)
         self._follows: str | None = None  # the instruction that the actions ahead are of
         self._generator.manual_seed(self._seed)
 
@@ -128,7 +136,9 @@ class DeployedPolicy:
     ) -> np.ndarray:
         """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
 
-        Another instruction than that of the chunk predicts at once, and drops what is left of it.
+        With a temporal ensemble each call predicts, and the action is the mean of what the calls so
+        far have predicted for it. Another instruction than that of the chunk predicts at once, and
+        drops what is left of earlier ones.
 
         Args:
             pictures, instruction, positions: see `predict_action_chunk`.
@@ -140,6 +150,12 @@ class DeployedPolicy:
         seen = self._checked(pictures, instruction, positions)
         if seen.instruction != self._follows:
             self._ahead.clear()
+            if self._averaged is not None:
+                self._averaged.reset()
+        if self._averaged is not None:
+            action = self._averaged.next(torch.from_numpy(self._predicted(seen)))
+            self._follows = seen.instruction
+            return action.numpy()
         if not self._ahead:
             self._ahead.extend(self._predicted(seen)[: self.replan])
             self._follows = seen.instruction
@@ -297,7 +313,11 @@ def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def load_policy(
-    run: str | Path, task: str | None = None, seed: int = 0, precision: str = devices.AUTO
+    run: str | Path,
+    task: str | None = None,
+    seed: int = 0,
+    precision: str = devices.AUTO,
+    ensemble: float | None = None,
 ) -> DeployedPolicy:
     """The policy of a run, on the GPU where there is one.
 
@@ -308,18 +328,22 @@ def load_policy(
         seed: seeds the noise that the flow begins with.
         precision: of matrix products, bf16 or float32; auto is bf16 on a GPU that multiplies in it,
             as training does there. What the policy answers is float32.
+        ensemble: decay of a temporal ensemble; None: as the policy was trained, which is without
+            one unless its recipe has `rollout.ensemble`.
 
     Raises:
-        AegisError: no run, files that are missing, broken or not of one checkpoint, or a task that
-            it has not learned.
+        AegisError: no run, files that are missing, broken or not of one checkpoint, a task that
+            it has not learned, or a decay that is not finite.
     """
+    if ensemble is not None:
+        temporal.check(ensemble)
     folder, device = Path(run), devices.pick()
     acts_in = devices.acting_precision(device, precision)
     if is_robot_stream_run(folder):
         found = robots.load_policy(folder, task)
         policy = found.policy.to(device)
         policy.acts_in = acts_in
-        return DeployedPolicy(policy, found.task, (), found.replan, seed)
+        return DeployedPolicy(policy, found.task, (), found.replan, seed, ensemble=ensemble)
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
@@ -333,6 +357,7 @@ def load_policy(
         seed,
         checkpoint.sizes_of(meta),
         meta,
+        meta.get("ensemble") if ensemble is None else ensemble,
     )
 
 

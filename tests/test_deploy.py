@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from samples.small_run import recipe
 from samples.training import images, make_policy
 
 from aegis_cli import load_policy, sim
@@ -18,8 +21,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.continual import robots
 from aegis_cli.continual.train import run as learn_stream
 from aegis_cli.deploy import DeployedPolicy
+from aegis_cli.evaluation import rollout
 from aegis_cli.publishing import card, export
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, train
 
 TEXT, OTHER, REPLAN = "go to the red target", "go to the blue target", 2
 POSITIONS = [0.3, -0.1, 0.2]
@@ -315,6 +319,63 @@ def test_an_observation_that_does_not_fit_is_one_error(given: Any, told: str) ->
         with pytest.raises(AegisError) as caught:
             policy.select_action(*given)
         assert told in str(caught.value)
+
+
+# --- a temporal ensemble --------------------------------------------------------------------------
+
+
+def test_an_ensemble_averages_what_was_predicted_for_each_step() -> None:
+    """By a naive sum over ACT's weights; another policy begins anew, and so does an episode."""
+    decay, steps = 0.3, 7
+    own, plain = deployed(ensemble=decay), deployed()
+    chunks = [plain.predict_action_chunk(frame(i % 3), TEXT, POSITIONS) for i in range(steps)]
+    for acting in (own, own.begin(), own):
+        acting.reset()
+        for step in range(steps):
+            found = acting.select_action(frame(step % 3), TEXT, POSITIONS)
+            first = max(0, step - own.chunk + 1)
+            told = [chunks[at][step - at].astype(np.float64) for at in range(first, step + 1)]
+            weights = [math.exp(-decay * i) for i in range(len(told))]
+            expected = sum(w * a for w, a in zip(weights, told, strict=True)) / sum(weights)
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+            assert found.dtype == np.float32
+    assert (own.replan, own.ensemble, plain.replan, plain.ensemble) == (1, decay, REPLAN, None)
+
+
+def test_another_instruction_begins_the_ensemble_anew() -> None:
+    own, other = deployed(ensemble=0.0), deployed()
+    chunks = [other.predict_action_chunk(frame(), text, POSITIONS) for text in (TEXT, TEXT, OTHER)]
+    for text in (TEXT, TEXT):
+        own.select_action(frame(), text, POSITIONS)
+    np.testing.assert_array_equal(own.select_action(frame(), OTHER, POSITIONS), chunks[2][0])
+
+
+def test_the_decay_of_a_run_is_its_recipes_or_the_one_asked_for(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    """Also after each export and back."""
+    chosen = recipe(tiny_folder, steps=2)
+    chosen = replace(chosen, rollout=replace(chosen.rollout, replan=1, ensemble=0.25))
+    train.run(chosen, "naive", demos_file, None, tmp_path / "run")
+    export.run(tmp_path / "run", tmp_path / "lerobot")
+    export.run(tmp_path / "lerobot", tmp_path / "back", card.AEGIS)
+    for folder in ("run", "lerobot", "back"):
+        assert load_policy(tmp_path / folder).ensemble == 0.25
+        asked = load_policy(tmp_path / folder, ensemble=0.5)
+        assert (asked.ensemble, asked.replan) == (0.5, 1)
+    config = json.loads((tmp_path / "lerobot" / "config.json").read_text())
+    assert (config["temporal_ensemble_coeff"], config["n_action_steps"]) == (0.25, 1)
+    report = rollout.run(tmp_path / "run", None, 1, "seen", keep=True)
+    kept = json.loads((tmp_path / "run/results/rollout-seen.json").read_text())
+    assert kept["settings"]["ensemble"] == 0.25 and report.episodes == 1
+
+
+def test_a_run_has_no_ensemble_by_itself(run_folder: Path) -> None:
+    own = load_policy(run_folder)
+    assert own.ensemble is None and own.replan > 1
+    assert load_policy(run_folder, ensemble=0.0).ensemble == 0.0
+    with pytest.raises(AegisError, match="decay nan"):
+        load_policy(run_folder, ensemble=math.nan)
 
 
 # --- precision ------------------------------------------------------------------------------------

@@ -37,6 +37,7 @@ from aegis_cli.cli.options import (
     Device,
     DropBelow,
     Dtype,
+    Ensemble,
     Episodes,
     Format,
     Gate,
@@ -829,6 +830,7 @@ def rollout(
             help="Seed of the episodes, none of which is a demonstration's.", callback=seed_number
         ),
     ] = 0,
+    ensemble: Ensemble = None,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     device: Device = None,
     as_json: Json = False,
@@ -855,6 +857,7 @@ def rollout(
         load=load_acting,
         seed=seed,
         keep=True,
+        ensemble=ensemble,
         device=device,
         as_json=as_json,
     )
@@ -952,6 +955,7 @@ def serve(
     precision: Annotated[
         Precision, Option(help="Of matrix products; auto is bf16 on a GPU that has it.")
     ] = Precision.auto,
+    ensemble: Ensemble = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -976,7 +980,7 @@ def serve(
         sys.stdout.flush()
 
     with stages.computing_on(device):
-        server.run(run, task, host, port, prompt, seed, precision, listening)
+        server.run(run, task, host, port, prompt, seed, precision, listening, ensemble)
 
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")

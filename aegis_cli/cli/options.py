@@ -321,6 +321,15 @@ OwnBatchSize = Annotated[
     int | None,
     Option(help=f"{_SAMPLES}; default: a run's own probe.batch_size, else 64.", callback=positive),
 ]
+Ensemble = Annotated[
+    float | None,
+    Option(
+        "--ensemble",
+        metavar="DECAY",
+        help="Temporal ensembling with this decay, as a recipe's rollout.ensemble; default: as the "
+        "policy was trained.",
+    ),
+]
 Rename = Annotated[
     list[str] | None,
     Option(

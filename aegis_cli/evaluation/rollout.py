@@ -16,6 +16,8 @@ from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
+from aegis_cli.core import ensemble as temporal
+from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import results
@@ -88,6 +90,7 @@ class _PlayedEpisode:
     env: TaskEnv
     observation: Observation
     moments: list[media.Moment] | None
+    ensemble: TemporalEnsemble | None = None
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -98,12 +101,16 @@ class _PlayedEpisode:
 
 
 class Acting(NamedTuple):
-    """A policy ready to act in a task; `replan` actions of each predicted chunk are executed."""
+    """A policy ready to act in a task; `replan` actions of each predicted chunk are executed.
+
+    `ensemble` is the decay of its temporal ensemble, which predicts at every step.
+    """
 
     policy: Policy
     task: str
     replan: int
     cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
+    ensemble: float | None = None
 
 
 Load = Callable[[Path, str | None], Acting]
@@ -117,7 +124,8 @@ def load_run(run: Path, task: str | None) -> Acting:
     """
     policy, meta = checkpoint.load_policy(run)
     cameras = checkpoint.cameras_of(meta, meta["task"] or task)
-    return Acting(policy, _task(policy, meta["task"], task), meta["replan"], cameras)
+    acts_in = _task(policy, meta["task"], task)
+    return Acting(policy, acts_in, meta["replan"], cameras, meta.get("ensemble"))
 
 
 def run(
@@ -132,6 +140,7 @@ def run(
     load: Load | None = None,
     seed: int = EVALUATION_SEED,
     keep: bool = False,
+    ensemble: float | None = None,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
@@ -142,11 +151,14 @@ def run(
         colors: one of TARGET_COLORS; a task without coloured targets has the default only.
         load: how the folder is read; default: `load_run`, which knows runs of one policy.
         keep: write the report into the run's folder.
+        ensemble: decay of a temporal ensemble; None: the policy's own, unless `replan` is given.
 
     Raises:
-        AegisError: no trained run, another task than the run's, colours it does not have, or zero
-            episodes.
+        AegisError: no trained run, another task than the run's, colours it does not have, zero
+            episodes, or a decay that is not finite.
     """
+    if ensemble is not None:
+        temporal.check(ensemble)
     if not 1 <= episodes <= _MOST:
         expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
         raise AegisError(f"{episodes} episodes", expected, "use --episodes 50")
@@ -154,7 +166,8 @@ def run(
         media.check_video(video_out)
     gl.check()
     asked = task
-    policy, task, planned, cameras = (load or load_run)(Path(run), asked)
+    policy, task, planned, cameras, own = (load or load_run)(Path(run), asked)
+    decay = own if ensemble is None and replan is None else ensemble
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
@@ -170,10 +183,12 @@ def run(
         on_event,
         seed,
         cameras,
+        decay,
     )
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
         settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
+        settings |= {} if decay is None else {"ensemble": decay}
         results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
     return report
 
@@ -189,8 +204,12 @@ def play(
     on_event: OnEvent = ignore,
     seed: int = EVALUATION_SEED,
     cameras: tuple[str, ...] = (),
+    ensemble: float | None = None,
 ) -> RolloutReport:
-    """Let a loaded policy act, as `run` does."""
+    """Let a loaded policy act, as `run` does.
+
+    With the decay of a temporal `ensemble` it predicts at every step, whatever `replan` is.
+    """
     started = time.perf_counter()
     finished: list[_PlayedEpisode] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
@@ -198,7 +217,9 @@ def play(
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         colored = TARGET_COLORS[colors]
-        group = [_begin(task, seed, stream, i, colored, i < clips, cameras) for i in numbers]
+        group = [
+            _begin(task, seed, stream, i, colored, i < clips, cameras, ensemble) for i in numbers
+        ]
         for _ in _play(policy, group, replan, first, seed):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
@@ -300,11 +321,13 @@ def _begin(
     colors: Sequence[str],
     filmed: bool,
     cameras: tuple[str, ...],
+    ensemble: float | None,
 ) -> _PlayedEpisode:
     env = sim.make(task, number=number, seen_by=cameras)
     observation = env.reset(episode_rng(seed, stream, number), colors)
     moments = [media.Moment(observation.image, "start")] if filmed else None
-    return _PlayedEpisode(env, observation, moments)
+    averaged = None if ensemble is None else TemporalEnsemble(ensemble)
+    return _PlayedEpisode(env, observation, moments, averaged)
 
 
 def _play(
@@ -316,8 +339,15 @@ def _play(
     while active := [e for e in group if not e.done]:
         chunks = _decide(policy, [e.observation for e in active], generator)
         for episode, chunk in zip(active, chunks, strict=True):
-            _execute(episode, chunk[:replan])
+            _execute(episode, _to_execute(episode.ensemble, chunk, replan))
         yield
+
+
+def _to_execute(ensemble: TemporalEnsemble | None, chunk: np.ndarray, replan: int) -> np.ndarray:
+    """The actions [*, A] until the next prediction: of a chunk [H, A], or of the ensemble's."""
+    if ensemble is None:
+        return chunk[:replan]
+    return ensemble.next(torch.from_numpy(chunk))[None].numpy()
 
 
 def _decide(

@@ -41,6 +41,7 @@ _SAID = (
     "method",
     "task",
     "replan",
+    "ensemble",
     "normalization",
     "relative",
     "cameras",
@@ -187,6 +188,7 @@ def _config(policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str]) -> 
         "normalization_mapping": _UNSCALED,
         "chunk_size": policy.expert.shape.chunk,
         "n_action_steps": meta["replan"],
+        **({"temporal_ensemble_coeff": meta["ensemble"]} if "ensemble" in meta else {}),
     }
 
 

@@ -40,6 +40,13 @@ def cross_checks(
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
         return
+    if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
+        yield Problem(
+            f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
+            f"{recipe.rollout.replan}",
+            "a prediction at every step",
+            "set rollout.replan to 1, or delete rollout.ensemble",
+        )
     if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")

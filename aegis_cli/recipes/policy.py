@@ -748,6 +748,13 @@ class Rollout:
         choice(*COLOR_SETS), COLOR_SETS, doc="Sets of colours that the targets are drawn from."
     )
     replan: int = key(POSITIVE, 4, doc="Actions that are executed before the next prediction.")
+    ensemble: float | None = key(
+        default=None,
+        later=True,
+        doc="Temporal ensembling as in ACT: an action is the mean of all chunks that predicted it, "
+        "weighted by exp(-ensemble * i), i = 0 for the oldest; ACT has 0.01. A chunk is predicted "
+        "at every step, so `replan` has to be 1. Null: chunks are executed as they are.",
+    )
 
 
 @section

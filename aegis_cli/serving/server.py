@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -24,7 +25,7 @@ from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.deploy import DeployedPolicy, load_policy
 from aegis_cli.serving import wire
-from aegis_cli.serving.observations import Reader
+from aegis_cli.serving.observations import Observation, Reader
 
 HEALTH = "/healthz"
 LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed pictures of a camera are a tenth of it
@@ -49,6 +50,7 @@ def run(
     seed: int,
     precision: str,
     on_ready: Callable[[Serving], None],
+    ensemble: float | None = None,
 ) -> None:
     """Serve a run's policy until a signal ends the process.
 
@@ -57,7 +59,7 @@ def run(
         port: 0 takes a free one.
         prompt: the instruction for observations without one.
         seed: seeds the noise of every connection alike.
-        precision: see `load_policy`.
+        precision, ensemble: see `load_policy`.
         on_ready: is told where, once the server listens.
 
     Raises:
@@ -69,7 +71,7 @@ def run(
         raise AegisError("an empty --host", "an address of this machine", "--host 127.0.0.1")
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
-    policy = load_policy(run, task, seed, precision)
+    policy = load_policy(run, task, seed, precision, ensemble=ensemble)
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:
@@ -158,6 +160,9 @@ class _Answering:
     async def _answer(self, policy: DeployedPolicy, message: str | bytes) -> dict[str, Any]:
         """Actions [H, A] for an observation, with the milliseconds that they took.
 
+        With a temporal ensemble they are [1, A], since each observation of a connection is the next
+        step.
+
         Raises:
             AegisError: a message that is no observation of this policy.
         """
@@ -168,12 +173,18 @@ class _Answering:
         async with self._turn:
             started = time.perf_counter()
             # In a thread, so that health checks and pings are answered meanwhile.
-            actions = await asyncio.to_thread(
-                policy.predict_action_chunk, seen.pictures, seen.prompt, seen.state
-            )
+            actions = await asyncio.to_thread(_actions, policy, seen)
             infer_ms = 1000 * (time.perf_counter() - started)
         return {
             "actions": actions,
             "policy_timing": {"infer_ms": infer_ms},
             "server_timing": {"infer_ms": infer_ms},
         }
+
+
+def _actions(policy: DeployedPolicy, seen: Observation) -> np.ndarray:
+    """The policy's chunk [H, A]; with a temporal ensemble the one action [1, A] of this step."""
+    given = (seen.pictures, seen.prompt, seen.state)
+    if policy.ensemble is None:
+        return policy.predict_action_chunk(*given)
+    return policy.select_action(*given)[None]

@@ -640,6 +640,8 @@ class PolicyRunner:
             "replan": settings.replan,
             "stream": stream,
         }
+        if settings.ensemble is not None:
+            key["ensemble"] = settings.ensemble
         if settings.seed != rollout.EVALUATION_SEED:  # what older records do not have
             key["seed"] = settings.seed
 
@@ -653,6 +655,7 @@ class PolicyRunner:
                 on_event=on_event,
                 stream=stream,
                 seed=settings.seed,
+                ensemble=settings.ensemble,
             )
             files.save_json(path, report.to_json())
             track.tell(recipe, path.parent, path.stem, report.to_json(), recipe.train.steps)

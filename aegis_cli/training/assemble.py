@@ -106,10 +106,11 @@ class TrainingRun:
 
         `task` is None for one that is not simulated; `cameras`, in their order, are there if they
         are several, or not the task's own; `stored`, the type that the backbone's weights came in,
-        if it is not float32; `relative`, for each action the place of the position that it is
-        predicted relative to, or None, if any is; `action_names`, `proprio_names` and `fps` as far
-        as the demonstrations say them; `action_std`, the actions' standard deviations, where the
-        policy's scale is another; `dataset`, their id or those of several, and `base_model`, that
+        if it is not float32; `ensemble`, the decay of its temporal ensemble, if it has one;
+        `relative`, for each action the place of the position that it is predicted relative to, or
+        None, if any is; `action_names`, `proprio_names` and `fps` as far as the demonstrations say
+        them; `action_std`, the actions' standard deviations, where the policy's scale is another;
+        `dataset`, their id or those of several, and `base_model`, that
         of the model that the backbone began as, if they come from the hub.
         """
         found = {
@@ -118,6 +119,8 @@ class TrainingRun:
             "replan": self.recipe.rollout.replan,
             "normalization": self.recipe.train.normalization,
         }
+        if self.recipe.rollout.ensemble is not None:
+            found["ensemble"] = self.recipe.rollout.ensemble
         found |= recipes.selected(self.recipe)
         found |= self.demos.recorded
         if self.policy.origins.places:

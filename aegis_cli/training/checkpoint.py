@@ -419,6 +419,9 @@ def _check_user_meta(meta: Mapping[str, Any]) -> None:
         raise ValueError(f"'rename' is {meta['rename']!r}")
     if "replan" in meta and meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
+    ensemble = meta.get("ensemble", 0.0)
+    if type(ensemble) not in (int, float) or not math.isfinite(ensemble):
+        raise ValueError(f"'ensemble' is {ensemble!r}")
     if meta.get("stored", FLOAT32) not in STORED_TYPES:
         raise ValueError(f"'stored' is {meta['stored']!r}")
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):

@@ -197,6 +197,57 @@ def test_replan_is_how_many_actions_of_a_chunk_are_executed(
     assert [len(env.shown) for env in envs] == [steps + 1] * 2
 
 
+@pytest.mark.parametrize(
+    ("asked", "own", "decay"), [(0.2, None, 0.2), (None, 0.4, 0.4), (-0.3, 0.4, -0.3)]
+)
+def test_an_ensemble_executes_the_mean_of_what_was_predicted(
+    asked: float | None,
+    own: float | None,
+    decay: float,
+    puppet: Callable[..., Puppet],
+    envs: list[Seen],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of several episodes by a naive sum over ACT's weights, one prediction a step."""
+    chunk, predicted, executed = 3, list[np.ndarray](), dict[int, list[np.ndarray]]()
+    draws = np.random.default_rng(0)
+    policy = puppet(rest, chunk=chunk)
+
+    def act(images: torch.Tensor, *_: Any) -> torch.Tensor:
+        predicted.append(draws.uniform(-0.2, 0.2, (len(images), chunk, 2)).astype(np.float32))
+        return torch.from_numpy(predicted[-1])
+
+    def step(self: Seen, action: np.ndarray, look: bool) -> Step:
+        executed.setdefault(envs.index(self), []).append(action)
+        return self.env.step(action)
+
+    monkeypatch.setattr(policy, "act", act)
+    monkeypatch.setattr(Seen, "step", step)
+    meta = {"task": "point", "replan": 1} | ({} if own is None else {"ensemble": own})
+    monkeypatch.setattr(checkpoint, "load_policy", lambda _: (policy, meta))
+    rollout.run(Path("any"), None, 2, "seen", ensemble=asked)
+    steps = len(predicted)
+    assert steps == 40 and [len(actions) for actions in executed.values()] == [steps] * 2
+    for number, actions in executed.items():
+        for at, found in enumerate(actions):
+            told = [predicted[t][number, at - t] for t in range(max(0, at - chunk + 1), at + 1)]
+            weights = np.exp(-decay * np.arange(len(told)))
+            expected = weights @ np.stack(told) / weights.sum()
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_replan_that_is_asked_for_executes_chunks_as_they_are(
+    puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = puppet(rest, chunk=40)
+    meta = {"task": "point", "replan": 1, "ensemble": 0.1}
+    monkeypatch.setattr(checkpoint, "load_policy", lambda _: (policy, meta))
+    rollout.run(Path("any"), None, 2, "seen", replan=20)
+    assert policy.calls == 2
+    with pytest.raises(AegisError, match="decay inf"):
+        rollout.run(Path("any"), None, 2, "seen", ensemble=float("inf"))
+
+
 def test_progress_and_more_episodes_than_one_group(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:

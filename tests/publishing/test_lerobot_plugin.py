@@ -17,6 +17,7 @@ from samples.training import make_policy, policy_over
 from torch import nn
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import checkpoint
@@ -249,3 +250,31 @@ def test_actions_that_are_not_finite_are_refused(plugin: Any) -> None:
     for act in (policy.select_action, policy.predict_action_chunk):
         with pytest.raises(AegisError, match="predicted numbers that are not finite"):
             act(seen(state=torch.full((1, 3), 1e30)))
+
+
+def test_an_ensemble_is_that_of_load_policy(plugin: Any, tmp_path: Path) -> None:
+    """Another text begins it anew, and a policy that is saved keeps it."""
+    own = DeployedPolicy(make_policy().eval(), None, (), 2, ensemble=0.1)
+    policy = acting(plugin)
+    policy.config.n_action_steps, policy.config.temporal_ensemble_coeff = 1, 0.1
+    policy.reset()
+    for text in (TEXT, TEXT, TEXT, OTHER, OTHER):
+        batch = seen(text)
+        picture = (batch[IMAGE][0].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+        expected = own.select_action(picture, text, batch["observation.state"][0].numpy())
+        torch.testing.assert_close(policy.select_action(batch)[0], torch.from_numpy(expected))
+    policy._save_pretrained(tmp_path)
+    meta = checkpoint.load_policy(tmp_path)[1]
+    assert (meta["ensemble"], meta["replan"]) == (0.1, 1)
+    policy.config.temporal_ensemble_coeff = None
+    policy._save_pretrained(tmp_path)
+    assert "ensemble" not in checkpoint.load_policy(tmp_path)[1]
+
+
+def test_an_ensemble_predicts_at_every_step(plugin: Any) -> None:
+    made = plugin.AegisConfig(temporal_ensemble_coeff=0.01, n_action_steps=1)
+    assert made.temporal_ensemble_coeff == 0.01
+    with pytest.raises(AegisError, match=r"0\.01 with n_action_steps 4"):
+        plugin.AegisConfig(temporal_ensemble_coeff=0.01)
+    with pytest.raises(AegisError, match="decay nan"):
+        plugin.AegisConfig(temporal_ensemble_coeff=math.nan, n_action_steps=1)

@@ -462,6 +462,7 @@ def test_every_key_says_what_it_means(kind):
         (PretrainRecipe, "model.heads=5"),
         (DualRecipe, "towers.heads=5"),
         (Recipe, "rollout.replan=9"),
+        (Recipe, "rollout.ensemble=0.01"),
     ],
 )
 def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):

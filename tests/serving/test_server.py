@@ -23,6 +23,7 @@ from websockets.exceptions import ConnectionClosed
 
 from aegis_cli import load_policy
 from aegis_cli.common.errors import AegisError
+from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.serving import server
 from aegis_cli.serving.server import Serving, listen
 
@@ -247,12 +248,46 @@ def test_what_would_answer_nobody_or_everybody_is_refused_before_it_listens(
 def test_the_policy_acts_in_the_precision_that_was_asked_for(
     precision: str, aegis: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def loaded(*given: Any) -> None:
+    def loaded(*given: Any, **_: Any) -> None:
         raise AegisError(f"loaded in {given[-1]}", "nothing", "no more")
 
     monkeypatch.setattr(server, "load_policy", loaded)
     words = () if precision == "auto" else ("--precision", precision)
     assert f"loaded in {precision}" in refused(aegis("serve", "run", *words))
+
+
+def test_a_temporal_ensemble_answers_with_the_one_action_of_a_step() -> None:
+    """Each connection has its own; a client that executes whole chunks executes that one."""
+    decay = 0.1
+    own, given = (
+        DeployedPolicy(make_policy().eval(), "reach", (), replan=2, ensemble=decay)
+        for _ in range(2)
+    )
+    plain = deployed()
+    with served(given) as serving:
+        metadata = serving.metadata
+        assert [metadata[key] for key in ("chunk", "replan", "ensemble")] == [1, 1, decay]
+        for _ in range(2):
+            own.reset()
+            with Client(serving.url) as client:
+                found = [client.infer(observation(seed))["actions"] for seed in range(5)]
+            for seed, actions in enumerate(found):
+                seen = observation(seed)
+                shown = (seen["observation/image"], seen["prompt"], seen["observation/state"])
+                np.testing.assert_array_equal(actions, own.select_action(*shown)[None])
+    np.testing.assert_array_equal(found[0][0], chunk(plain, observation(0))[0])
+    assert not np.allclose(found[1][0], chunk(plain, observation(1))[0])
+
+
+def test_the_decay_that_was_asked_for_is_the_policys(
+    aegis: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def loaded(*_: Any, ensemble: float | None) -> None:
+        raise AegisError(f"with {ensemble}", "nothing", "no more")
+
+    monkeypatch.setattr(server, "load_policy", loaded)
+    for words, told in (((), None), (("--ensemble", "0.01"), 0.01), (("--ensemble=-0.5",), -0.5)):
+        assert f"with {told}" in refused(aegis("serve", "run", *words))
 
 
 def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:

@@ -8,6 +8,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig, OptimizerConfig
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core import ensemble
 from lerobot_policy_aegis.optimizers_aegis import AegisKfacConfig, AegisNullspaceConfig
 
 METHODS = ("naive", "stop-gradient", "kfac", "nullspace")
@@ -30,6 +31,8 @@ class AegisConfig(PreTrainedConfig):
         expert_width, expert_mlp_ratio: of a new policy's action expert.
         chunk_size: H, actions that are predicted at once.
         n_action_steps: of which so many are executed.
+        temporal_ensemble_coeff: decay of a temporal ensemble, as ACT's; it predicts at every step,
+            so `n_action_steps` has to be 1. None: chunks are executed as they are.
         noise_seed: seeds the noise that the flow begins with, at every reset.
         flow_samples: flow times that are drawn per frame in training.
         method: how `lerobot-train` fine-tunes the backbone; kfac and nullspace need `anchor`.
@@ -43,6 +46,7 @@ class AegisConfig(PreTrainedConfig):
     expert_mlp_ratio: int = 4
     chunk_size: int = 8
     n_action_steps: int = 4
+    temporal_ensemble_coeff: float | None = None
     noise_seed: int = 0
 
     flow_samples: int = 8
@@ -64,6 +68,15 @@ class AegisConfig(PreTrainedConfig):
                 "at least 1, and at most the chunk",
                 f"--policy.n_action_steps={self.chunk_size}",
             )
+        if self.temporal_ensemble_coeff is not None:
+            ensemble.check(self.temporal_ensemble_coeff)
+            if self.n_action_steps != 1:
+                raise AegisError(
+                    f"temporal_ensemble_coeff {self.temporal_ensemble_coeff:g} with n_action_steps "
+                    f"{self.n_action_steps}",
+                    "a prediction at every step",
+                    "--policy.n_action_steps=1",
+                )
         if self.method not in METHODS:
             raise AegisError(
                 f"method '{self.method}'", f"one of {', '.join(METHODS)}", "--policy.method=naive"

@@ -18,6 +18,7 @@ from torch import Tensor
 from aegis_cli import methods
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
+from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
@@ -82,6 +83,8 @@ class AegisPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Begin episodes: forget the last prediction, and begin the flow's noise anew."""
         self._ahead: deque[Tensor] = deque()
+        decay = self.config.temporal_ensemble_coeff
+        self._averaged = None if decay is None else TemporalEnsemble(decay)
         self._follow: list[str] = []  # the texts that the actions ahead are of
         self._generator.manual_seed(self.config.noise_seed)
 
@@ -89,7 +92,9 @@ class AegisPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of each row, [B, A]; every `n_action_steps`-th call predicts.
 
-        Other texts than those of the chunk predict at once, and drop what is left of it.
+        With a temporal ensemble each call predicts, and the action is the mean of what the calls so
+        far have predicted for it. Other texts than those of the chunk predict at once, and drop
+        what is left of earlier ones.
 
         Raises:
             AegisError: what `predict_action_chunk` finds wrong with texts and state, or a picture
@@ -103,6 +108,12 @@ class AegisPolicy(PreTrainedPolicy):
                 _check_picture(name, batch[name])
         if texts != self._follow:
             self._ahead.clear()
+            if self._averaged is not None:
+                self._averaged.reset()
+        if self._averaged is not None:
+            action = self._averaged.next(self.predict_action_chunk(batch, **kwargs))
+            self._follow = texts
+            return action
         if not self._ahead:
             chunk = self.predict_action_chunk(batch, **kwargs)
             self._ahead.extend(chunk[:, : self.config.n_action_steps].unbind(1))
@@ -202,12 +213,15 @@ class AegisPolicy(PreTrainedPolicy):
                 "train without FSDP",
             )
         self.config._save_pretrained(save_directory)
+        known = {name: value for name, value in self._meta.items() if name != "ensemble"}
+        if self.config.temporal_ensemble_coeff is not None:
+            known["ensemble"] = self.config.temporal_ensemble_coeff
         meta = {
             "method": self.config.method,
             "replan": self.config.n_action_steps,
             "cameras": [_short(name) for name in self._cameras],
         }
-        lerobot_folder.write_model(Path(save_directory), self.model, {**self._meta, **meta})
+        lerobot_folder.write_model(Path(save_directory), self.model, {**known, **meta})
 
     @classmethod
     def from_pretrained(
