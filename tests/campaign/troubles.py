@@ -99,7 +99,12 @@ def overwritten_input(case: Case) -> Outcome:
         file.write(case.rng.randbytes(64))
     ended = child.wait()
     problem = case.fails(ended)
-    if not problem and ended.code == 0 and not done and contents(case.place / "new", case.place) != case.whole:
+    if (
+        not problem
+        and ended.code == 0
+        and not done
+        and contents(case.place / "new", case.place) != case.whole
+    ):
         problem = "other files without an error"
     return name, ended.code, problem
 
