@@ -39,6 +39,7 @@ pytest_plugins = [
     "samples.lerobot",
     "samples.merges",
     "samples.nullspace",
+    "samples.processes",
     "samples.robots",
     "samples.streams",
     "samples.training_runs",

@@ -1,4 +1,4 @@
-"""Processes of a test that find torch, and what trains, imported."""
+"""Processes of a test that find torch, and what trains, imported; and worker processes that do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import multiprocessing
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from torch.multiprocessing import start_processes
+
+from aegis_cli.common import processes
 
 # Each of them would take four seconds to import this. The process that they are forked from does
 # so once; it has neither threads nor a graphics context.
@@ -29,3 +32,13 @@ def start(function: Callable[..., object], args: tuple[Any, ...], count: int) ->
     """
     multiprocessing.set_forkserver_preload(list(IMPORTED))
     start_processes(function, args, nprocs=count, start_method="forkserver")
+
+
+@pytest.fixture
+def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes that start at once, where a test looks at what they find alone."""
+    from aegis_cli.studies import cells  # which the fast tests have no need of
+
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    for module in (processes, cells):
+        monkeypatch.setattr(module, "SPAWN", multiprocessing.get_context("forkserver"))
