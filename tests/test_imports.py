@@ -160,6 +160,18 @@ assert not heavy, heavy
     assert done.returncode == 0 and done.stdout, done.stdout + done.stderr
 
 
+def test_a_model_is_read_without_torchs_compiler() -> None:
+    """Its import takes as long as that of all the rest of torch."""
+    program = """
+import sys
+from aegis_cli.models import backbones
+backbones.load('embedded')
+assert 'torch._dynamo' not in sys.modules
+"""
+    done = run(program)
+    assert done.returncode == 0, done.stderr
+
+
 def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """A Python program in a process of its own."""
     command = [sys.executable, "-c", program, *arguments]

@@ -118,10 +118,11 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
-    header = replace(header, digest=_digest(asdict(header), plain))
-    text = canonical(asdict(header))
+    fields = asdict(header)
+    digest = _digest(fields, plain)
+    text = canonical(fields | {"digest": digest})
     write_atomically(Path(path), lambda file: _write_safetensors(file, plain, text))
-    return header
+    return replace(header, digest=digest)
 
 
 def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None = None) -> Artifact:

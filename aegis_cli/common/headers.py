@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from safetensors import SafetensorError, safe_open
-
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import (
     RENAME,
@@ -25,6 +23,7 @@ from aegis_cli.common.files import (
 from aegis_cli.common.kinds import KINDS, quoted
 
 if TYPE_CHECKING:
+    from safetensors import safe_open
     from torch import Tensor
 
 
@@ -100,6 +99,8 @@ def opened(
         AegisError: it is missing, truncated or no safetensors file, or its path is no text
             and its tensors are read for torch.
     """
+    from safetensors import SafetensorError, safe_open  # which --help has no need of
+
     fix = rewrite(kind)
     try:
         with reading(path, fix), safe_open(path, framework=framework) as file:

@@ -7,13 +7,14 @@ and an optimizer writes outside a state that is smaller than its parameter.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.kinds import describe, quoted
@@ -118,6 +119,22 @@ def check_heads(width: int, heads: int) -> None:
         raise ValueError(f"a width of {width} for {heads} heads")
 
 
+class _NothingDrawn(TorchFunctionMode):
+    """Tables are left as they are; torch would import its compiler to draw what has no memory."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func is nn.init.normal_:
+            return args[0] if args else kwargs["tensor"]
+        return func(*args, **kwargs)
+
+
 @contextlib.contextmanager
 def outline(path: Path) -> Iterator[None]:
     """Make modules inside the block without memory, to compare a file with them before it is used.
@@ -127,7 +144,7 @@ def outline(path: Path) -> Iterator[None]:
     """
     with reading_meta(path):
         try:
-            with torch.device("meta"):
+            with torch.device("meta"), _NothingDrawn():
                 yield
         except RuntimeError as error:
             raise ValueError(str(error)) from error

@@ -32,8 +32,9 @@ def main() -> int:
     if not (options.mutations or options.kills or options.troubles or options.one):
         return _report(options)
     with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
-        root = world.build(Path(folder) / "world")
-        warm.up(root)
+        root = world.begin(Path(folder) / "world")
+        warm.up(root)  # before the commands of the world too, which are as many as those of cases
+        world.finish(root)
         chosen = [each for each in subjects.SUBJECTS if options.only in each.name]
         chosen = chosen or list(subjects.SUBJECTS)
         cases = subjects.Cases(root, Path(folder) / "mutations", options.seed, chosen)

@@ -167,6 +167,6 @@ def output(place: Path) -> dict[str, str]:
     """What a command has left beside the world, but for pages with their times."""
     return {
         name: digest
-        for name, digest in contents(place).items()
+        for name, digest in contents(place, place).items()
         if name.startswith("new") and not name.endswith((".html", ".md"))
     }

@@ -237,7 +237,7 @@ class Cases:
             whole, tree = self._undamaged(subject, file)
             if figures(ended.out) != figures(whole.out):
                 return f"other output without an error: {ended.out[-2000:]}"
-            found = contents(place / subject.writes) if subject.writes else {}
+            found = contents(place / subject.writes, place) if subject.writes else {}
             other = {name for name in tree | found if tree.get(name) != found.get(name)}
             # What was damaged where nothing is read is still there.
             damaged = (self._root / file).resolve().relative_to(self._root.resolve())
@@ -253,7 +253,7 @@ class Cases:
             ended = forks.run(subject.args, place)
             if ended.code:
                 raise RuntimeError(f"{subject.name}: {ended.code}\n{ended.err}")
-            tree = contents(place / subject.writes) if subject.writes else {}
+            tree = contents(place / subject.writes, place) if subject.writes else {}
             shutil.rmtree(place)
             self._whole[subject] = ended, tree
         return self._whole[subject]
@@ -316,15 +316,20 @@ def figures(out: str) -> Any:
         return out
 
 
-def contents(folder: Path) -> dict[str, str]:
-    """Every file below a folder by its digest, links by their targets."""
+def contents(folder: Path, place: Path) -> dict[str, str]:
+    """Every file below a folder by its digest, links by their targets.
+
+    Args:
+        place: the folder of the case, whose own path in a JSON file makes no difference.
+    """
     found = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
         if path.is_symlink():
             found[name] = f"-> {os.readlink(path)}"
         elif path.suffix in (".json", ".jsonl") and path.is_file():
-            lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
+            text = path.read_text().replace(str(place), "PLACE")
+            lines = text.splitlines() if path.suffix == ".jsonl" else [text]
             found[name] = json.dumps([_timeless(json.loads(line)) for line in lines])
         elif path.is_file():
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -83,7 +83,7 @@ def two_writers(case: Case) -> Outcome:
     problem = case.fails(ended) or case.fails(second)
     if not problem and sorted((ended.code, second.code)) != [0, 2]:
         problem = f"exit {ended.code} and {second.code}: {ended.err} {second.err}"
-    if not problem and contents(case.place / "new") != case.whole:
+    if not problem and contents(case.place / "new", case.place) != case.whole:
         problem = "other files than those of one training"
     return "train", second.code, problem
 
@@ -99,7 +99,12 @@ def overwritten_input(case: Case) -> Outcome:
         file.write(case.rng.randbytes(64))
     ended = child.wait()
     problem = case.fails(ended)
-    if not problem and ended.code == 0 and not done and contents(case.place / "new") != case.whole:
+    if (
+        not problem
+        and ended.code == 0
+        and not done
+        and contents(case.place / "new", case.place) != case.whole
+    ):
         problem = "other files without an error"
     return name, ended.code, problem
 
@@ -124,7 +129,7 @@ def touched_input(case: Case) -> Outcome:
         os.utime(case.place / world.ANCHOR)
     ended = child.wait()
     problem = case.fails(ended) or (f"exit {ended.code}: {ended.err}" if ended.code else "")
-    if not problem and contents(case.place / "new") != case.whole:
+    if not problem and contents(case.place / "new", case.place) != case.whole:
         problem = "other files"
     return "both", ended.code, problem
 
@@ -142,7 +147,7 @@ def full_disk(case: Case) -> Outcome:
     if not problem:
         again = forks.run([*_TRAIN, "--out", "kept", "--resume"], case.place)
         problem = case.fails(again) or (f"exit {again.code}: {again.err}" if again.code else "")
-        if not problem and contents(kept) != case.whole:
+        if not problem and contents(kept, case.place) != case.whole:
             problem = "other files after going on"
     return f"{room} bytes, {how}", ended.code, problem
 
@@ -238,7 +243,7 @@ class Cases:
             ended = forks.run([*_TRAIN, "--out", "new"], place)
             if ended.code:
                 raise RuntimeError(ended.err)
-            self._undisturbed = contents(place / "new"), time.monotonic() - started
+            self._undisturbed = contents(place / "new", place), time.monotonic() - started
             shutil.rmtree(place)
         return self._undisturbed
 

@@ -1,4 +1,7 @@
-"""Commands run once in this process, so that forked children find what they need imported."""
+"""Commands run once in this process, so that forked children find what they need imported.
+
+What takes longest is imported here: torch does so itself where the first optimizer is made.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,9 @@ import io
 import shutil
 from pathlib import Path
 
+import datasets  # noqa: F401
+import pyarrow.parquet  # noqa: F401
+import torch._dynamo  # noqa: F401
 import typer.main
 from campaign import world
 
@@ -14,10 +20,11 @@ from aegis_cli.cli.app import app
 
 
 def up(root: Path) -> None:
-    """Run commands that render nothing: a graphics context would not survive a fork."""
-    import datasets  # noqa: F401
-    import pyarrow.parquet  # noqa: F401
+    """Run commands that render nothing: a graphics context would not survive a fork.
 
+    Args:
+        root: a world that has begun.
+    """
     command = typer.main.get_command(app)
     typer.main.get_command = lambda _: command  # it takes longer to make than most cases
     asked = ("--vqa", world.ASKED, "--questions", "14")
@@ -26,7 +33,6 @@ def up(root: Path) -> None:
         ("inspect", "warm"),
         ("evaluate", "warm", "--demos", world.DEMOS, "--frames", "4"),
         ("probe", "model", *asked),
-        ("inspect", "stream"),
         ("inspect", "dataset"),
         ("inspect", world.RECIPE),
     )

@@ -41,11 +41,19 @@ class Enough(Exception):
     """Ends a training that is to go on later."""
 
 
-def build(root: Path) -> Path:
-    """Make everything below `root`; the work is done in children, which leave nothing behind."""
+def begin(root: Path) -> Path:
+    """Make the files below `root` that every command reads.
+
+    The work is done in children, which leave nothing behind.
+    """
     root.mkdir(parents=True, exist_ok=True)
     for make in (_model_and_demos, _recipes, _anchor, _questions, _dataset):
         forks.call(make, root)
+    return root
+
+
+def finish(root: Path) -> None:
+    """Make what commands leave, finished and in progress, in children too."""
     _done(root, "train", RECIPE, *TRAIN, "--out", "run")
     _done(root, "export", "run", "--format", "lerobot", "--out", "exported")
     _done(root, "train", "stream.yaml", "--out", "stream")
@@ -53,7 +61,6 @@ def build(root: Path) -> Path:
     _done(root, "run", "study.yaml", "--out", "studies")
     forks.call(_run_in_progress, root)
     forks.call(_stream_in_progress, root)
-    return root
 
 
 def _done(root: Path, *args: object) -> None:

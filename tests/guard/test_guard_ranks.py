@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from samples import processes
 from samples.guard import (
     IMAGE,
     LAYERS,
@@ -25,7 +26,7 @@ from samples.ranks import (
     lack_one,
     train_together,
 )
-from torch import Tensor, multiprocessing
+from torch import Tensor
 
 from aegis_cli import Guard
 
@@ -52,7 +53,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, P
     """A folder of what two processes have trained, and the anchors."""
     folder = tmp_path_factory.mktemp("trained")
     paths = anchors_by_method(folder)
-    multiprocessing.spawn(train_together, args=(str(folder), paths), nprocs=WORLD)
+    processes.start(train_together, (str(folder), paths), WORLD)
     return folder, paths
 
 
@@ -110,8 +111,8 @@ def test_sharded_gradients_may_be_summed_by_the_last_of_a_steps_passes(
 
 
 def test_norms_of_a_familys_own_class_are_known_where_they_are_sharded(tmp_path: Path) -> None:
-    multiprocessing.spawn(know_sharded_norms, args=(str(tmp_path),), nprocs=WORLD)
+    processes.start(know_sharded_norms, (str(tmp_path),), WORLD)
 
 
 def test_a_gradient_that_one_process_lacks_counts_as_zero_there(tmp_path: Path) -> None:
-    multiprocessing.spawn(lack_one, args=(str(tmp_path),), nprocs=WORLD)
+    processes.start(lack_one, (str(tmp_path),), WORLD)

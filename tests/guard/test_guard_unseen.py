@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from samples import processes
 from samples.guard import (
     LAYERS,
     Block,
@@ -20,7 +21,7 @@ from samples.guard import (
     vector,
 )
 from samples.ranks import WORLD, shard_under_a_guard
-from torch import Tensor, multiprocessing, nn
+from torch import Tensor, nn
 
 from aegis_cli import Guard
 from aegis_cli.common import devices
@@ -69,7 +70,7 @@ def test_sharded_weights_before_and_after_the_guard(
     anchors: dict[str, Path], tmp_path: Path
 ) -> None:
     """FSDP2 puts others in the place of the parameters; a guard would see no gradient of theirs."""
-    multiprocessing.spawn(shard_under_a_guard, args=(str(tmp_path), anchors), nprocs=WORLD)
+    processes.start(shard_under_a_guard, (str(tmp_path), anchors), WORLD)
 
 
 def replace(model: Vlm) -> None:

@@ -185,6 +185,12 @@ def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -
     assert seen == [(1, sum(len(words) + 1 for words in said))]
 
 
+@pytest.fixture(scope="module")
+def said_plainly(hf_backbone: Loaded) -> Callable[[str], list[str]]:
+    """What a family's untouched model answers; asked once."""
+    return cache(lambda family: hf_backbone(family).answer(images(4), TEXTS))
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(
     "own",
@@ -197,10 +203,13 @@ def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -
     ],
 )
 def test_a_models_own_ways_to_generate_change_no_answer(
-    own: dict[str, float], backbone: HFBackbone
+    own: dict[str, float],
+    family: str,
+    backbone: HFBackbone,
+    said_plainly: Callable[[str], list[str]],
 ) -> None:
     """An answer is the likeliest, or what is scored would be another than what is said."""
-    plain = backbone.answer(images(4), TEXTS)
+    plain = said_plainly(family)
     config = backbone.vlm.generation_config
     before = {name: getattr(config, name) for name in own}
     config.update(**own)

@@ -14,7 +14,6 @@ from typing import Protocol
 
 import pytest
 import torch
-from torch import multiprocessing
 
 from aegis_cli.anchors import measure
 from aegis_cli.cli.app import app
@@ -25,6 +24,7 @@ from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import dry_run, train
+from samples import processes
 
 
 class Runnable(Protocol):
@@ -203,7 +203,7 @@ def share(job: Leading, number: int, on_event: OnEvent, twice: bool) -> int:
 
 def run_together(count: int, jobs: Sequence[Runnable]) -> None:
     """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
-    multiprocessing.spawn(_run, args=(count, jobs, free_ports(len(jobs))), nprocs=count)
+    processes.start(_run, (count, jobs, free_ports(len(jobs))), count)
 
 
 def _run(rank: int, count: int, jobs: Sequence[Runnable], ports: Sequence[int]) -> None:

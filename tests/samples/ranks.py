@@ -1,4 +1,4 @@
-"""What the processes of a distributed test run; a spawned process finds these by their module."""
+"""What the processes of a distributed test run; each finds these by their module."""
 
 from __future__ import annotations
 

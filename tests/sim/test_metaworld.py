@@ -147,6 +147,7 @@ def test_random_actions_do_not_succeed() -> None:
 # --- demonstrations -------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_demonstrations_of_a_set_are_the_same_by_any_number_of_processes(tmp_path: Path) -> None:
     paths = [tmp_path / f"{workers}.safetensors" for workers in (1, 2)]
     reports = [record.run(SET, 5, 0, path, workers=i + 1) for i, path in enumerate(paths)]

@@ -190,6 +190,7 @@ def test_a_finished_study_is_told_shown_and_not_run_again(
     assert code == 0 and "Study of a robot stream" in page and "sequential: task by task" in page
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_processes_find_what_one_finds(
     finished: tuple[Any, Path, list[Path]], tiny_folder: Path, tmp_path: Path
 ) -> None:

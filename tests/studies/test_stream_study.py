@@ -284,6 +284,7 @@ def _on_validation(points: list[dict[str, Any]], folder: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variants = {
         "zero-shot": VARIANTS["zero-shot"],

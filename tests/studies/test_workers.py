@@ -42,6 +42,7 @@ def small(tiny_folder: Path, tmp_path: Path) -> StudyRecipe:
     return study(tmp_path, tiny_folder, variants=VARIANTS, tuning=None, seeds=[0])
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_processes_find_what_one_finds(small: StudyRecipe, tmp_path: Path) -> None:
     alone = stage.run(small, tmp_path / "alone")
     events: list[Progress] = []

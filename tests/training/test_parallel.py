@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from samples import processes
 from samples.parallel_runs import Job, Measuring, free_ports, lose_one, run_together
 from samples.training_runs import TIMES, metrics
 from torch import multiprocessing
@@ -300,7 +301,7 @@ def test_all_wait_until_a_checkpoint_is_written(
 
 
 def test_a_process_that_is_gone_is_one_error() -> None:
-    multiprocessing.spawn(lose_one, args=(2, *free_ports(1)), nprocs=2)
+    processes.start(lose_one, (2, *free_ports(1)), 2)
 
 
 @pytest.mark.parametrize("accumulate", [1, 2, 3])

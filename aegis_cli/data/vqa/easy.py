@@ -48,11 +48,11 @@ def _read() -> Iterator[Read]:
         "test": (easy_vqa.get_test_questions, easy_vqa.get_test_image_paths),
     }
     for split, (questions, image_paths) in sources.items():
-        paths = image_paths()
+        paths = {image: Path(path) for image, path in image_paths().items()}
         for number, (text, answer, image) in enumerate(zip(*questions(), strict=True)):
             where = f"{NAME} {split}, question {number}"
             question = make_question(where, text, [answer], f"{split}-{number}", family(text))
-            yield Entry(where, question, Picture(f"{split}/{image}", where, Path(paths[image])))
+            yield Entry(where, question, Picture(f"{split}/{image}", where, paths[image]))
 
 
 def is_test(key: str) -> bool:

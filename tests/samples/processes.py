@@ -1,0 +1,44 @@
+"""Processes of a test that find torch, and what trains, imported; and worker processes that do."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from torch.multiprocessing import start_processes
+
+from aegis_cli.common import processes
+
+# Each of them would take four seconds to import this. The process that they are forked from does
+# so once; it has neither threads nor a graphics context.
+IMPORTED = (
+    "pytest",
+    "torch._dynamo",
+    "torch.distributed.fsdp",
+    "transformers",
+    "aegis_cli.cli.app",
+    "aegis_cli.studies.pipeline",
+)
+
+
+def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
+    """Let `count` processes call a function with their number and `args`; wait for their end.
+
+    Raises:
+        ProcessExitedException, ProcessRaisedException: one of them has failed; the others are
+            ended.
+    """
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    start_processes(function, args, nprocs=count, start_method="forkserver")
+
+
+@pytest.fixture
+def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes that start at once, where a test looks at what they find alone."""
+    from aegis_cli.studies import cells  # which the fast tests have no need of
+
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    for module in (processes, cells):
+        monkeypatch.setattr(module, "SPAWN", multiprocessing.get_context("forkserver"))
