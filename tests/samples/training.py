@@ -164,7 +164,7 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
     return method.start(
         Setting(
             backbone,
-            backbone.parameter_groups(),
+            backbone.learning_groups(),
             sites,
             options,
             anchor or make_anchor(),

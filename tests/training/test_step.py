@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from samples.training import (
     same_bits,
     snapshot_gradients,
 )
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.core import projection
@@ -209,14 +210,20 @@ def test_an_anchor_that_is_met_exactly_changes_nothing() -> None:
 
 
 def test_a_frozen_part_is_left_alone() -> None:
-    """The projection works over what learns: a frozen layer has zero rows and no gradient."""
-    policy = adapt(AEGIS, make_policy())
-    policy.backbone.layers[0].requires_grad_(False)
-    row = gradients(policy, AEGIS).row
-    i = list(policy.backbone.parameter_groups()).index("layers.0")
-    assert row.tt[i] == row.ta[i] == row.aa[i] == 0
+    """The projection works over what learns: a frozen layer has no row and no gradient."""
+
+    def all_but_a_layer(backbone: nn.Module, *_: Any) -> None:
+        backbone.requires_grad_(True)
+        backbone.layers[0].requires_grad_(False)
+
+    method = replace(AEGIS, adapt=all_but_a_layer)
+    policy = adapt(method, make_policy())
+    row = gradients(policy, method).row
+    learning, every = policy.backbone.learning_groups(), policy.backbone.parameter_groups()
+    assert [name for name in every if name not in learning] == ["layers.0"]
+    assert len(row.tt) == len(row.ta) == len(row.aa) == len(learning)
     assert all(p.grad is None for p in policy.backbone.layers[0].parameters())
-    assert row.aa[i + 1] > 0
+    assert row.aa[list(learning).index("layers.1")] > 0 and len(row.w2) == 2
 
 
 def test_any_combination_is_a_line() -> None:
