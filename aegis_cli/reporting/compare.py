@@ -18,6 +18,7 @@ from aegis_cli.reporting import differences
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
+from aegis_cli.training.up_to_date import refuse_unfinished
 
 Interval = tuple[float, float] | None
 _Named = tuple[Any, results.Result]  # by what two runs' results are compared
@@ -173,6 +174,7 @@ def _runs(path: Path) -> Iterator[Path]:
             yield from table.runs(found)
             return
     if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
+        refuse_unfinished(path, "compare")
         raise AegisError(
             f"'{path}' is no run of a policy",
             "folders that aegis train wrote, or one that aegis run made of a recipe",

@@ -27,6 +27,7 @@ from aegis_cli.studies.comparison import (
 )
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
+from aegis_cli.training.up_to_date import refuse_unfinished
 
 _VIDEOS = (".mp4", ".gif", ".webm")
 
@@ -165,6 +166,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         repeat = _command("aegis", "train", path / "recipe.yaml", "--out", "NEW_FOLDER")
         return StreamDocument(found.kind, str(path), found.report, [repeat])
     if not (path / "recipe.yaml").is_file():
+        refuse_unfinished(path, "report")
         inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
         inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
         example = next(iter(inside), "runs/quickstart")

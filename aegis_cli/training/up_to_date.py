@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from aegis_cli import recipes
-from aegis_cli.common import files
+from aegis_cli.common import commands, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.version import __version__
 from aegis_cli.data import record
 from aegis_cli.recipes import Demos
 
+SHARED = "stages.json"  # the records of what the runs of a folder share
 BEGUN = "begun"  # the stage of a run that has been started, finished or not
 
 
@@ -23,6 +24,25 @@ def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def refuse_unfinished(folder: Path, command: str) -> None:
+    """Raise AegisError for the folder of a job that has not come to its table yet.
+
+    Args:
+        command: which wants to tell of it, and can tell of its runs.
+    """
+    if not (folder / SHARED).is_file():
+        return
+    runs = sorted(path.parent for path in folder.glob("*/recipe.yaml"))
+    fix = "call the same aegis run again, which goes on"
+    if runs:
+        fix += f"; meanwhile one of its runs: {commands.aegis(command, *runs[:1])}"
+    raise AegisError(
+        f"'{folder}' is what aegis run has not finished: no table of all methods is there yet",
+        "a finished job, or a run",
+        fix,
+    )
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -149,7 +169,7 @@ class StageRecords:
         return self._of(stage.rpartition("/")[0]).get(stage, {})
 
     def _path(self, label: str) -> Path:
-        return self.folder / "stages" / f"{label}.json" if label else self.folder / "stages.json"
+        return self.folder / "stages" / f"{label}.json" if label else self.folder / SHARED
 
     def _hashes(self, outputs: list[Path]) -> dict[str, str]:
         """sha256 of each output that exists; a missing one makes the difference."""

@@ -233,6 +233,15 @@ def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
     assert "no run, job or study" in said
 
 
+def test_a_job_that_is_not_finished_says_so(aegis, job: Path) -> None:
+    (job / "table.json").unlink()
+    (job / "stages.json").write_text("{}")
+    for command in ("report", "compare"):
+        said = refused(aegis(command, job))
+        assert "has not finished" in said and "call the same aegis run again" in said
+        assert f"aegis {command} {job / 'aegis'}" in said
+
+
 @pytest.mark.parametrize(
     ("name", "changed"),
     [
