@@ -385,7 +385,7 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
     method: str, number: int, done: Done
 ) -> None:
     report, out = done(method)
-    policy, task, replan, _ = robots.load_policy(out, report.tasks[number])
+    policy, task, replan, *_ = robots.load_policy(out, report.tasks[number])
     run = robots.load_to_act(out)
     assert (task, replan) == (report.tasks[number], 4)
     proprio = torch.randn(2, SIZES[task], generator=torch.Generator().manual_seed(1))
