@@ -867,13 +867,14 @@ def rollout(
 def evaluate(
     run: PolicyArg,
     demos: Annotated[
-        Path,
+        Path | None,
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub.",
+            help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
+            "default: those that the run learned from.",
         ),
-    ],
+    ] = None,
     episodes: Annotated[
         str | None,
         Option(
@@ -904,7 +905,7 @@ def evaluate(
     run keeps the figures.
 
     \b
-    Example: aegis evaluate runs/x --demos reach.safetensors --plot actions.png
+    Example: aegis evaluate runs/x --plot actions.png
     Example: aegis evaluate runs/x --demos datasets/arm --episodes 40-49
     """
     if plot is not None:
@@ -913,7 +914,7 @@ def evaluate(
     chosen = listed_episodes(episodes)
     report = stages.EVALUATE.run(
         run,
-        demos,
+        demos or resuming.demonstrations_of(run),
         chosen,
         frames,
         seed,

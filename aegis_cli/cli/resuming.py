@@ -79,36 +79,63 @@ def inputs_of(
             f"name all of them: {commands.aegis('train', run, *_options(kept.demos))}",
         )
     if anchor is None and kept.anchor is not None:
-        anchor = _there(run, kept.anchor, "anchor", ["--anchor", "FILE"])
+        again = commands.aegis("train", run, "--anchor", "FILE")
+        anchor = _there(run, kept.anchor, "anchor", again)
     return list(demos), anchor
+
+
+def demonstrations_of(run: Path) -> Path:
+    """The demonstrations that a run learned from, for `aegis evaluate` that is given none.
+
+    Raises:
+        AegisError: they are not known, are no longer there, or are several sets.
+    """
+    from aegis_cli.evaluation import results
+    from aegis_cli.training import inputs
+
+    home = results.run_of(run)
+    kept = None if home is None else inputs.of(home)
+    if kept is None:
+        raise AegisError(
+            f"no --demos for '{run}', which does not say where those of its training lie",
+            "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",
+            f"name them: {commands.aegis('evaluate', run, '--demos', 'PATH')}",
+        )
+    if len(kept.demos) > 1:
+        raise AegisError(
+            f"no --demos for '{run}', which learned from {len(kept.demos)} sets",
+            f"one of {', '.join(kept.demos)}",
+            f"evaluate on each: {commands.aegis('evaluate', run, '--demos', kept.demos[0])}",
+        )
+    again = commands.aegis("evaluate", run, "--demos", "PATH")
+    return _there(run, kept.demos[0], "demonstrations", again)
 
 
 def _all_there(run: Path, places: Sequence[str]) -> list[Path]:
     """The recorded sets of demonstrations, if something is there of each."""
+    from aegis_cli.training.inputs import is_gone
+
     # The command names all sets, for those that are given are all that the run goes on with.
-    options = _options("PATH" if _gone(place) else place for place in places)
-    return [_there(run, place, "demonstrations", options) for place in places]
+    options = _options("PATH" if is_gone(place) else place for place in places)
+    again = commands.aegis("train", run, *options)
+    return [_there(run, place, "demonstrations", again) for place in places]
 
 
 def _options(places: Iterable[str]) -> list[str]:
     return [word for place in places for word in ("--demos", place)]
 
 
-def _there(run: Path, place: str, what: str, options: Sequence[str]) -> Path:
-    """A recorded place, if something is there."""
-    if _gone(place):
+def _there(run: Path, place: str, what: str, again: str) -> Path:
+    """A recorded place, if something is there; else `again` is the command that names another."""
+    from aegis_cli.training.inputs import is_gone
+
+    if is_gone(place):
         raise AegisError(
             f"'{place}' is gone, the {what} of the run in '{run}'",
             "what the run was begun with",
-            f"bring it back, or say where it lies now: {commands.aegis('train', run, *options)}",
+            f"bring it back, or say where it lies now: {again}",
         )
     return Path(place)
-
-
-def _gone(place: str) -> bool:
-    """Whether nothing is there; the id of a dataset is the hub's to find."""
-    path = Path(place)
-    return path.is_absolute() and not path.exists()
 
 
 def _no_anchor(run: Path) -> None:

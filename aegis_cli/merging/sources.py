@@ -35,6 +35,7 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import STORED_TYPES, Backbone
 from aegis_cli.training import assemble, checkpoint, train
 from aegis_cli.training import folder as run_folder
+from aegis_cli.training import inputs as places
 
 _CARD = """# `{method}` merge of strength {strength:g}
 
@@ -186,7 +187,10 @@ class PolicyRun:
         return found
 
     def _find_demos(self, wanted: str) -> Paths:
-        """The recipe's demonstrations, or a file beside the run, where `aegis run` puts it."""
+        """Where the run has learned from them, where its recipe says, or a file beside it."""
+        kept = places.of(self._run)
+        if kept is not None and not any(map(places.is_gone, kept.demos)):
+            return tuple(map(Path, kept.demos))
         if self._recipe.demos.path is not None:
             return mixture.at(self._recipe.demos.path)
         for path in sorted(self._run.resolve().parent.glob("*.safetensors")):

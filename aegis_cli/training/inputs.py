@@ -37,6 +37,12 @@ class Inputs:
         )
 
 
+def is_gone(place: str) -> bool:
+    """Whether nothing is there; the id of a dataset is the hub's to find."""
+    path = Path(place)
+    return path.is_absolute() and not path.exists()
+
+
 def keep(out: Path, inputs: Inputs) -> None:
     """Write them into a run's folder."""
     files.save_json(out / NAME, asdict(inputs))

@@ -301,6 +301,40 @@ def test_a_folder_that_is_no_run_says_what_may_be_meant(place: Path, bad: Bad) -
     bad("train", "empty", says=("no recipe.yaml in 'empty'", "aegis train RECIPE --out RUN"))
 
 
+def test_evaluate_takes_the_demonstrations_that_the_run_learned_from(
+    place: Path, aegis: Aegis, bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = cut(place, "naive")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    code, out, err = aegis("evaluate", run, "--frames", 8, "--json")
+    found = json.loads(out)
+    assert code == 0 and found["data"] == str(place / "demos.safetensors"), err
+    assert found["split"] == "validation"
+    (place / "demos.safetensors").rename(place / "moved.safetensors")
+    bad("evaluate", run, says=("demos.safetensors' is gone", f"aegis evaluate {run} --demos PATH"))
+    (run / inputs.NAME).unlink()
+    bad("evaluate", run, says=("no --demos for", f"aegis evaluate {run} --demos PATH"))
+
+
+def test_evaluate_asks_which_of_several_sets(place: Path, aegis: Aegis, bad: Bad) -> None:
+    code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
+    assert code == 0, err
+    run = cut(place, "naive", sets=("demos.safetensors", "new.safetensors"))
+    bad("evaluate", run, says=("which learned from 2 sets", f"{place / 'new.safetensors'}"))
+
+
+def test_merge_finds_the_demonstrations_where_the_run_learned_from_them(
+    place: Path, aegis: Aegis
+) -> None:
+    run = cut(place, "naive")
+    (place / "apart").mkdir()
+    run = run.rename(place / "apart" / "run")
+    asked = "--samples", 8, "--frames", 8, "--vqa", "scenes"
+    code, _, err = aegis("merge", run, "--strength", 1, *asked, "--out", "merged")
+    assert code == 0 and (place / "merged" / "checkpoints").is_dir(), err
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"demos": [3], "anchor": null}', '{"demos": ["x"]']
 )
