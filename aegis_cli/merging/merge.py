@@ -14,7 +14,7 @@ from typing import Any
 
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import check_finite
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data.vqa import sets
 from aegis_cli.evaluation import probe, results
 from aegis_cli.merging import rules, sources
@@ -131,6 +131,9 @@ def _run(
         judge = _Judge(source, settings, on_event)
         points = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
         baseline, chosen = judge.baseline_accuracy, _weakest(points, max_drop)
+        if chosen == 0:
+            said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
+            on_event(Warned("merge", said))
     kept = loss = None
     if chosen is not None and out is not None:
         kept = displacement.keep(chosen)

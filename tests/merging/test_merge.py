@@ -286,6 +286,15 @@ def test_max_drop_writes_the_weakest_merge_that_passes(
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
 
 
+def test_what_passes_as_it_is_is_said_not_to_have_moved(
+    aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    given = ("--method", "linear", "--sweep", "1", "--max-drop", 100, "--out", tmp_path / "merged")
+    code, shown, err = aegis("merge", merge_place.run, *given, *SMALL, "--json")
+    assert code == 0 and json.loads(shown)["strength"] == 0
+    assert "itself loses no more than 100 points: nothing is moved" in " ".join(err.split())
+
+
 def test_a_gate_fails_where_no_strength_passes(
     aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:
