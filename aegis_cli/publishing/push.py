@@ -11,16 +11,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.files import write_text
 from aegis_cli.common.version import __version__
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export
+from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
+from aegis_cli.training.card import without_folders
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
+_PLACES = {"backbone", "path", "vqa", "start"}  # recipes' keys of models and data
 RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 _REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
 # What lies in `backbone/` after a push: the model's files and its card, and what transformers calls
@@ -126,7 +132,8 @@ def run(
         exported = export.run(at, folder, form, repo=repo, dtype=dtype)
         contents = _files(folder)
         if form == card.AEGIS:
-            contents[RECIPE] = home / "recipe.yaml"
+            contents[RECIPE] = Path(aside) / RECIPE
+            write_text(contents[RECIPE], _recipe(home))
         url, removed = (None, ()) if api is None else _send(api, repo, contents, private)
         size = sum(path.stat().st_size for path in contents.values())
         dtype, files = exported.dtype, tuple(sorted(contents))
@@ -141,6 +148,20 @@ def _check_name(repo: str) -> None:
             "ORG/NAME of letters, digits, '-', '_' and '.', without '--' and '..'",
             "e.g. aegis push runs/x your-name/reach-aegis",
         )
+
+
+def _recipe(home: Path) -> str:
+    """The recipe of the training, without the folders in which models and data lie here."""
+
+    def told(key: str, value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: told(name, inner) for name, inner in value.items()}
+        if isinstance(value, list):
+            return [told(key, inner) for inner in value]
+        return without_folders(value) if key in _PLACES and isinstance(value, str) else value
+
+    kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
+    return dump(told("", kept))
 
 
 def _files(folder: Path) -> dict[str, Path]:

@@ -154,7 +154,26 @@ def test_a_checkpoints_files_are_those_of_its_user_and_the_recipe(
     push.run(run_folder, REPO)
     assert not any("training_state" in name for name in hub.committed)
     saved = download(hub, tmp_path) / push.RECIPE
-    assert recipes.load(saved) == recipes.load(run_folder / "recipe.yaml")
+    learned, told = recipes.load(run_folder / "recipe.yaml"), recipes.load(saved)
+    assert told == dataclasses.replace(learned, backbone=Path(learned.backbone).name)
+
+
+def test_the_recipe_tells_nobody_where_models_and_data_lie(
+    run_folder: Path, hub: Hub, tmp_path: Path
+) -> None:
+    learned = recipes.load(
+        run_folder / "recipe.yaml",
+        [
+            *("demos.path=[/home/ann/arm, org/arm]", "anchor.vqa=/home/ann/asked.jsonl"),
+            *("probe.vqa=[scenes, /home/ann/asked.jsonl]", "probe.ask=/say {}"),
+        ],
+    )
+    own = shutil.copytree(run_folder, tmp_path / "own", symlinks=True)
+    files.write_text(own / "recipe.yaml", recipes.to_yaml(learned))
+    push.run(own, REPO)
+    told = recipes.load(download(hub, tmp_path) / push.RECIPE)
+    assert told.demos.path == ("arm", "org/arm") and told.anchor.vqa == "asked.jsonl"
+    assert told.probe.vqa == ("scenes", "asked.jsonl") and told.probe.ask == "/say {}"
 
 
 def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
