@@ -499,7 +499,7 @@ def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> No
 
 def _warn_of_other_cameras(
     path: Path,
-    demos: Path,
+    demos: Paths,
     shown: Sequence[str],
     rename: Mapping[str, str] | None,
     on_event: OnEvent,
@@ -521,7 +521,7 @@ def _warn_of_other_cameras(
     text = (
         f"the anchor '{path}' was measured on frames of {', '.join(own) or 'no camera by name'}, "
         f"and the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "
-        f"anchor --demos {shlex.quote(str(demos))} {names}".rstrip()
+        f"anchor --demos {shlex.quote(str(mixture.each(demos)[0]))} {names}".rstrip()
     )
     on_event(Warned("train", text))
 

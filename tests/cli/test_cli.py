@@ -326,7 +326,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
-            {"load": load_acting, "seed": 4, "keep": True},
+            {"load": load_acting, "seed": 4, "keep": True, "ensemble": None},
         )
     ]
     calls, drawn = stage("evaluate", Evaluated()), []
@@ -334,7 +334,8 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     plot = tmp_path / "a.png"
     command = ("evaluate", "runs/x", "--demos", "d", "--episodes", "0,3-5", "--plot", plot)
     _, _, err = aegis(*command, "--json")
-    assert calls == [((Path("runs/x"), Path("d"), [0, 3, 4, 5], 1000, 0, 64, True), {"keep": True})]
+    asked = (Path("runs/x"), Path("d"), [0, 3, 4, 5], 1000, 0, 64, True)
+    assert calls == [(asked, {"keep": True, "rename": ()})]
     assert drawn == [plot] and "trained on: 3, 4; " in err
     calls, saved = stage("pipeline"), []
     monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))

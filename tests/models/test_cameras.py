@@ -292,8 +292,12 @@ def test_of_one_camera_that_nobody_has_named_nothing_is_said(
     moments = {name: torch.ones(3, dtype=torch.float64) for name in names}
     artifacts.save(anchor, "anchor", moments | {"count": torch.tensor([5, 5])}, meta=meta)
     told: list[Event] = []
-    assemble._warn_of_other_cameras(anchor, Path("demos"), shown, told.append)
+    sets = Path("my demos"), Path("others")
+    assemble._warn_of_other_cameras(anchor, sets, shown, {"cam": "top"}, told.append)
     assert bool(told) is warns
+    if told:
+        assert "aegis anchor --demos 'my demos' " in told[0].text
+        assert told[0].text.endswith("--rename cam=top")
 
 
 def test_through_the_command_line(
