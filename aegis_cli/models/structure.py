@@ -512,7 +512,7 @@ def site_kind(module: nn.Module) -> str | None:
 def is_rms_norm(module: nn.Module) -> bool:
     """Whether all the module does is to scale x / rms(x) by its weight, or by 1 + its weight."""
     parameters = dict(module.named_parameters())
-    if parameters.keys() != {"weight"} or rms_epsilon(module) is None:
+    if parameters.keys() != {"weight"} or rms_epsilon(module, torch.float32) is None:
         return False
     if parameters["weight"].ndim != 1:
         return False
@@ -530,8 +530,14 @@ def is_rms_norm(module: nn.Module) -> bool:
     )
 
 
-def rms_epsilon(module: nn.Module) -> float | None:
-    """The epsilon under its root, if it names one."""
+def rms_epsilon(module: nn.Module, dtype: torch.dtype) -> float | None:
+    """The epsilon under its root, if it names one.
+
+    Args:
+        dtype: of its arithmetic, whose smallest step is the epsilon of PyTorch's by default.
+    """
+    if isinstance(module, nn.RMSNorm) and module.eps is None:
+        return torch.finfo(dtype).eps
     for name in ("eps", "variance_epsilon"):
         if hasattr(module, name):
             return getattr(module, name)
@@ -544,4 +550,5 @@ def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
     The arithmetic is in float32 or wider.
     """
     wide = x if x.dtype == torch.float64 else x.float()
-    return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + rms_epsilon(module))
+    epsilon = rms_epsilon(module, wide.dtype)
+    return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + epsilon)

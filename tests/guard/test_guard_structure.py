@@ -156,7 +156,7 @@ def test_what_is_not_known_is_named() -> None:
     model = nn.ModuleDict(
         {
             "a": nn.Linear(2, 2),
-            "b": nn.RMSNorm(2),
+            "b": nn.GroupNorm(1, 2),
             "c": nn.Conv2d(4, 4, 1, groups=2),
             "d": nn.Conv2d(2, 2, 3, padding="same"),
             "e": nn.MultiheadAttention(4, 2),
@@ -166,8 +166,21 @@ def test_what_is_not_known_is_named() -> None:
     maps = structure.find_maps(model, "f")
     assert maps.kinds == {"a": "maps", "f": "stem"}
     assert (
-        set(maps.unknown) == {"b", "c", "d", "e", "e.out_proj"} and "RMSNorm" in maps.unknown["b"]
+        set(maps.unknown) == {"b", "c", "d", "e", "e.out_proj"} and "GroupNorm" in maps.unknown["b"]
     )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("eps", [None, 1e-5])
+@pytest.mark.parametrize("size", [1, 1e-3, 1e-6])
+def test_a_root_mean_square_of_pytorch_is_known_with_its_own_epsilon(
+    dtype: torch.dtype, eps: float | None, size: float
+) -> None:
+    norm = nn.RMSNorm(6, eps=eps, dtype=dtype)
+    norm.weight.data = torch.linspace(0.5, 2, 6, dtype=dtype)
+    assert structure.site_kind(norm) == "norms"
+    x = size * torch.linspace(-1, 2, 30, dtype=dtype).view(5, 6)
+    torch.testing.assert_close(norm.weight * structure.rms_normed(norm, x), norm(x))
 
 
 def test_a_part_of_the_model_by_its_whole_name() -> None:
