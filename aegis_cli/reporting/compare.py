@@ -175,10 +175,11 @@ def _runs(path: Path) -> Iterator[Path]:
             return
     if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
         refuse_unfinished(path, "compare")
+        there = path.exists()
         raise AegisError(
-            f"'{path}' is no run of a policy",
+            f"'{path}' is no run of a policy" if there else f"nothing is at '{path}'",
             "folders that aegis train wrote, or one that aegis run made of a recipe",
-            "aegis inspect shows studies and streams",
+            "aegis inspect shows studies and streams" if there else "check the path",
         )
     yield path
 

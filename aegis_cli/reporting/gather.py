@@ -170,10 +170,11 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
         inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
         example = next(iter(inside), "runs/quickstart")
+        there = path.exists()
         raise AegisError(
-            f"'{path}' is no run, job or study",
+            f"'{path}' is no run, job or study" if there else f"nothing is at '{path}'",
             "a folder that aegis train or aegis run wrote",
-            f"aegis report {shlex.quote(str(example))}",
+            f"aegis report {shlex.quote(str(example))}" if there else "check the path",
         )
     return run_document(path, videos=True)
 

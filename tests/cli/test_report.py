@@ -227,6 +227,12 @@ def test_a_page_of_another_ending_is_refused(aegis, job: Path, tmp_path: Path) -
     assert "x.html" in said and not list(tmp_path.glob("x.*"))
 
 
+@pytest.mark.parametrize("command", ["report", "compare"])
+def test_a_path_with_nothing_at_it_is_told_as_such(aegis, command: str, tmp_path: Path) -> None:
+    code, _, err = aegis(command, tmp_path / "nope")
+    assert code == 2 and "nothing is at" in err and "check the path" in err
+
+
 def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
     said = refused(aegis("report", job.parent))
     assert f"aegis report {job}" in said
