@@ -108,7 +108,8 @@ class Measurement(Removable):
         Args:
             mask: [B, T] of the tokens that the layers see, true at those that count; None: every
                 token counts.
-            image: [B, T] or [T], true at image tokens; needed for moments.
+            image: [B, T] or [T], true at image tokens; needed for moments, and all false where
+                prompts have no images.
 
         Raises:
             AegisError: a mask that does not fit, or a map whose inputs cannot be told from padding.
@@ -121,7 +122,7 @@ class Measurement(Removable):
             raise AegisError(
                 "no image mask",
                 "image=: which tokens are the image's",
-                "measured.watch(mask, image=...)",
+                "measured.watch(mask, image=...), all false for prompts without images",
             )
         self._check_answered()
         self._broken = True  # unless the block ends well

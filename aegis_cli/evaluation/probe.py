@@ -352,7 +352,8 @@ def drift(
 ) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
-    Image and text tokens are merged.
+    Image and text tokens are merged; text tokens alone are compared with an anchor that saw no
+    others.
     """
     return _layers(_distances(model, asked, anchor, batch_size, ranks), None)
 
@@ -373,7 +374,10 @@ def _distances(
     found = []
     for layer in zip(image, text, anchor.image, anchor.text, strict=True):
         image_now, text_now, image_then, text_then = layer
-        now, then = merge(image_now, text_now), merge(image_then, text_then)
+        if not image_then.count:  # the anchor is of prompts without images
+            now, then = text_now, text_then
+        else:
+            now, then = merge(image_now, text_now), merge(image_then, text_then)
         found.append(float(w2_diag(now.mean, now.var, then.mean, then.var)))
     return found
 

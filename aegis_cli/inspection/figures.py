@@ -28,6 +28,7 @@ def of_anchor(path: Path) -> dict[str, Any]:
         _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
         for i in range(len(anchor.image))
         for kind, layers in (("image", anchor.image), ("text", anchor.text))
+        if layers[i].count
     )
     inputs, curvature = (
         tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature)

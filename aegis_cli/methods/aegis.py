@@ -110,11 +110,21 @@ def _penalty(
     """The transport cost over the tokens in scope, as a function of a pass.
 
     The scope `each` averages the costs of image and of text tokens.
+
+    Raises:
+        AegisError: an anchor that saw no tokens in scope.
     """
     measured = {"image": anchor.image, "text": anchor.text}
     # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
     measured["all"] = [merge(*both) for both in zip(anchor.image, anchor.text, strict=True)]
     scopes = ("image", "text") if scope == "each" else (scope,)
+    for name in scopes:
+        if not measured[name][0].count:
+            raise AegisError(
+                f"an anchor of prompts without {name} tokens, and the scope '{scope}'",
+                f"{name} tokens to compare with",
+                "choose the scope 'all', or measure the anchor on prompts that have them",
+            )
     targets = []
     for name in scopes:
         layers = [layer.to(like) for layer in measured[name]]

@@ -144,6 +144,16 @@ def test_w2_against_the_very_same_questions_is_zero(tiny: EmbeddedVLM) -> None:
     )
 
 
+def test_an_anchor_of_prompts_without_images_is_compared_with_text_tokens_alone(
+    tiny: EmbeddedVLM,
+) -> None:
+    asked = load_scenes("probe", QUESTIONS)
+    _, text = anchor_moments.measure(tiny, asked.batches(8), QUESTIONS)
+    nothing = [empty(len(m.mean)) for m in text]
+    found = probe.drift(tiny, asked, Anchor(nothing, text), 64)
+    assert [x.w2 for x in found] == pytest.approx([0, 0], abs=1e-9)
+
+
 def test_an_anchor_without_moments_is_refused_before_any_question(
     taught: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,30 @@ def test_the_embedded_vlms_inputs_are_those_of_the_command() -> None:
         assert torch.equal(spectrum.values, wanted[site].values)
 
 
+def test_an_anchor_of_prompts_without_images_holds_all_their_tokens(
+    anchor: Path, tmp_path: Path
+) -> None:
+    """Of a language model there are text tokens alone: then they are all that is compared."""
+    path, model = tmp_path / "text.safetensors", make()
+    with Guard.measure(model, LAYERS) as found:
+        for seed in range(100, 103):
+            pixels, ids, mask = batch(seed)
+            with found.watch(mask, torch.zeros_like(IMAGE)):
+                model(pixels, ids, mask)
+    found.save(path)
+    rows = inspection.run(path).moments
+    assert len(rows) == len(found.anchor().text) and all("text" in row.name for row in rows)
+    trained = []
+    for measured_on in (anchor, path):
+        model = make()
+        guarded_steps(model, Guard(model, measured_on, LAYERS))
+        trained.append(vector(model))
+    torch.testing.assert_close(*trained, rtol=1e-6, atol=1e-9)
+    for scope in ("image", "each"):
+        with pytest.raises(AegisError, match="without image tokens"):
+            Guard(make(), path, LAYERS, scope=scope)
+
+
 def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
     """Each question alone and without its padding."""
     with Guard.measure(model, LAYERS, parts=parts, vision="vision", energy=1.0) as found:

@@ -455,9 +455,6 @@ def test_a_measurement_is_of_whole_passes_of_the_model_as_it_answers(tmp_path: P
     refused(lambda: forward(mask=mask[:, 1:]), "reads [4, 8, 16]", "vision=")
     refused(lambda: found.save(tmp_path / "a.safetensors"), "failed")
     assert not list(tmp_path.iterdir())
-    found = Guard.measure(model, LAYERS, parts=("moments",))
-    forward(image=torch.zeros_like(IMAGE))
-    refused(lambda: found.save(tmp_path / "a.safetensors"), "no tokens of a kind")
 
 
 def test_maps_whose_rows_are_not_the_tokens() -> None:
