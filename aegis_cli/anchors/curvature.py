@@ -132,6 +132,9 @@ class CurvatureRecorder:
             for name, site in modules_of_sites(model, maps).items()
             if isinstance(model.get_submodule(name), DENSE)
         }
+        # Found before any pass is watched: to try a norm out is a use of its parameters too.
+        owning = structure.owning(model).items()
+        self._called = {name for name, module in owning if structure.site_kind(module) is not None}
 
     @property
     def names(self) -> list[str]:
@@ -142,12 +145,13 @@ class CurvatureRecorder:
     def watch(self) -> Iterator[None]:
         """Follow the maps that are called inside the block."""
         self.forget()
+        self._graph.lone = []
         with contextlib.ExitStack() as hooks:
             for name, module in structure.owning(self._model).items():
                 site = self._sites.get(name)
                 if site is not None:
                     after = partial(self._follow_call, site)
-                elif structure.site_kind(module) is not None:
+                elif name in self._called:
                     after = self._note_entry
                 else:
                     own = module.parameters(recurse=False)

@@ -10,7 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.guard import IMAGE, LAYERS, PATCHES, Vlm, batch, compiling, make, task_loss, vector
+from samples.guard import (
+    IMAGE,
+    LAYERS,
+    PATCHES,
+    WIDTH,
+    Vlm,
+    batch,
+    compiling,
+    make,
+    task_loss,
+    vector,
+)
 from samples.tiny import make_tiny
 from samples.training import make_questions
 from torch import Tensor, nn
@@ -98,6 +109,34 @@ def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
     assert {name.rpartition(".")[0] for name in spectra[0]} == set(MAPS)
     for name, spectrum in spectra[0].items():
         torch.testing.assert_close(spectrum.values, spectra[1][name].values, rtol=1e-6, atol=1e-15)
+
+
+class FamilyNorm(nn.Module):
+    """The RMS norm of a model family: a class of its own, known by what it does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight, self.eps = nn.Parameter(torch.full((WIDTH,), 1.5, dtype=torch.float64)), 1e-6
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.weight * (x * torch.rsqrt(x.square().mean(-1, keepdim=True) + self.eps))
+
+
+def test_a_familys_norms_are_measured_beside_the_curvature() -> None:
+    """The curvature tries a norm out to know it, which is no use of its weight by the model."""
+    found = {}
+    for parts in (("inputs",), ("inputs", "curvature")):
+        model = make()
+        model.text.norm = FamilyNorm()
+        with Guard.measure(model, parts=parts, vision="vision", energy=1.0) as measuring:
+            if "curvature" in parts:
+                asked(model, measuring)
+            else:
+                pixels, ids, mask = batch(100)
+                with measuring.watch(mask):
+                    model(pixels, ids, mask)
+        found[len(parts)] = measuring.anchor().inputs
+    assert found[1].keys() == found[2].keys() and "text.norm" in found[2]
 
 
 def test_all_parts_in_one_measurement_are_what_each_is_alone(tmp_path: Path) -> None:
