@@ -36,7 +36,7 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.models.expert import ActionExpert
 from aegis_cli.recipes import Nullspace, Recipe
 from aegis_cli.training import checkpoint, schedule
@@ -197,7 +197,7 @@ def test_a_compiled_policy_trains_alike(
         called.append(real.__name__)
         real(part, "aot_eager")
 
-    for owner, name in ((Backbone, "compile_passes"), (ActionExpert, "compile_layers")):
+    for owner, name in ((EmbeddedVLM, "compile_passes"), (ActionExpert, "compile_layers")):
         real = getattr(owner, name)
         monkeypatch.setattr(owner, name, lambda part, real=real: quickly(real, part))
     runs = []
