@@ -800,12 +800,24 @@ def test_frozen_parts_stay_frozen(anchor: Path) -> None:
     assert torch.equal(vector(model.vision), frozen) and not torch.equal(
         vector(model.text.layers[1]), free
     )
+
+
+def test_the_ledger_lists_what_learns_and_inspect_says_what_does_not(
+    anchor: Path, tmp_path: Path
+) -> None:
+    model = make()
+    model.vision.requires_grad_(False)
+    model.text.layers[0].requires_grad_(False)
+    guard = Guard(model, anchor, LAYERS)
+    guarded_steps(model, guard)
     rows = guard.ledger.tensors()
-    assert (
-        not rows["tt"][:, [0, 2]].any()
-        and not rows["aa"][:, [0, 2]].any()
-        and rows["aa"][:, 1].all()
-    )
+    assert guard.ledger.groups == ("layers.1", "embeddings", "text.norm")
+    assert guard.ledger.layers == ("layers.0", "layers.1")
+    assert rows["tt"].all() and rows["aa"][:, 0].all() and rows["w2"].all()
+    guard.ledger.save(tmp_path / "ledger.safetensors")
+    report = inspection.run(tmp_path / "ledger.safetensors")
+    assert [layer.name for layer in report.layers] == list(guard.ledger.groups)
+    assert report.frozen == ("layers.0",)
 
 
 def test_what_lies_outside_the_model_is_left_to_the_task(anchor: Path) -> None:

@@ -23,6 +23,7 @@ from aegis_cli.models.structure import (
     owning_modules,
     site_kind,
     under,
+    what_learns,
 )
 
 FLOAT32 = "float32"
@@ -223,11 +224,7 @@ class Backbone(nn.Module, ABC):
 
     def learning_groups(self) -> dict[str, list[nn.Parameter]]:
         """What learns of each group, without the groups of which nothing does."""
-        found = {}
-        for name, group in self.parameter_groups().items():
-            if learning := [p for p in group if p.requires_grad]:
-                found[name] = learning
-        return found
+        return what_learns(self.parameter_groups())
 
     @abstractmethod
     def language_maps(self) -> dict[str, nn.Linear]:
