@@ -23,6 +23,7 @@ from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
 from aegis_cli.models import structure
+from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
     assemble,
@@ -167,8 +168,10 @@ def _planned(
     # What is free changes meanwhile: all report what the first, which writes, has seen.
     room = ranks.agree(_free_disk(out))
     backbone, frames = training.policy.backbone, len(training.demos.train)
+    buffers = WrittenBuffers(backbone)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     needs = _needs(training, parts, free, base, ranks)
+    train.warn_of_written(backbone, buffers, on_event if ranks.first else ignore)
     left = recipe.train.steps - _done(written)
     return DryRunReport(
         method=method.name,

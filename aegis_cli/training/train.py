@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from aegis_cli import methods, recipes
 from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.headers import rewrite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
@@ -27,6 +27,8 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import (
@@ -278,6 +280,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     settings = run.recipe.train
     shown: dict[str, float] = {}
     run.policy.train()
+    buffers: WrittenBuffers | None = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
@@ -296,6 +299,9 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 update(run, index, batch, window, settle=save or validate)
                 if logged:
                     read(run, window)
+            if buffers is not None:
+                warn_of_written(run.policy.backbone, buffers, on_event)
+                buffers = None
             window.data_s += fetched - started
             window.update_s += time.perf_counter() - fetched
             window.steps += 1
@@ -423,6 +429,24 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
             good,
         )
     run.save_checkpoint(finished, going_on)
+
+
+def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEvent) -> None:
+    """Say which parts of the backbone passes have written to, for no method holds that.
+
+    Args:
+        before: its buffers before these passes.
+    """
+    written = [name.removeprefix(backbone.inside) for name in before.modules()]
+    if not written:
+        return
+    more = f" and of {len(written) - 1} more modules" if written[1:] else ""
+    text = (
+        f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm averages "
+        "what it reads: answers change with them, and no method holds them; train.freeze, of the "
+        "modules or of what they lie in, keeps batch normalisations as they are"
+    )
+    on_event(Warned("train", text))
 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:

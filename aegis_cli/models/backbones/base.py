@@ -214,10 +214,14 @@ class Backbone(nn.Module, ABC):
         """The parameters, each in exactly one group: `layers.{i}`, or another part by its name."""
 
     def train(self, mode: bool = True) -> Self:
-        """Go to training mode, but for running averages (BatchNorm's) of what does not learn."""
+        """Go to training mode, but for running averages (BatchNorm's) of what does not learn.
+
+        Those without weights of their own belong to the part that they lie in.
+        """
         super().train(mode)
-        for module in averaging(self).values():
-            own = list(module.parameters())
+        for name, module in averaging(self).items():
+            around = self.get_submodule(name.rpartition(".")[0])
+            own = list(module.parameters()) or list(around.parameters())
             if own and not any(p.requires_grad for p in own):
                 module.eval()
         return self
