@@ -44,7 +44,8 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import Demos, RobotStreamRecipe
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
-from aegis_cli.training import assemble, train
+from aegis_cli.training import assemble, freezing, train
+from aegis_cli.training.freezing import Still
 from aegis_cli.training.up_to_date import Made, StageRecords
 
 # Training frames, evenly spaced, on which routers are measured, always with the same noise.
@@ -68,6 +69,7 @@ class RobotStreamRun(StreamRun):
 
     Attributes:
         policies: one per task; they share backbone and action expert and have scales of their own.
+        still: what the recipe freezes of the backbone.
         demos: one per task; none in a run that only acts.
         question_files: digests of the files that the questions come from; none of scenes.
         evaluator: what measures the run; None in a run that only acts.
@@ -78,6 +80,7 @@ class RobotStreamRun(StreamRun):
 
     recipe: RobotStreamRecipe
     policies: tuple[Policy, ...]
+    still: Still = Still()
     demos: tuple[Demonstrations, ...] = ()
     question_files: Mapping[str, str] = field(default_factory=dict)
     evaluator: RobotEvaluator | None = None
@@ -100,7 +103,8 @@ class RobotStreamRun(StreamRun):
         return {n: site for n, site in self.sites.items() if not n.startswith("expert.")}
 
     def task_begun(self) -> None:
-        """With the first task the action expert learns whole."""
+        """With the first task the action expert learns whole; what is frozen never does."""
+        self.still.hold()
         if self.learner.trains == "experts" and self.current.task == 0:
             self.model.expert.requires_grad_(True)
 
@@ -239,6 +243,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     for task in recipe.tasks:
         sim.check(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    _check_freeze(recipe, backbone, on_event)
     for task in recipe.tasks:
         _check_words(backbone, task)
     demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
@@ -339,15 +344,17 @@ def _assemble(
 ) -> RobotStreamRun:
     """A run at its beginning: one policy per task, and sites for experts if its learner has any."""
     learner = learners.get(recipe.train.method)
-    fingerprint = backbone.fingerprint()  # of the bare backbone, before anything stands beside it
+    # Of the bare backbone, before anything stands beside it.
+    fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
     policies = share(backbone, shape, scales, recipe.seed)
     return RobotStreamRun(
         recipe=recipe,
         learner=learner,
-        sites=route(policies[0]) if learner.trains == "experts" else {},
+        sites=route(policies[0], still) if learner.trains == "experts" else {},
         fingerprint=fingerprint,
         out=out,
         policies=policies,
+        still=still,
         demos=demos,
     )
 
@@ -416,6 +423,32 @@ def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Question
     return sets.read(asked.vqa, asked.skip_bad, on_event, asked.ask)
 
 
+def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEvent) -> None:
+    """Raise AegisError unless what is frozen would learn, and something else of the backbone does.
+
+    Each name has to be that of a part.
+    """
+    still = freezing.named(backbone, recipe.train.freeze)
+    if not still.given:
+        return
+    learner = learners.get(recipe.train.method)
+    with_learner = f"{still.said} with method '{learner.name}'"
+    if learner.trains == "model":
+        left = still.left(backbone.parameter_groups())
+    else:
+        grown = grown_maps(backbone)
+        left = list(still.without(grown))
+        if len(left) == len(grown):
+            raise AegisError(
+                f"{with_learner}, which trains none of it anyway",
+                "parts with maps beside which experts would stand: the MLPs and attention outputs "
+                "of all language layers but the last",
+                "name such parts, delete train.freeze, or --method sequential, which trains all",
+            )
+    freezing.check_something_learns(with_learner, left, "freeze less")
+    still.warn_of_tied(on_event)
+
+
 def _check_words(backbone: Backbone, task: str) -> None:
     """Raise AegisError unless the backbone knows the words of a simulated task's instructions."""
     size = backbone.image_size or 64
@@ -481,18 +514,30 @@ def share(
     return tuple(policy.requires_grad_(False) for policy in made)
 
 
-def route(policy: Policy) -> dict[str, routing.RoutedLinear]:
-    """Let experts stand beside maps of the backbone's language layers, and all of the expert's.
+def grown_maps(backbone: Backbone) -> dict[str, nn.Linear]:
+    """The maps of a backbone's language layers that may get experts.
 
-    The inputs of the backbone's attention get none. Nor do the last layer's maps: they are behind
-    the last keys and values, which is all that the expert reads, so that no action depends on them.
+    The inputs of attention get none. Nor do the last layer's maps: they are behind the last keys
+    and values, which is all that the action expert reads, so that no action depends on them.
     """
-    last_layer = policy.backbone.parameter_groups()[f"layers.{policy.backbone.depth - 1}"]
+    last_layer = backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]
     last = {id(parameter) for parameter in last_layer}
     maps = {}
-    for name, linear in policy.backbone.language_maps().items():
+    for name, linear in backbone.language_maps().items():
         if name.rpartition(".")[2] not in ATTENTION_INPUTS and id(linear.weight) not in last:
-            maps[f"backbone.{name}"] = linear
+            maps[name] = linear
+    return maps
+
+
+def route(policy: Policy, still: Still) -> dict[str, routing.RoutedLinear]:
+    """Let experts stand beside maps of the backbone's language layers, and all of the expert's.
+
+    Args:
+        still: the parts of the backbone whose maps get none.
+    """
+    maps = {}
+    for name, linear in still.without(grown_maps(policy.backbone)).items():
+        maps[f"backbone.{name}"] = linear
     for name, module in policy.expert.named_modules():
         if isinstance(module, nn.Linear):
             maps[f"expert.{name}"] = module

@@ -52,7 +52,7 @@ class DualBackward:
         """Begin without a pass.
 
         Args:
-            groups: the model's parameters, each once.
+            groups: the parameters that learn, each once; the ledger has a column for each group.
             owners: the processes that have some rows of every weight.
             processes: those that train the model together.
         """

@@ -57,7 +57,8 @@ class Guard(Removable):
     the first is part of that sum.
 
     Attributes:
-        ledger: inner products of each group and W2^2 of each layer, one row per optimizer step.
+        ledger: inner products of each group of which something learns, and W2^2 of each layer, one
+            row per optimizer step.
         unprotected: names of learning modules that nothing holds (`nullspace` and `kfac`): those
             that `protect` leaves free, and those on which no answer depended when the anchor was
             measured.
@@ -119,7 +120,7 @@ class Guard(Removable):
         # The other methods look at maps, and need not be told which modules are layers.
         with naming_its_part(model, path, part):
             found = structure.find_layers(model, layers) if dual else {}
-        groups = structure.parameter_groups(model, found) if dual else {}
+        groups = structure.learning_groups(model, found) if dual else {}
         pixels = structure.plain_parts(model, vision)
         started = start(method, model, path, found, groups, pixels, options, self._owners, part)
         self._parts, self._widths = started.parts, started.widths

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_reached
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import structure
+from aegis_cli.models.buffers import WrittenBuffers
 
 Scaler = torch.amp.GradScaler
 Closure = Callable[[], Any]
@@ -70,6 +72,9 @@ class GuardedStepper:
         # step; and how often each weight had been written to.
         self._took, self._tells = False, False
         self._written: list[int] = []
+        # The buffers as the first pass left them; None before it, and once the second was seen.
+        self._buffers: WrittenBuffers | None = None
+        self._looked = False
         _AT_WORK.add(self)
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
@@ -115,10 +120,29 @@ class GuardedStepper:
         self._refuse_another_guard()
         if not self._sums_late:
             check_reached(self._learning.values())
+        if not self._looked:
+            self._look_at_buffers()
         self._stepped, self._counted = set(), None
         self._took, self._written = False, self._versions()
         if not self._in_closure:
             self._depth = 0  # a step that raised an exception has left it as it was
+
+    def _look_at_buffers(self) -> None:
+        """Warn, at the second pass, of what it has written to since the first."""
+        before, self._buffers = self._buffers, None
+        if before is None:
+            self._buffers = WrittenBuffers(self._model)
+            return
+        self._looked = True
+        if not (written := before.modules()):
+            return
+        more = f" and of {len(written) - 1} more modules" if written[1:] else ""
+        warnings.warn(
+            f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm "
+            "averages what it reads: answers change with them, and no method holds them; call "
+            "module.eval() for each of these modules after model.train()",
+            stacklevel=2,
+        )
 
     def _refuse_another_guard(self) -> None:
         """Refuse a second guard of the same kind on a parameter: it would undo what one has held.

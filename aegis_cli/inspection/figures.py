@@ -64,8 +64,11 @@ def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
         for g in ledger.summarize_groups(groups, tensors)
     )
     mean = ledger.energy_shed_mean(tensors)
+    # A ledger has W2^2 of every layer, and inner products of what learns alone.
+    frozen = tuple(name for name in artifact.header.meta["layers"] if name not in groups)
     return {
         "layers": tuple(layers),
+        "frozen": frozen,
         "over_time": _over_time(groups, tensors),
         "energy_shed_mean": mean,
     }

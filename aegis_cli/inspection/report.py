@@ -102,8 +102,9 @@ class InspectReport:
     Attributes:
         kind: what the path is.
         facts: what is said of it in one line each.
-        energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
-            taken.
+        frozen: the layers of which nothing has learned, so that they have no energies.
+        energy_shed_mean: None, with `layers`, `frozen` and `over_time` empty, where no anchor
+            gradient was taken.
         probes, rollouts, open_loops: what was measured of a run's last checkpoint.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
@@ -117,6 +118,7 @@ class InspectReport:
     curvature: tuple[SiteSpectrum, ...] = ()
     features: tuple[FeatureInfo, ...] = ()
     layers: tuple[LayerEnergy, ...] = ()
+    frozen: tuple[str, ...] = ()
     over_time: tuple[Bin, ...] = ()
     energy_shed_mean: float | None = None
     loss: float | None = None

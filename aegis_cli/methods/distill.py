@@ -20,15 +20,16 @@ from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+from aegis_cli.models.backbones.base import Backbone
 
 
 def start(setting: Setting) -> Parts:
-    """Copy the backbone as it is now."""
+    """Copy what learns of the backbone, as it is now."""
     weight = setting.options["weight"]
     if weight == 0:  # naive, and no copy to pay for
         return Parts()
     backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
-    frozen = copy.deepcopy(backbone).eval().requires_grad_(False)
+    frozen = _teacher(backbone)
 
     def auxiliary(seen: Pass) -> Tensor:
         _round_alike(frozen, backbone)
@@ -37,6 +38,13 @@ def start(setting: Setting) -> Parts:
         return weight * relative_distance(seen.hidden, taught, seen.mask, seen.total)
 
     return Parts(auxiliary=auxiliary)
+
+
+def _teacher(backbone: Backbone) -> Backbone:
+    """A copy that stands still, and has what stands still in both in common with the backbone."""
+    shared = {id(p): p for p in backbone.parameters() if not p.requires_grad}
+    # What the memo has, deepcopy takes as copied already.
+    return copy.deepcopy(backbone, shared).eval().requires_grad_(False)
 
 
 def _round_alike(frozen: nn.Module, backbone: nn.Module) -> None:

@@ -216,6 +216,22 @@ def parameter_groups(
     return groups
 
 
+def learning_groups(
+    model: nn.Module, layers: Mapping[str, nn.Module]
+) -> dict[str, list[nn.Parameter]]:
+    """What learns of each of `parameter_groups`, without the groups of which nothing does."""
+    return what_learns(parameter_groups(model, layers))
+
+
+def what_learns(groups: Mapping[str, Sequence[nn.Parameter]]) -> dict[str, list[nn.Parameter]]:
+    """What learns of each group, without the groups of which nothing does."""
+    found = {}
+    for name, group in groups.items():
+        if learning := [p for p in group if p.requires_grad]:
+            found[name] = learning
+    return found
+
+
 def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
     """The modules around the module of this name, beginning with the model."""
     parts = name.split(".")

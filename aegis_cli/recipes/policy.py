@@ -387,7 +387,7 @@ class Train:
     compile: bool = key(
         default=False,
         doc="Compile backbone and expert with torch.compile: of a Hugging Face backbone its "
-        "layers, with prompts padded to multiples of 32 tokens.",
+        "layers, with prompts padded to multiples of 32 tokens (the embedded backbone's: of 4).",
     )
     accumulate: int = key(
         POSITIVE,

@@ -17,7 +17,15 @@ from aegis_cli.recipes.keys import (
     key,
     section,
 )
-from aegis_cli.recipes.policy import COLOR_SETS, NORMALIZATIONS, PRECISIONS, TASK, Expert, Probe
+from aegis_cli.recipes.policy import (
+    COLOR_SETS,
+    NORMALIZATIONS,
+    PART,
+    PRECISIONS,
+    TASK,
+    Expert,
+    Probe,
+)
 
 LEARNERS = (
     "zero-shot",
@@ -107,6 +115,13 @@ class RobotTrain:
     )
     final_lr_share: float = key(
         UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at a task's last step."
+    )
+    freeze: str | tuple[str, ...] | None = key(
+        PART,
+        None,
+        later=True,
+        doc="Parts of the backbone that do not learn, as in a recipe of a policy; a learner with "
+        "experts puts none beside their maps. Null: all learns that the learner trains.",
     )
     validation_share: float = key(
         SHARE, 0.05, doc="Share of each task's episodes that is kept for the validation loss."

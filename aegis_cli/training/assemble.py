@@ -245,8 +245,79 @@ def build(
     check_masters(recipe.train, ranks)
     eight_bit.check(recipe.train, ranks)
     device, shards = devices.pick(), _shards(recipe.train, ranks)
+    read = _read(recipe, method, demos, anchor, on_event, ranks)
+    backbone, measured = read.backbone, read.measured
+    policy = _begun_policy(recipe, read)
+    source = _trained_on(method, recipes.options(recipe), on_event)
+    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
+    sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    masters = _adapted(recipe, method, backbone, on_event)
+    # By a whole copy the first process writes checkpoints.
+    plain = copy.deepcopy(policy) if shards and ranks.first else None
+    owners = ranks if shards else ALONE
+    if shards:
+        parallel.shard(policy, recipe.train.precision, device)
+    parts = _start(recipe, method, policy, read.demos, measured, sites, source, owners, on_event)
+    _check_weights(recipe, parts)
+    if recipe.train.compile:
+        backbone.compile_passes()
+        policy.expert.compile_layers()
+    made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
+    return TrainingRun(
+        recipe,
+        method,
+        out,
+        _digests(recipe, read, source),
+        read.demos,
+        policy,
+        parts,
+        Stepper(backbone, parts, may_shard=owners.several),
+        made,
+        _ledger(method, backbone),
+        ranks,
+        plain,
+        read.watched,
+        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
+        masters=masters,
+        average=_average(recipe.train, policy),
+    )
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What a training reads, each checked against the others.
+
+    Attributes:
+        backbone: as it was stored, where it is to learn.
+        fingerprint: of its weights.
+        watched: the anchor's file, if there is one, and `anchor` its digest.
+        measured: what the anchor holds; None where there is none.
+    """
+
+    backbone: Backbone
+    fingerprint: str
+    demos: demonstrations.Demonstrations
+    watched: WatchedFiles
+    anchor: str | None
+    measured: Anchor | None
+
+
+def _read(
+    recipe: Recipe,
+    method: Method,
+    demos: Paths,
+    anchor: Path | None,
+    on_event: OnEvent,
+    ranks: Ranks,
+) -> _Read:
+    """Load backbone, demonstrations and anchor.
+
+    Raises:
+        AegisError: inputs that do not fit together.
+    """
+    device = devices.pick()
     # What is to be cut stays on the CPU: a GPU may have room for its share alone.
-    backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
+    backbone = backbones.load(recipe.backbone).to("cpu" if _shards(recipe.train, ranks) else device)
     recorded = _loaded(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
     fingerprint = backbone.fingerprint()
@@ -256,50 +327,24 @@ def build(
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
+    digest = None if anchor is None else watched.sha256[anchor]
+    return _Read(backbone, fingerprint, recorded, watched, digest, measured)
+
+
+def _begun_policy(recipe: Recipe, read: _Read) -> Policy:
+    """The policy as it begins, its backbone in the type that the recipe asks for."""
     # After the fingerprint: the anchor is of the weights before they are rounded.
-    _fit(backbone, recipe)
+    _fit(read.backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
-    policy = _policy(recipe, backbone, recorded)
-    options = recipes.options(recipe)
-    source = _trained_on(method, options, on_event)
-    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
-    sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
+    return _policy(recipe, read.backbone, read.demos)
+
+
+def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
+    """Let learn what the method trains and nothing freezes; the masters of what is rounded."""
     own = list(backbone.parameters())
-    freezing.adapt(method, backbone, options, recipe.train.freeze, on_event)
+    freezing.adapt(method, backbone, recipes.options(recipe), recipe.train.freeze, on_event)
     # After it, for adapters are wide anyway, and what does not learn needs no master.
-    masters = Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
-    del own
-    # By a whole copy the first process writes checkpoints.
-    plain = copy.deepcopy(policy) if shards and ranks.first else None
-    owners = ranks if shards else ALONE
-    if shards:
-        parallel.shard(policy, recipe.train.precision, device)
-    parts = _start(recipe, method, policy, recorded, measured, sites, source, owners, on_event)
-    _check_weights(recipe, parts)
-    if recipe.train.compile:
-        backbone.compile_passes()
-        policy.expert.compile_layers()
-    inputs = {**mixture.inputs(recorded), "backbone": fingerprint}
-    inputs |= _digests(recipe, None if anchor is None else watched.sha256[anchor], source)
-    made = optimizers.make(policy, recipe.train, rate_per_parameter=parts.shares is not None)
-    return TrainingRun(
-        recipe,
-        method,
-        out,
-        inputs,
-        recorded,
-        policy,
-        parts,
-        Stepper(backbone, parts, may_shard=owners.several),
-        made,
-        _ledger(method, backbone),
-        ranks,
-        plain,
-        watched,
-        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
-        masters=masters,
-        average=_average(recipe.train, policy),
-    )
+    return Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
 
 
 def _average(settings: Train, policy: Policy) -> Average:
@@ -317,9 +362,11 @@ def _trained_on(method: Method, options: Mapping[str, Any], on_event: OnEvent) -
     return sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
 
 
-def _digests(recipe: Recipe, anchor: str | None, source: Questions | None) -> dict[str, str]:
-    """Digests of what a training reads beside its demonstrations and backbone, by their names."""
-    found = {} if anchor is None else {"anchor": anchor}
+def _digests(recipe: Recipe, read: _Read, source: Questions | None) -> dict[str, str]:
+    """Digests of what a training reads, by their names."""
+    found = {**mixture.inputs(read.demos), "backbone": read.fingerprint}
+    if read.anchor is not None:
+        found["anchor"] = read.anchor
     if recipe.expert.start is not None:
         found["expert"] = checkpoint.expert_sha256(recipe.expert.start)
     return found if source is None else found | source.sha256

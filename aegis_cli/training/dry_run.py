@@ -23,6 +23,7 @@ from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
 from aegis_cli.models import structure
+from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
     assemble,
@@ -161,23 +162,35 @@ def _planned(
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks))
     parts = _memory(training, held, activations)
     written = [] if overwrite else checkpoint.whole(out)
-    to_come, kept = _to_come(recipe, written), recipe.train.keep_checkpoints
-    checkpoints = retention.most_at_once(to_come, len(written), kept)
-    disk = checkpoints * _checkpoint_bytes(training)
-    # What is free changes meanwhile: all report what the first, which writes, has seen.
-    room = ranks.agree(_free_disk(out))
-    backbone, frames = training.policy.backbone, len(training.demos.train)
+    disk = _disk(training, written)
+    buffers = WrittenBuffers(training.policy.backbone)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     needs = _needs(training, parts, free, base, ranks)
-    left = recipe.train.steps - _done(written)
+    told = on_event if ranks.first else ignore
+    train.warn_of_written(training.policy.backbone, buffers, told)
+    return _report(training, tokens, needs, free, disk, recipe.train.steps - _done(written))
+
+
+def _report(
+    training: TrainingRun, tokens: int, needs: _Needs, free: int | None, disk: _Disk, left: int
+) -> DryRunReport:
+    """What was found, in megabytes and hours.
+
+    Args:
+        tokens: of one frame.
+        free: bytes of memory before anything was built.
+        left: steps that are still to be taken.
+    """
+    recipe, policy, frames = training.recipe, training.policy, len(training.demos.train)
+    groups = policy.backbone.parameter_groups()
     return DryRunReport(
-        method=method.name,
+        method=training.method.name,
         backbone=recipe.backbone,
-        device=str(backbone.device),
-        processes=ranks.count,
-        parameters=_count(training.policy.parameters()),
-        trainable=_count(p for p in training.policy.parameters() if p.requires_grad),
-        groups={name: _count(group) for name, group in backbone.parameter_groups().items()},
+        device=str(policy.backbone.device),
+        processes=training.ranks.count,
+        parameters=_count(policy.parameters()),
+        trainable=_count(p for p in policy.parameters() if p.requires_grad),
+        groups={name: _count(group) for name, group in groups.items()},
         steps=recipe.train.steps,
         cameras=list(training.demos.cameras),
         training_frames=frames,
@@ -186,18 +199,22 @@ def _planned(
         tokens_per_frame=tokens,
         memory_mb={name: size / _MB for name, size in needs.parts.items()},
         memory_total_mb=sum(needs.parts.values()) / _MB,
-        memory_measured_mb=None if needs.measured is None else needs.measured / _MB,
-        memory_together_mb=None if needs.together is None else needs.together / _MB,
-        memory_free_mb=None if free is None else free / _MB,
+        memory_measured_mb=_in_mb(needs.measured),
+        memory_together_mb=_in_mb(needs.together),
+        memory_free_mb=_in_mb(free),
         memory_fits=needs.fits,
         step_s=needs.step_s,
         hours=None if needs.step_s is None else needs.step_s * left / 3600,
-        checkpoints=checkpoints,
-        disk_mb=disk / _MB,
-        disk_free_mb=room / _MB,
-        disk_fits=disk <= room,
-        out=str(out),
+        checkpoints=disk.checkpoints,
+        disk_mb=disk.needed / _MB,
+        disk_free_mb=disk.free / _MB,
+        disk_fits=disk.needed <= disk.free,
+        out=str(training.out),
     )
+
+
+def _in_mb(size: int | None) -> float | None:
+    return None if size is None else size / _MB
 
 
 def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
@@ -485,6 +502,31 @@ def _timed(training: TrainingRun) -> float:
 
 
 # --- disk -----------------------------------------------------------------------------------------
+
+
+class _Disk(NamedTuple):
+    """What checkpoints take, in bytes.
+
+    Attributes:
+        checkpoints: those still to be written that lie there at one time.
+    """
+
+    checkpoints: int
+    needed: int
+    free: int
+
+
+def _disk(training: TrainingRun, written: Sequence[Path]) -> _Disk:
+    """What the checkpoints take that are still to be written, and what is free.
+
+    Args:
+        written: those that are there.
+    """
+    to_come, kept = _to_come(training.recipe, written), training.recipe.train.keep_checkpoints
+    checkpoints = retention.most_at_once(to_come, len(written), kept)
+    # What is free changes meanwhile: all report what the first, which writes, has seen.
+    free = training.ranks.agree(_free_disk(training.out))
+    return _Disk(checkpoints, checkpoints * _checkpoint_bytes(training), free)
 
 
 def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:

@@ -9,6 +9,7 @@ repository has them. What is named stands still with all that is below it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import nn
@@ -40,29 +41,84 @@ def adapt(
     Raises:
         AegisError: a name that no part has, or nothing that is left to learn.
     """
-    maps, given = backbone.language_maps(), names(freeze or ())
+    maps = backbone.language_maps()
     # Before the method puts modules of its own in others' places.
-    every, named = _every(backbone), _named(backbone, given)
-    still = {id(every[name]): name for name in sorted(named)}
-    # A low-rank term would change what its map does.
-    free = {name: linear for name, linear in maps.items() if id(linear.weight) not in still}
+    still = named(backbone, freeze)
+    free = still.without(maps)
     method.adapt(backbone, free, options)
-    if not given:
+    if not still.given:
         return
     adds_less = method.export is not None and len(free) < len(maps)
-    stops = adds_less or any(every[name].requires_grad for name in named)
-    for name in named:
-        every[name].requires_grad_(False)
-    said = f"{_KEY}: {', '.join(given)}"
+    stops = adds_less or any(p.requires_grad for p in still.parameters.values())
+    still.hold()
     if not stops:
-        text = f"{said} changes nothing: method '{method.name}' trains none of it anyway"
+        text = f"{still.said} changes nothing: method '{method.name}' trains none of it anyway"
         on_event(Warned("train", text))
         return
-    _check_something_learns(backbone, f"{said} with method '{method.name}'")
-    for other, parameter in every.items():
-        if id(parameter) in still and other not in named:
-            text = f"{said} freezes {other} too, the same weight as {still[id(parameter)]}"
-            on_event(Warned("train", f"{text}: name both"))
+    with_method = f"{still.said} with method '{method.name}'"
+    check_something_learns(
+        with_method,
+        list(backbone.learning_groups()),
+        "freeze less; or --method stop-gradient, which trains the action expert alone",
+    )
+    still.warn_of_tied(on_event)
+
+
+@dataclass(frozen=True)
+class Still:
+    """What `train.freeze` names of a backbone.
+
+    Attributes:
+        given: the names and patterns, as the recipe has them.
+        parameters: the parameters that they name, by their names in the model itself.
+        tied: further names of these -> the name that was given.
+    """
+
+    given: tuple[str, ...] = ()
+    parameters: Mapping[str, nn.Parameter] = field(default_factory=dict)
+    tied: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def said(self) -> str:
+        """The key and its value, as messages begin."""
+        return f"{_KEY}: {', '.join(self.given)}"
+
+    def hold(self) -> None:
+        """Let none of it learn."""
+        for parameter in self.parameters.values():
+            parameter.requires_grad_(False)
+
+    def without(self, maps: Mapping[str, nn.Linear]) -> dict[str, nn.Linear]:
+        """The other maps: a low-rank term would change what its map does."""
+        still = set(map(id, self.parameters.values()))
+        return {name: linear for name, linear in maps.items() if id(linear.weight) not in still}
+
+    def left(self, groups: Mapping[str, Sequence[nn.Parameter]]) -> list[str]:
+        """The groups that have something else."""
+        still = set(map(id, self.parameters.values()))
+        return [name for name, own in groups.items() if any(id(p) not in still for p in own)]
+
+    def warn_of_tied(self, on_event: OnEvent) -> None:
+        """Say what else stands still, being the same weight."""
+        for other, name in self.tied.items():
+            text = f"{self.said} freezes {other} too, the same weight as {name}: name both"
+            on_event(Warned("train", text))
+
+
+def named(backbone: Backbone, freeze: str | Sequence[str] | None) -> Still:
+    """What `train.freeze` names, of a backbone without a method's own modules.
+
+    Raises:
+        AegisError: a name that no part has.
+    """
+    given, every = names(freeze or ()), _every(backbone)
+    own = {name: every[name] for name in sorted(_named(backbone, given))}
+    first = {id(parameter): name for name, parameter in own.items()}
+    tied = {}
+    for name, parameter in every.items():
+        if id(parameter) in first and name not in own:
+            tied[name] = first[id(parameter)]
+    return Still(given, own, tied)
 
 
 def sentence(freeze: str | Sequence[str] | None, before: str) -> str:
@@ -71,15 +127,20 @@ def sentence(freeze: str | Sequence[str] | None, before: str) -> str:
     return f"{before}Of the backbone `{'`, `'.join(given)}` did not learn." if given else ""
 
 
-def _check_something_learns(backbone: Backbone, said: str) -> None:
-    """Raise AegisError unless something learns that the action expert reads."""
-    left = list(backbone.learning_groups())
+def check_something_learns(said: str, left: Sequence[str], fix: str) -> None:
+    """Raise AegisError unless something learns that the action expert reads.
+
+    Args:
+        said: what freezes the rest.
+        left: the groups of which something learns.
+        fix: what to do if nothing does.
+    """
     if set(left) <= _BEHIND:
         but = f" but {' and '.join(left)}, which the action expert does not read" if left else ""
         raise AegisError(
             f"{said}: nothing of the backbone is left to learn{but}",
             "a part that learns",
-            "freeze less; or --method stop-gradient, which trains the action expert alone",
+            fix,
         )
 
 

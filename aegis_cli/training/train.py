@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from aegis_cli import methods, recipes
 from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.headers import rewrite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
@@ -27,6 +27,8 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import (
@@ -278,51 +280,82 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     settings = run.recipe.train
     shown: dict[str, float] = {}
     run.policy.train()
+    buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
-            started = time.perf_counter()
-            batch = next(batches)
-            fetched = time.perf_counter()
             finished = index + 1
-            last = finished in settings.plans
-            save = finished % settings.checkpoint_every == 0 or last
-            validate = finished % settings.validate_every == 0 or last
-            logged = save or validate or finished % settings.log_every == 0
-            # With several processes this is a message, for which a GPU would wait.
-            heeds = logged or not (run.ranks.several and run.unread.waits)
-            with _good_steps_saved(run):
-                update(run, index, batch, window, settle=save or validate)
-                if logged:
-                    read(run, window)
-            window.data_s += fetched - started
-            window.update_s += time.perf_counter() - fetched
-            window.steps += 1
-            if logged:
-                shown = _log(run, finished, window, validate)
+            due = _Due.after(finished, settings)
+            _take_step(run, index, batches, window, due)
+            if index == done:
+                warn_of_written(run.policy.backbone, buffers, on_event)
+            if due.line:
+                shown = _log(run, finished, window, due.validation)
                 log(shown)
                 window = Window()
-            if save:
+            if due.checkpoint:
                 _save(run, finished)
-            on_event(
-                Progress(
-                    "train",
-                    finished,
-                    settings.steps,
-                    "steps",
-                    {k: shown[k] for k in ("loss",) if k in shown},
-                )
-            )
-            # Between two constraints a step waits for the next: to constrain earlier would lead to
-            # other weights than those of a run that nobody interrupts.
-            heeds = heeds and not run.stepper.pending
-            if heeds and run.ranks.any(signaled.number is not None)[0]:
-                with _good_steps_saved(run):
-                    read(run, window)
-                _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
+            told = {k: shown[k] for k in ("loss",) if k in shown}
+            on_event(Progress("train", finished, settings.steps, "steps", told))
+            if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
+                _save_interrupted(run, finished, window)
                 signaled.leave()
     return run.ranks.agree(_report(run) if run.ranks.first else None)
+
+
+@dataclass(frozen=True)
+class _Due:
+    """What is due after a step: a checkpoint, a validation loss, a line of metrics."""
+
+    checkpoint: bool
+    validation: bool
+    line: bool
+
+    @classmethod
+    def after(cls, finished: int, settings: Train) -> _Due:
+        """What is due after so many steps; the last has all."""
+        last = finished in settings.plans
+        save = finished % settings.checkpoint_every == 0 or last
+        validate = finished % settings.validate_every == 0 or last
+        return cls(save, validate, save or validate or finished % settings.log_every == 0)
+
+
+def _take_step(
+    run: TrainingRun, index: int, batches: Iterator[RobotBatch], window: Window, due: _Due
+) -> None:
+    """Fetch a batch and take its step; the window gets both times.
+
+    Raises:
+        Diverged: the steps before it are saved.
+    """
+    started = time.perf_counter()
+    batch = next(batches)
+    fetched = time.perf_counter()
+    with _good_steps_saved(run):
+        update(run, index, batch, window, settle=due.checkpoint or due.validation)
+        if due.line:
+            read(run, window)
+    window.data_s += fetched - started
+    window.update_s += time.perf_counter() - fetched
+    window.steps += 1
+
+
+def _heeds(run: TrainingRun, due: _Due) -> bool:
+    """Whether a signal is looked for after this step."""
+    # Between two constraints a step waits for the next: to constrain earlier would lead to other
+    # weights than those of a run that nobody interrupts.
+    if run.stepper.pending:
+        return False
+    # With several processes this is a message, for which a GPU would wait.
+    return due.line or not (run.ranks.several and run.unread.waits)
+
+
+def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
+    """Write the checkpoint that a run goes on from after a signal."""
+    with _good_steps_saved(run):
+        read(run, window)
+    _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
 
 
 @contextmanager
@@ -423,6 +456,24 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
             good,
         )
     run.save_checkpoint(finished, going_on)
+
+
+def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEvent) -> None:
+    """Say which parts of the backbone passes have written to, for no method holds that.
+
+    Args:
+        before: its buffers before these passes.
+    """
+    written = [name.removeprefix(backbone.inside) for name in before.modules()]
+    if not written:
+        return
+    more = f" and of {len(written) - 1} more modules" if written[1:] else ""
+    text = (
+        f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm averages "
+        "what it reads: answers change with them, and no method holds them; train.freeze, of the "
+        "modules or of what they lie in, keeps batch normalisations as they are"
+    )
+    on_event(Warned("train", text))
 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:

@@ -37,7 +37,7 @@ from aegis_cli.evaluation.open_loop import (
 )
 from aegis_cli.evaluation.results import Result
 from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
-from aegis_cli.inspection import InspectReport
+from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
@@ -470,6 +470,17 @@ def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() 
     shown = text_of(render.inspect(InspectReport("run", "x", {}, open_loops=(evaluated,))))
     assert re.search(r"2 held-out episodes of arm +0\.250 +- +- +1,000", shown)
     assert "nothing is measured" not in shown
+
+
+def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:
+    rows = LayerEnergy("layers.3", 0.1, 0.2, 0.5)
+    frozen = tuple(f"layers.{i}" for i in (0, 1, 2, 4, 10, 11))
+    told = {"layers": (rows,), "over_time": (Bin(1, 2, 0.1, (0.1,)),)}
+    shown = text_of(render.inspect(InspectReport("ledger", "x", {}, frozen=frozen, **told)))
+    assert "nothing has learned of layers.0-2, layers.4, layers.10-11\n" in shown
+    assert "nothing has learned" not in text_of(
+        render.inspect(InspectReport("ledger", "x", {}, **told))
+    )
 
 
 def test_a_merge_is_told_without_what_was_not_measured() -> None:

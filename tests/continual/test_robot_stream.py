@@ -197,6 +197,56 @@ def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) ->
     )
 
 
+@pytest.mark.parametrize("freeze", ["stem", ("words", "layers.0")])
+def test_what_is_frozen_stays_bit_for_bit_where_all_weights_learn(
+    freeze: str | tuple[str, ...], make: Make, tiny_folder: Path, tmp_path: Path
+) -> None:
+    built = train.build(make("sequential", freeze=freeze), tmp_path)
+    learn(built, 2)
+    parts = (freeze,) if isinstance(freeze, str) else freeze
+    after = dict(built.model.backbone.named_parameters())
+    for name, before in backbones.load(str(tiny_folder)).named_parameters():
+        held = name.startswith(tuple(f"{part}." for part in parts))
+        # What lies behind all that the action expert reads has no gradient.
+        if held or name in ("layers.1.qkv.weight", "stem.halve.0.weight", "words.weight"):
+            assert same_bits(before, after[name]) == held, name
+
+
+@pytest.mark.parametrize("method", ["igsp", "isolated-lora"])
+def test_no_experts_stand_beside_what_is_frozen(method: str, make: Make, tmp_path: Path) -> None:
+    recipe = make(method, freeze=("layers.0.up", "layers.0.down", "stem"))
+    report, out = train.run(recipe, tmp_path / "run"), tmp_path / "run"
+    for record in report.records:
+        maps = {s.site for s in record.sites if s.site.startswith("backbone.")}
+        assert maps == {"backbone.layers.0.out"}
+    run = robots.load_to_act(out)
+    assert "backbone.layers.0.out" in run.sites and "backbone.layers.0.up" not in run.sites
+
+
+@pytest.mark.parametrize(
+    ("method", "freeze", "says"),
+    [
+        ("igsp", "stem", "with method 'igsp', which trains none of it anyway"),
+        ("isolated-lora", "layers.1", "which trains none of it anyway"),
+        ("igsp", "layers.0", "nothing of the backbone is left to learn"),
+        ("sequential", "*", "nothing of the backbone is left to learn"),
+        ("sequential", "vision", "'vision', and no part of the backbone is called so"),
+    ],
+)
+def test_to_freeze_what_would_not_learn_or_everything_is_refused_before_anything_is_recorded(
+    method: str,
+    freeze: str,
+    says: str,
+    make: Make,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(robots, "_demos", lambda *_: pytest.fail("demonstrations were looked for"))
+    with pytest.raises(AegisError) as caught:
+        train.build(make(method, freeze=freeze), tmp_path / "run")
+    assert caught.value.found.startswith("train.freeze: ") and says in caught.value.found
+
+
 # --- what is learned and told ---------------------------------------------------------------------
 
 

@@ -800,12 +800,52 @@ def test_frozen_parts_stay_frozen(anchor: Path) -> None:
     assert torch.equal(vector(model.vision), frozen) and not torch.equal(
         vector(model.text.layers[1]), free
     )
+
+
+def test_the_ledger_lists_what_learns_and_inspect_says_what_does_not(
+    anchor: Path, tmp_path: Path
+) -> None:
+    model = make()
+    model.vision.requires_grad_(False)
+    model.text.layers[0].requires_grad_(False)
+    guard = Guard(model, anchor, LAYERS)
+    guarded_steps(model, guard)
     rows = guard.ledger.tensors()
-    assert (
-        not rows["tt"][:, [0, 2]].any()
-        and not rows["aa"][:, [0, 2]].any()
-        and rows["aa"][:, 1].all()
-    )
+    assert guard.ledger.groups == ("layers.1", "embeddings", "text.norm")
+    assert guard.ledger.layers == ("layers.0", "layers.1")
+    assert rows["tt"].all() and rows["aa"][:, 0].all() and rows["w2"].all()
+    guard.ledger.save(tmp_path / "ledger.safetensors")
+    report = inspection.run(tmp_path / "ledger.safetensors")
+    assert [layer.name for layer in report.layers] == list(guard.ledger.groups)
+    assert report.frozen == ("layers.0",)
+
+
+class Averaged(nn.Linear):
+    """Divides by a mean of its own making, as if by BatchNorm's."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(width, width)
+        self.register_buffer("seen", torch.ones(()))
+        self.register_buffer("last", torch.ones(()), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.training:
+            self.seen = 0.9 * self.seen + 0.1 * x.detach().abs().mean()
+        self.last = x.detach().mean()
+        return super().forward(x / self.seen)
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_buffers_that_training_passes_change_are_told_once(training: bool, tmp_path: Path) -> None:
+    """Those that a checkpoint has, and only where they change."""
+    model = make()
+    model.text.norm = nn.Sequential(model.text.norm, Averaged(16).double())
+    guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), LAYERS)
+    model.train(training)
+    if training:
+        with pytest.warns(UserWarning, match=r"buffers of 'text\.norm\.1', as BatchNorm"):
+            guarded_steps(model, guard)
+    guarded_steps(model, guard)
 
 
 def test_what_lies_outside_the_model_is_left_to_the_task(anchor: Path) -> None:

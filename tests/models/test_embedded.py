@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from samples.backbones import LONGEST, TEXTS, close, encode, images, outspoken_tiny
+from samples.training import policy_over, robot_batch
 from torch import Tensor
 
 from aegis_cli.data.vqa.packing import pack
@@ -123,6 +127,36 @@ def test_the_longest_text_fits(embedded: EmbeddedVLM) -> None:
     )  # with the answer marker and all but the last word said
     assert len(embedded.answer(images(1), [question])) == 1
     assert embedded.answer_log_likelihood(images(1), [question], ["red cube"]).isfinite().all()
+
+
+# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_texts_of_every_length_share_what_is_compiled(embedded: EmbeddedVLM) -> None:
+    made = {"backbone": 0, "expert": 0}
+
+    def counting(part: str) -> Callable[..., Any]:
+        def count(graph: torch.fx.GraphModule, _: object) -> Any:
+            made[part] += 1
+            return graph.forward
+
+        return count
+
+    torch.compiler.reset()
+    plain, compiled = policy_over(outspoken_tiny()), policy_over(embedded)
+    compiled.backbone.compile_passes(counting("backbone"))  # type: ignore[arg-type]
+    compiled.expert.compile_layers(counting("expert"))  # type: ignore[arg-type]
+    for words in range(1, MAX_TEXT):  # a marker follows them
+        batch = replace(robot_batch(2), instructions=["ball", " ".join(["ball"] * words)])
+        losses, gradients = [], []
+        for policy in (plain, compiled):
+            encoding = policy.encode(batch.images, batch.instructions)
+            loss = policy.flow_loss(batch, encoding, 2, torch.Generator().manual_seed(0))
+            losses.append(loss)
+            gradients.append(torch.autograd.grad(loss, policy.backbone.words.weight))
+        close(*losses)
+        close(*(gradient for (gradient,) in gradients))
+    assert made["backbone"] <= 2
+    assert made["expert"] <= 5
 
 
 def test_a_half_precision_file_loads_in_float32(embedded: EmbeddedVLM, tmp_path: Path) -> None:

@@ -410,6 +410,41 @@ def test_a_dry_run_counts_no_gradient_of_what_is_frozen(
         assert less.disk_mb < whole.disk_mb
 
 
+def test_distill_copies_what_learns_alone(
+    hf_folder: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    plain = small(hf_folder("smolvlm"))
+    whole, less = (
+        dry_run.run(recipe, "distill", demos_file, None, tmp_path / "out")
+        for recipe in (plain, changed(plain, freeze="vision"))
+    )
+    saved = whole.memory_mb["method"] - less.memory_mb["method"]
+    assert saved == pytest.approx(4e-6 * whole.groups["vision"])
+    assert less.memory_mb["method"] > 0
+
+
+def test_what_distill_shares_with_its_teacher_is_what_it_would_have_copied() -> None:
+    found = []
+    for shares in (False, True):
+        policy, chosen = double_policy(), METHODS["distill"]
+        backbone = policy.backbone
+        freezing.adapt(chosen, backbone, options_of(chosen), ("stem", "layers.0"), heard()[1])
+        if not shares:
+            backbone.requires_grad_(True)  # so that all is copied
+        policy.parts = chosen.start(  # type: ignore[assignment]
+            Setting(backbone, backbone.learning_groups(), {}, options_of(chosen))
+        )
+        freezing.adapt(chosen, backbone, options_of(chosen), ("stem", "layers.0"), heard()[1])
+        with torch.no_grad():
+            backbone.layers[1].up.weight.mul_(1.5)
+        gradients(policy, chosen)
+        found.append(dict(policy.named_parameters()))
+    for name, parameter in found[0].items():
+        same = found[1][name]
+        assert parameter.requires_grad == same.requires_grad
+        assert same_bits(parameter, same) and same_bits(parameter.grad, same.grad), name
+
+
 @pytest.mark.parametrize("method", ["linear", "kfac-shrink", "factors"])
 def test_a_merge_leaves_what_was_frozen_where_it_is(
     method: str, merge_place: Place, aegis: Callable[..., Any], tmp_path: Path

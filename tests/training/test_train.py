@@ -37,9 +37,10 @@ from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Parts, Setting
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.models.expert import ActionExpert
 from aegis_cli.recipes import Nullspace, Recipe
-from aegis_cli.training import checkpoint, schedule
+from aegis_cli.training import assemble, checkpoint, dry_run, schedule, train
 
 FIGURES = {"step", "loss", "lr_expert"} | TIMES
 
@@ -161,6 +162,37 @@ def test_a_line_of_metrics_covers_the_steps_since_the_one_before(
     )
 
 
+@pytest.mark.parametrize("freeze", [None, "stem.norm"])
+def test_running_averages_that_move_are_told_once_with_what_keeps_them(
+    freeze: str | None,
+    recipe: Recipe,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No known family has any, but a model of the hub may."""
+    load = assemble.backbones.load
+
+    def with_averages(name: str) -> Backbone:
+        backbone = load(name)
+        backbone.stem.norm = nn.BatchNorm2d(3)
+        backbone.stem.register_forward_pre_hook(lambda stem, given: stem.norm(*given))
+        return backbone
+
+    monkeypatch.setattr(assemble.backbones, "load", with_averages)
+    chosen = replace(recipe, train=replace(SETTINGS, steps=2, checkpoint_every=2, freeze=freeze))
+    for run in (train.run, dry_run.run):
+        told: list[str] = []
+
+        def hear(event: Event, told: list[str] = told) -> None:
+            told += [event.text] if isinstance(event, Warned) else []
+
+        run(chosen, "naive", demos_file, None, tmp_path / run.__module__, on_event=hear)
+        assert len(told) == (freeze is None)
+        for text in told:
+            assert "buffers of 'stem.norm', as BatchNorm" in text and "train.freeze" in text
+
+
 def test_all_methods_begin_with_the_same_expert(
     start: Start, recipe: Recipe, tmp_path: Path
 ) -> None:
@@ -197,7 +229,7 @@ def test_a_compiled_policy_trains_alike(
         called.append(real.__name__)
         real(part, "aot_eager")
 
-    for owner, name in ((Backbone, "compile_passes"), (ActionExpert, "compile_layers")):
+    for owner, name in ((EmbeddedVLM, "compile_passes"), (ActionExpert, "compile_layers")):
         real = getattr(owner, name)
         monkeypatch.setattr(owner, name, lambda part, real=real: quickly(real, part))
     runs = []

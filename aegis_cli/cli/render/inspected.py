@@ -51,6 +51,8 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
                 ("Group", "Energy shed, mean %", "Largest step %", "Steps in conflict %"), rows
             )
         )
+        if report.frozen:
+            parts.append(Text(f"nothing has learned of {_as_ranges(report.frozen)}\n"))
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "checkpoint", "ledger"):
         parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
@@ -180,6 +182,17 @@ def _features(features: Sequence[Any]) -> Table:
                 (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
             )
     return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
+
+
+def _as_ranges(layers: Sequence[str]) -> str:
+    """Names `layers.{i}` as `train.freeze` takes them: `layers.0-11, layers.13`."""
+    ranges: list[tuple[int, int]] = []
+    for i in sorted(int(name.rpartition(".")[2]) for name in layers):
+        if ranges and ranges[-1][1] == i - 1:
+            ranges[-1] = (ranges[-1][0], i)
+        else:
+            ranges.append((i, i))
+    return ", ".join(f"layers.{a}-{b}" if b > a else f"layers.{a}" for a, b in ranges)
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:

@@ -23,6 +23,7 @@ from aegis_cli.models.structure import (
     owning_modules,
     site_kind,
     under,
+    what_learns,
 )
 
 FLOAT32 = "float32"
@@ -213,21 +214,21 @@ class Backbone(nn.Module, ABC):
         """The parameters, each in exactly one group: `layers.{i}`, or another part by its name."""
 
     def train(self, mode: bool = True) -> Self:
-        """Go to training mode, but for running averages (BatchNorm's) of what does not learn."""
+        """Go to training mode, but for running averages (BatchNorm's) of what does not learn.
+
+        Those without weights of their own belong to the part that they lie in.
+        """
         super().train(mode)
-        for module in averaging(self).values():
-            own = list(module.parameters())
+        for name, module in averaging(self).items():
+            around = self.get_submodule(name.rpartition(".")[0])
+            own = list(module.parameters()) or list(around.parameters())
             if own and not any(p.requires_grad for p in own):
                 module.eval()
         return self
 
     def learning_groups(self) -> dict[str, list[nn.Parameter]]:
         """What learns of each group, without the groups of which nothing does."""
-        found = {}
-        for name, group in self.parameter_groups().items():
-            if learning := [p for p in group if p.requires_grad]:
-                found[name] = learning
-        return found
+        return what_learns(self.parameter_groups())
 
     @abstractmethod
     def language_maps(self) -> dict[str, nn.Linear]:

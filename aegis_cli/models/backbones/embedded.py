@@ -28,6 +28,8 @@ from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 MAX_TEXT = 20  # tokens of a question with its answer
 MAX_ANSWER = 4  # tokens of an answer with its end
+# Tokens; a compiled model's prompts are padded to multiples, of which MAX_TEXT is one.
+MULTIPLE = 4
 # The location words of data/vqa/questions.py, which itself would load MuJoCo.
 X_WORDS, Y_WORDS = (tuple(f"{axis}{i}" for i in range(8)) for axis in "xy")
 
@@ -114,6 +116,7 @@ class EmbeddedVLM(Backbone):
     kind: ClassVar[str] = "backbone"
     tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
     numbers: ClassVar[int] = len(X_WORDS) * len(Y_WORDS)
+    _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -194,6 +197,15 @@ class EmbeddedVLM(Backbone):
         is_image = torch.arange(hidden[0].shape[1], device=device) < count
         return Encoding(tuple(hidden), tuple(joined), mask, is_image)
 
+    def compile_passes(self, backend: str = "inductor") -> None:
+        """Compile the whole pass, and pad prompts to multiples of some tokens.
+
+        The expert's layers, which read this pass, are compiled anew for every other length, of
+        which five are left.
+        """
+        super().compile_passes(backend)
+        self._multiple = MULTIPLE
+
     # --- questions -----------------------------------------------------------------------------
 
     def pixels(self, images: Tensor) -> Tensor:
@@ -201,7 +213,7 @@ class EmbeddedVLM(Backbone):
         return send(images, self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
 
     def process(self, images: Tensor, prompts: Sequence[str]) -> Batch:
-        ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts])
+        ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts], self._multiple)
         return Batch(self.pixels(images), ids, mask)
 
     @torch.no_grad()
@@ -297,10 +309,15 @@ class EmbeddedVLM(Backbone):
         # The model's own answer has to fit too.
         _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))
 
-    def _pad(self, rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
-        """Rows of ids as ids [B, S] padded on the right, and their mask [B, S]."""
-        length = max(len(row) for row in rows)
-        _check_length(length)
+    def _pad(self, rows: Sequence[Sequence[int]], multiple: int = 1) -> tuple[Tensor, Tensor]:
+        """Rows of ids as ids [B, S] padded on the right, and their mask [B, S].
+
+        Args:
+            multiple: S is a multiple of it.
+        """
+        longest = max(len(row) for row in rows)
+        _check_length(longest)
+        length = -(-longest // multiple) * multiple
         padded = [[*row, *[self.tokenizer.pad] * (length - len(row))] for row in rows]
         ids = send(torch.tensor(padded), self.device)
         return ids, ids != self.tokenizer.pad

@@ -1,0 +1,72 @@
+"""Which parts of a model its own passes write to, as batch normalisations average what they read.
+
+No method holds what is written so: it is no parameter and has no gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from aegis_cli.models.wrappers import plain_names
+
+
+class WrittenBuffers:
+    """The buffers of a model as they are now, to see which of them change later."""
+
+    def __init__(self, model: nn.Module) -> None:
+        """Copy them."""
+        self._model = model
+        self._then = {name: [_Then.of(b) for b in own] for name, own in _kept(model)}
+
+    def modules(self) -> list[str]:
+        """Plain names of the modules that have buffers with other values than then."""
+        found, plain = [], plain_names(self._model)
+        for name, own in _kept(self._model):
+            then = self._then.get(name, [])
+            if len(own) != len(then) or _changed(own, then):
+                found.append(plain(name))
+        return found
+
+
+@dataclass(frozen=True)
+class _Then:
+    """A buffer, how often it had been written to as PyTorch counts it, and its values then."""
+
+    buffer: Tensor
+    version: int
+    values: Tensor
+
+    @classmethod
+    def of(cls, buffer: Tensor) -> _Then:
+        return cls(buffer, buffer._version, buffer.detach().clone())
+
+
+def _changed(own: Sequence[Tensor], then: Sequence[_Then]) -> bool:
+    """Whether any buffer of a module has other values than then.
+
+    What nobody wrote to is not read, for which a GPU would wait: of BatchNorm only the number of
+    batches counts as written to. DistributedDataParallel writes equal values before each pass.
+    """
+    pairs = list(zip(own, then, strict=True))
+    if all(now is before.buffer and now._version == before.version for now, before in pairs):
+        return False
+    return not all(torch.equal(now, before.values.to(now.device)) for now, before in pairs)
+
+
+def _kept(model: nn.Module) -> Iterator[tuple[str, list[Tensor]]]:
+    """The buffers of each module that are written into checkpoints, by its name.
+
+    The others are made anew, as tables of positions are for longer texts.
+    """
+    for name, module in model.named_modules():
+        own = []
+        for leaf, buffer in module._buffers.items():
+            lasts = buffer is not None and leaf not in module._non_persistent_buffers_set
+            if lasts and not buffer.is_inference():  # which is never written to
+                own.append(buffer)
+        if own:
+            yield name, own
