@@ -226,11 +226,16 @@ def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tens
             "give the mask of the tokens that the layers see, image tokens among them; None if "
             "every one counts",
         )
+    refuse_empty(valid)
+    return valid
+
+
+def refuse_empty(valid: Tensor) -> None:
+    """Raise AegisError for a mask by which no token counts."""
     if not valid.any():
         raise AegisError(
             "a mask without a single valid token", "at least one", "leave empty batches out"
         )
-    return valid
 
 
 def boolean(mask: Tensor, what: str) -> Tensor:

@@ -188,7 +188,9 @@ def test_every_pass_has_its_answers() -> None:
     with pytest.raises(AegisError, match=r"scores \[0, 8, 23\]"):
         found.answer(scores[:0])
     found.answer(scores[:, PATCHES:])
-    forward()
+    overflowed = forward() * torch.inf
+    with pytest.raises(AegisError, match=r"not finite[\s\S]*float32"):
+        found.answer(overflowed)
     found.remove()
     with pytest.raises(AegisError, match="without the curvature"):
         Guard.measure(model, LAYERS).answer(scores)
