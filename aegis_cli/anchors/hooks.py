@@ -85,6 +85,10 @@ class LayerHooks:
             mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
                 None: all count.
             image: [T] or [B, T], true at image tokens; None: no token is one.
+
+        Raises:
+            AegisError: a block inside another, layers that were not called or do not fit together,
+                or masks of other tokens.
         """
         if self.open:
             raise AegisError(

@@ -79,12 +79,12 @@ def run(
     Files give at most as many as they hold. It runs in float32, so that neither batch size nor
     order shows in the result.
 
+    Where torchrun has started several processes, each calls this, and they share the passes.
+
     Args:
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
         selection: which of their frames; nothing but pictures and instructions is read.
-
-    Where torchrun has started several processes, each calls this, and they share the passes.
 
     Raises:
         AegisError: inputs that cannot be read, or parts that frames do not tell.

@@ -110,6 +110,8 @@ def run(
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
     Args:
         questions: how many are asked; at most, where they come from files.
         gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
@@ -120,8 +122,6 @@ def run(
             checkpoints.
         ask: what a question becomes before a model reads it, with {} for it.
         seed: of the choice of questions.
-
-    Where torchrun has started several processes, each calls this, and they share the questions.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -275,10 +275,10 @@ def answers(
 ) -> Answers:
     """Ask a run or backbone, and measure its drift from an anchor.
 
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
     Args:
         anchor: its file, and the fingerprint of the backbone that it has to be of.
-
-    Where torchrun has started several processes, each calls this, and they share the questions.
 
     Raises:
         AegisError: nothing to load, or an anchor of another backbone.
@@ -388,7 +388,11 @@ def compare(
     w2_between: str | None = None,
     gate: str = MEAN,
 ) -> ProbeReport:
-    """The report of two sets of answers to the same questions."""
+    """The report of two sets of answers to the same questions.
+
+    Raises:
+        AegisError: `max_drop` without answers from before.
+    """
     total, families = score(after), by_family(after)
     reference = None if before is None else score(before)
     earlier = {} if before is None else by_family(before)

@@ -105,6 +105,9 @@ def relative_fisher(
     """Each learning parameter's Fisher information, scaled to mean 1 over all their entries.
 
     It has the parameter's shape and dtype.
+
+    Raises:
+        AegisError: a parameter that was not measured, or a mean that is 0 or no number.
     """
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:
