@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors.curvature import CurvatureRecorder
-from aegis_cli.anchors.hooks import LayerHooks, Removable, boolean
+from aegis_cli.anchors.hooks import LayerHooks, Removable, boolean, refuse_empty
 from aegis_cli.anchors.inputs import InputRecorder
 from aegis_cli.anchors.moments import MomentRecorder
 from aegis_cli.common.errors import AegisError
@@ -99,7 +99,8 @@ class Measurement(Removable):
             self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
         if "curvature" in parts:
             self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
-        self._samples, self._broken, self._unanswered = 0, False, False
+        self._samples: int | None = 0  # None: a pass has not told how many it had
+        self._broken, self._unanswered = False, False
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
@@ -125,6 +126,9 @@ class Measurement(Removable):
                 "measured.watch(mask, image=...), all false for prompts without images",
             )
         self._check_answered()
+        counts = None if mask is None else boolean(mask, "a mask")
+        if counts is not None:
+            refuse_empty(counts)
         self._broken = True  # unless the block ends well
         self._unanswered = self._curvature is not None
         with contextlib.ExitStack() as stack:
@@ -133,14 +137,13 @@ class Measurement(Removable):
             if self._layers:
                 stack.enter_context(self._hooks.watch(mask, image, self._count))
             if self._inputs is not None:
-                counts = None if mask is None else boolean(mask, "a mask")
                 stack.enter_context(self._inputs.watch(counts))
             if self._curvature is not None:
                 stack.enter_context(self._curvature.watch())
             yield
         # With layers watched, `_count` knows the batch's size from what they return.
-        if not self._layers and mask is not None:
-            self._samples += len(mask)
+        if not self._layers:
+            self._add_samples(None if mask is None else len(mask))
         self._broken = False
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
@@ -204,7 +207,9 @@ class Measurement(Removable):
         """Write the anchor; the weights must still be those that were measured."""
         measured = (self._layers, self._inputs is not None, self._curvature is not None)
         parts = [part for part, has in zip(PARTS, measured, strict=True) if has]
-        meta: dict[str, Any] = {"parts": parts, "energy": self._energy, "samples": self._samples}
+        meta: dict[str, Any] = {"parts": parts, "energy": self._energy}
+        if self._samples is not None:
+            meta["samples"] = self._samples
         plain = plain_names(self._model)
         if self._layers:
             meta["layers"] = [plain(name) for name in self._layers]
@@ -236,4 +241,8 @@ class Measurement(Removable):
 
     def _count(self, seen: Pass) -> None:
         self._moments.add(seen.hidden, seen.mask, seen.image)
-        self._samples += len(seen.mask)
+        self._add_samples(len(seen.mask))
+
+    def _add_samples(self, count: int | None) -> None:
+        known = self._samples is not None and count is not None
+        self._samples = self._samples + count if known else None

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from aegis_cli.anchors import inputs, passes
 from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
-from aegis_cli.anchors.second_moments import SecondMoments
+from aegis_cli.anchors.second_moments import FINITE, SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -174,6 +174,9 @@ class CurvatureRecorder:
         Args:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
             keep: keep the graph, for other scores of the same pass.
+
+        Raises:
+            AegisError: scores by which no word can be drawn.
         """
         self.entropy.add(scores)
         self.follow(_log_likelihood(scores / self._temperature, self._generator), keep)
@@ -380,5 +383,11 @@ def _log_likelihood(scores: Tensor, generator: torch.Generator) -> Tensor:
     """The log-likelihood of words drawn from the scores [n, V] themselves."""
     # Drawn on the CPU, where the generator is, so that the words are the same on every device.
     chances = scores.detach().float().softmax(-1).cpu()
+    if not chances.isfinite().all():
+        raise AegisError(
+            f"scores of {len(scores)} words, some of which are not finite",
+            "finite scores; minus infinity for a word that is never said",
+            f"{FINITE}, and see that its weights are finite",
+        )
     drawn = torch.multinomial(chances, 1, generator=generator).to(scores.device)  # [n, 1]
     return scores.float().log_softmax(-1).gather(1, drawn).sum()

@@ -85,6 +85,10 @@ class LayerHooks:
             mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
                 None: all count.
             image: [T] or [B, T], true at image tokens; None: no token is one.
+
+        Raises:
+            AegisError: a block inside another, layers that were not called or do not fit together,
+                or masks of other tokens.
         """
         if self.open:
             raise AegisError(
@@ -226,11 +230,16 @@ def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tens
             "give the mask of the tokens that the layers see, image tokens among them; None if "
             "every one counts",
         )
+    refuse_empty(valid)
+    return valid
+
+
+def refuse_empty(valid: Tensor) -> None:
+    """Raise AegisError for a mask by which no token counts."""
     if not valid.any():
         raise AegisError(
             "a mask without a single valid token", "at least one", "leave empty batches out"
         )
-    return valid
 
 
 def boolean(mask: Tensor, what: str) -> Tensor:

@@ -398,7 +398,11 @@ def dense_width(module: nn.Module) -> int | None:
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:
-    """What the module's parameters multiply, one row per output token: [n, d]."""
+    """What the module's parameters multiply, one row per output token: [n, d].
+
+    Raises:
+        AegisError: a volume that is larger than the kernel of a 3-D convolution.
+    """
     if isinstance(module, nn.Conv2d):
         padding = 0 if module.padding == "valid" else module.padding
         patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)

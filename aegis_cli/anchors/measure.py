@@ -79,12 +79,12 @@ def run(
     Files give at most as many as they hold. It runs in float32, so that neither batch size nor
     order shows in the result.
 
+    Where torchrun has started several processes, each calls this, and they share the passes.
+
     Args:
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
         selection: which of their frames; nothing but pictures and instructions is read.
-
-    Where torchrun has started several processes, each calls this, and they share the passes.
 
     Raises:
         AegisError: inputs that cannot be read, or parts that frames do not tell.
@@ -142,18 +142,19 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
         },
     )
     # Every layer sees the same tokens, so the first one's count is that of all.
-    counts = [found[0].count if found else None for found in (anchor.image, anchor.text)]
+    image, text = (found[0].count if found else None for found in (anchor.image, anchor.text))
     return AnchorReport(
-        measured.samples,
-        measured.skipped,
-        *counts,
-        len(anchor.image) or None,
-        inputs.kept_share(anchor.inputs),
-        measured.entropy,
-        measured.seconds,
-        out.stat().st_size / 1e6,
-        str(out),
-        artifacts.sha256_file(out),
+        samples=measured.samples,
+        skipped=measured.skipped,
+        image_tokens=image,
+        text_tokens=text,
+        layers=len(anchor.image) or None,
+        directions=inputs.kept_share(anchor.inputs),
+        entropy=measured.entropy,
+        seconds=measured.seconds,
+        megabytes=out.stat().st_size / 1e6,
+        out=str(out),
+        sha256=artifacts.sha256_file(out),
     )
 
 
@@ -192,13 +193,13 @@ def _on_questions(
     anchor, seconds = _PartMeasurement(model, asked, settings, on_event, ranks, entropy).parts()
     return _Measured(
         anchor,
-        model.fingerprint(),
-        len(asked.questions),
-        asked.skipped,
-        seconds,
-        source.sha256,
-        {"vqa": source.name} | ({} if source.ask == sets.PLAIN else {"ask": source.ask}),
-        entropy.mean(ranks) if anchor.curvature else None,
+        fingerprint=model.fingerprint(),
+        samples=len(asked.questions),
+        skipped=asked.skipped,
+        seconds=seconds,
+        inputs=source.sha256,
+        meta={"vqa": source.name} | ({} if source.ask == sets.PLAIN else {"ask": source.ask}),
+        entropy=entropy.mean(ranks) if anchor.curvature else None,
     )
 
 
@@ -239,12 +240,12 @@ def _on_frames(
     image, text = moments.measure_passes(model, batches, read, len(frames), on_event, ranks)
     return _Measured(
         Anchor(image, text),
-        model.fingerprint(),
-        len(frames),
-        0,
-        {"moments": time.perf_counter() - start},
-        {"demos": found.sha256},
-        meta,
+        fingerprint=model.fingerprint(),
+        samples=len(frames),
+        skipped=0,
+        seconds={"moments": time.perf_counter() - start},
+        inputs={"demos": found.sha256},
+        meta=meta,
     )
 
 
@@ -310,10 +311,10 @@ class _PartMeasurement:
             self.settings.energy,
             self.settings.batch_size,
             self.on_event,
-            self._memory,
-            self.settings.exact_width,
-            self.ranks,
-            inputs.Drawn(self.settings.tokens, self.settings.seed),
+            memory=self._memory,
+            whole=self.settings.exact_width,
+            ranks=self.ranks,
+            drawn=inputs.Drawn(self.settings.tokens, self.settings.seed),
         )
 
     def _curvature(self) -> dict[str, Spectrum]:
@@ -324,11 +325,11 @@ class _PartMeasurement:
             self.settings.seed,
             self.settings.batch_size,
             self.on_event,
-            self._memory,
-            self.settings.exact_width,
-            self.ranks,
-            self.settings.temperature,
-            self.entropy,
+            memory=self._memory,
+            whole=self.settings.exact_width,
+            ranks=self.ranks,
+            temperature=self.settings.temperature,
+            entropy=self.entropy,
         )
 
     def _fisher(self) -> dict[str, Tensor]:

@@ -14,6 +14,8 @@ from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
 from aegis_cli.core.spectrum import Spectrum, decompose
 
+# The cure for activations that are not finite.
+FINITE = "measure the model in float32 or bfloat16, since float16 ends at 65,504"
 Readers = tuple[str, ...]  # names of maps that have read the same rows, in alphabetical order
 
 
@@ -102,6 +104,9 @@ class SecondMoments:
             leave_out: names of moments that do not count.
             release: forget each sum when its spectrum is found, so that not all are in memory at
                 the same time.
+
+        Raises:
+            AegisError: a sum that is not finite.
         """
         names = [name for name in self._counts if name not in leave_out]
         sums_of = {name: tuple(r for r in self._rows if name in r) for name in names}
@@ -111,10 +116,12 @@ class SecondMoments:
         with devices.single_threaded():  # the eigensolver waits for its own threads
             for name, sums in sums_of.items():
                 if name in self._small:
+                    _check_finite(name, [self._small[name]])
                     found[name] = _small(self._small[name].cpu() / self._counts[name], energy)
                     continue
                 if sums not in shared:
                     whole = moment_sums.merged([self._rows[readers] for readers in sums])
+                    _check_finite(name, whole.parts())
                     shared[sums] = whole.spectrum(self._counts[name], energy)
                 found[name] = shared[sums]
                 if release:
@@ -133,6 +140,16 @@ def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
         if leader != name:
             followers[name] = leader
     return followers
+
+
+def _check_finite(name: str, parts: Iterable[Tensor]) -> None:
+    """Raise AegisError for a sum of which no eigenvectors can be found."""
+    if not all(part.isfinite().all() for part in parts):
+        raise AegisError(
+            f"a second moment of '{name}' that is not finite",
+            "finite activations and gradients in every pass",
+            f"{FINITE}, and see that its weights are finite",
+        )
 
 
 def _small(mean: Tensor, energy: float) -> Spectrum:

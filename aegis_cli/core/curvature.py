@@ -91,11 +91,7 @@ class Curvature:
             bias: displacement of its bias, [o].
             strength: the penalty's weight w, a tensor [] where nobody may read it.
         """
-        if isinstance(strength, Tensor):
-            strength = strength.clamp(max=_HEAVIEST)
-        else:
-            strength = min(strength, _HEAVIEST)
-        return self._weighed(weight, bias, strength, taken)
+        return self._weighed(weight, bias, bounded(strength), taken)
 
     def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
         """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
@@ -208,6 +204,14 @@ def _relative(spectrum: Spectrum) -> Tensor:
     return ratio(spectrum.values, spectrum.values.mean())[: spectrum.vectors.shape[1]]
 
 
+def bounded(strength: float | Tensor) -> float | Tensor:
+    """A penalty's weight w, at most so large that a proximal step takes away all but rounding."""
+    if isinstance(strength, Tensor):
+        return strength.clamp(max=_HEAVIEST)
+    return min(strength, _HEAVIEST)
+
+
 def taken(strength: Tensor) -> Tensor:
     """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
+    strength = strength.clamp(max=_HEAVIEST)  # infinity over infinity is no number
     return strength / (1 + strength)

@@ -105,7 +105,7 @@ class Whole(MomentSum):
     def add(self, rows: Tensor) -> None:
         x = _widened(rows)
         if self._width <= EXACT_SUM:
-            moment = second_moment(x, bias=False)
+            moment = second_moment(x)
             self._sums = [self._sums[0] + moment if self._sums else moment]
             return
         if not self._sums:

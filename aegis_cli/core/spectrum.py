@@ -67,19 +67,15 @@ def with_rest(found: Tensor, vectors: Tensor, rest: Tensor) -> Spectrum:
 
 
 @torch.no_grad()
-def second_moment(rows: Tensor, bias: bool) -> Tensor:
-    """Sum over rows [n, d] of x x^T, or with a bias of (x, 1) (x, 1)^T.
+def second_moment(rows: Tensor) -> Tensor:
+    """Sum over rows [n, d] of x x^T: [d, d] float64. The rows of a map with a bias end with a 1.
 
     C is uncentred by definition, and its diagonal is a sum of squares, so nothing cancels. Rows
     narrower than float32 are widened first, also under autocast: eight bits would hide the smaller
     directions. Some processors' products are not symmetric bit by bit, so the lower triangle is
     mirrored.
-
-    Returns:
-        [d, d] float64; with a bias [d + 1, d + 1].
     """
     x = rows.to(torch.promote_types(rows.dtype, torch.float32))
-    x = torch.cat([x, x.new_ones(len(x), 1)], dim=1) if bias else x
     total = torch.zeros(x.shape[1], x.shape[1], dtype=torch.float64, device=x.device)
     with torch.autocast(x.device.type, enabled=False):
         for block in x.split(_BLOCK):

@@ -51,26 +51,20 @@ def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
 
 
 def transport_penalty(
-    moments: Sequence[tuple[Tensor, Tensor]],
-    anchor: Sequence[Moments],
-    weighting: str = "none",
-    weights: Tensor | None = None,
+    moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Moments], weights: Tensor
 ) -> tuple[Tensor, Tensor]:
     """How far each layer's activations are from the anchor.
 
     Args:
         moments: (mean [D], var [D]) of the current batch, one pair per layer, with their graph.
         anchor: the pre-trained moments, one per layer.
-        weighting: see `layer_weights`.
-        weights: what `layer_weights` made of both, where it is known.
+        weights: what `layer_weights` has made of the anchor, [L].
 
     Returns:
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
     w2 = _of_each_layer(moments, anchor)
-    if weights is None:
-        weights = layer_weights(anchor, weighting)
     return (w2 * weights).mean(), w2.detach()
 
 

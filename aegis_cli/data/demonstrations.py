@@ -378,15 +378,15 @@ def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:
     tensors, meta = dict(artifact.tensors), artifact.header.meta
     episode_of, train, validation = _split(path, tensors["episode_starts"], split)
     return Demonstrations(
-        meta["task"],
-        (tensors.pop("frames"),),
-        tensors,
-        meta["instructions"],
-        tensors.pop("instruction")[episode_of],
-        episode_of,
-        train,
-        validation,
-        watched.sha256[path],
+        task=meta["task"],
+        frames=(tensors.pop("frames"),),
+        instructions=meta["instructions"],
+        instruction_of=tensors.pop("instruction")[episode_of],
+        tensors=tensors,
+        episode_of=episode_of,
+        train=train,
+        validation=validation,
+        sha256=watched.sha256[path],
         watched=(watched,),
         action_names=renaming.joints(rename, meta.get("action_names", ()), f"'{path}'"),
         proprio_names=renaming.joints(rename, meta.get("proprio_names", ()), f"'{path}'"),
@@ -425,21 +425,21 @@ def _load_folder(
             frames.append(torch.from_numpy(made))
             mapped.append(Path(made.filename))
     return Demonstrations(
-        found.info.task,
-        tuple(frames),
-        {"proprio": proprio, "actions": actions, "episode_starts": starts},
-        list(found.tasks),
-        torch.from_numpy(index.task),
-        episode_of,
-        train,
-        validation,
-        sources.joined_digest(digests),
-        tuple(map(found.called, cameras)),
+        task=found.info.task,
+        frames=tuple(frames),
+        tensors={"proprio": proprio, "actions": actions, "episode_starts": starts},
+        instructions=list(found.tasks),
+        instruction_of=torch.from_numpy(index.task),
+        episode_of=episode_of,
+        train=train,
+        validation=validation,
+        sha256=sources.joined_digest(digests),
+        cameras=tuple(map(found.called, cameras)),
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
-        (WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
-        action_names,
-        proprio_names,
-        found.info.fps,
+        watched=(WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
+        action_names=action_names,
+        proprio_names=proprio_names,
+        fps=found.info.fps,
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
 
-_MOST = 1_000_000  # numbers in one range
+_MOST = 1_000_000  # numbers in one range or split
 
 
 def listed(text: str) -> list[int]:
@@ -77,5 +77,7 @@ def _named(text: str, splits: Mapping[str, str]) -> list[int]:
 def _of_split(said: str) -> list[int]:
     first, colon, end = said.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal()):
+        raise ValueError(said)
+    if int(end) - int(first) > _MOST:
         raise ValueError(said)
     return list(range(int(first), int(end)))

@@ -69,6 +69,9 @@ def successes(
 
     A task whose expert fails gets later numbers in place of the failures, so that every task has
     its share in the end.
+
+    Raises:
+        AegisError: an expert that keeps failing.
     """
     left = shares(tasks, episodes)
     limit = 2 * episodes + 20 * len(tasks)

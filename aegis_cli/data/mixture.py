@@ -98,36 +98,33 @@ def joined(
     episodes = [len(own.tensors["episode_starts"]) - 1 for own in shown]
     first_episodes = torch.tensor([0, *episodes]).cumsum(0)[:-1].tolist()
     texts = list(dict.fromkeys(text for own in shown for text in own.instructions))
-    ends = [
-        own.tensors["episode_starts"][1:] + start for own, start in zip(shown, starts, strict=True)
-    ]
     numbered = list(zip(shown, starts, strict=True))
+    ends = [own.tensors["episode_starts"][1:] + start for own, start in numbered]
+    of_camera = zip(*(own.frames for own in shown), strict=True)
+    members = zip(paths, shown, strict=True)
     return Demonstrations(
-        next((own.task for own in shown if own.task is not None), None),
-        tuple(
-            JoinedFrames(cameras) for cameras in zip(*(own.frames for own in shown), strict=True)
-        ),
-        {
+        task=next((own.task for own in shown if own.task is not None), None),
+        frames=tuple(map(JoinedFrames, of_camera)),
+        tensors={
             "proprio": torch.cat([own.tensors["proprio"] for own in shown]),
             "actions": torch.cat([own.tensors["actions"] for own in shown]),
             "episode_starts": torch.cat([torch.zeros(1, dtype=torch.int64), *ends]),
         },
-        texts,
-        torch.cat([_renumbered(own, texts) for own in shown]),
-        torch.cat([own.episode_of + e for own, e in zip(shown, first_episodes, strict=True)]),
-        torch.cat([own.train + start for own, start in numbered]),
-        torch.cat([own.validation + start for own, start in numbered]),
-        joined_digest([own.sha256 for own in shown]),
-        next((own.cameras for own in shown if own.cameras), ()),
-        tuple(watched for own in shown for watched in own.watched),
-        next((own.action_names for own in shown if any(own.action_names)), ()),
-        next((own.proprio_names for own in shown if any(own.proprio_names)), ()),
-        next((own.fps for own in shown if own.fps is not None), None),
-        tuple(name for own in shown for name in own.datasets),
-        tuple(
-            Member(str(path), own.sha256, len(own.train))
-            for path, own in zip(paths, shown, strict=True)
+        instructions=texts,
+        instruction_of=torch.cat([_renumbered(own, texts) for own in shown]),
+        episode_of=torch.cat(
+            [own.episode_of + e for own, e in zip(shown, first_episodes, strict=True)]
         ),
+        train=torch.cat([own.train + start for own, start in numbered]),
+        validation=torch.cat([own.validation + start for own, start in numbered]),
+        sha256=joined_digest([own.sha256 for own in shown]),
+        cameras=next((own.cameras for own in shown if own.cameras), ()),
+        watched=tuple(watched for own in shown for watched in own.watched),
+        action_names=next((own.action_names for own in shown if any(own.action_names)), ()),
+        proprio_names=next((own.proprio_names for own in shown if any(own.proprio_names)), ()),
+        fps=next((own.fps for own in shown if own.fps is not None), None),
+        datasets=tuple(name for own in shown for name in own.datasets),
+        members=tuple(Member(str(path), own.sha256, len(own.train)) for path, own in members),
     )
 
 

@@ -110,6 +110,8 @@ def run(
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
     Args:
         questions: how many are asked; at most, where they come from files.
         gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
@@ -120,8 +122,6 @@ def run(
             checkpoints.
         ask: what a question becomes before a model reads it, with {} for it.
         seed: of the choice of questions.
-
-    Where torchrun has started several processes, each calls this, and they share the questions.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -144,7 +144,7 @@ def run(
     model = backbones.load(target)
     before = None if baseline is None else backbones.load(baseline)
     if before is not None:
-        _warn_of_another_start(target, baseline, before.fingerprint(), on_event)
+        _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
     # Both models have to read every question: the drop is of the same ones.
     checks = [m.check_text for m in (model, before) if m is not None]
@@ -235,7 +235,7 @@ def warn_of_few_questions(report: ProbeReport, max_drop: float | None, on_event:
 
 
 def _warn_of_another_start(
-    target: str, baseline: str | None, fingerprint: str, on_event: OnEvent
+    target: str, baseline: str | None, before: Backbone, on_event: OnEvent
 ) -> None:
     """Warn where a run is compared with another model than the one that it began from.
 
@@ -245,7 +245,8 @@ def _warn_of_another_start(
     if not folder.is_dir() or not (checkpoint.is_one(folder) or checkpoint.begun(folder)):
         return
     header = artifacts.read_header(checkpoint.chosen(folder) / checkpoint.EXPERT)
-    if header.inputs.get("backbone") != fingerprint:
+    # Only now: of billions of weights a digest takes as long as many answers.
+    if header.inputs.get("backbone") != before.fingerprint():
         text = (
             f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
             "difference between two models, and not what this training has cost"
@@ -274,10 +275,10 @@ def answers(
 ) -> Answers:
     """Ask a run or backbone, and measure its drift from an anchor.
 
+    Where torchrun has started several processes, each calls this, and they share the questions.
+
     Args:
         anchor: its file, and the fingerprint of the backbone that it has to be of.
-
-    Where torchrun has started several processes, each calls this, and they share the questions.
 
     Raises:
         AegisError: nothing to load, or an anchor of another backbone.
@@ -391,7 +392,11 @@ def compare(
     w2_between: str | None = None,
     gate: str = MEAN,
 ) -> ProbeReport:
-    """The report of two sets of answers to the same questions."""
+    """The report of two sets of answers to the same questions.
+
+    Raises:
+        AegisError: `max_drop` without answers from before.
+    """
     total, families = score(after), by_family(after)
     reference = None if before is None else score(before)
     earlier = {} if before is None else by_family(before)

@@ -178,12 +178,12 @@ def run(
         episodes,
         colors,
         replan or planned,
-        stream,
-        video_out,
-        on_event,
-        seed,
-        cameras,
-        decay,
+        stream=stream,
+        video_out=video_out,
+        on_event=on_event,
+        seed=seed,
+        cameras=cameras,
+        ensemble=decay,
     )
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])

@@ -61,7 +61,11 @@ class AutomaticLoop:
         self._ahead: AnchorGradient | None = None
 
     def begin(self, mask: Tensor | None, image: Tensor | None) -> None:
-        """A forward pass under gradients begins."""
+        """A forward pass under gradients begins.
+
+        Raises:
+            AegisError: parameters that the guard does not know, or the pass before is still unused.
+        """
         if not self._owners.several:
             # Sharded weights may be gathered already, and others then in their place.
             self._stepper.check()
@@ -117,7 +121,12 @@ class AutomaticLoop:
             self._dual.leave()
 
     def after_backward(self) -> None:
-        """All its gradients lie in `.grad`."""
+        """All its gradients lie in `.grad`.
+
+        Raises:
+            AegisError: the guard saw no pass that they could be of.
+            Diverged: one is not finite, and no scaler skips the step.
+        """
         # An enabled scaler skips a step that overflows by itself.
         skips = self._scaler is not None and self._scaler.is_enabled()
         if self._dual is None:

@@ -114,6 +114,9 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
     A constraint covers one step where nobody promises to settle. `kfac` has no key `protect` in a
     recipe, where everything else is frozen; a guard's may leave some maps free.
+
+    Raises:
+        AegisError: an option that the method does not have, or a value that is for training alone.
     """
     problems: list[Problem] = []
     every = {} if methods.get(method).dual else {"every": 1}
@@ -151,7 +154,11 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def load_anchor(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
-    """The anchor, and what its file says of the model and of how it was measured."""
+    """The anchor, and what its file says of the model and of how it was measured.
+
+    Raises:
+        AegisError: no anchor, or one without the part that the method reads.
+    """
     artifact = artifacts.load(path, "anchor")
     (part,) = methods.get(method).needs
     anchor = anchor_file.only(anchor_file.from_artifact(artifact), [part])

@@ -438,7 +438,7 @@ class SlowedStep:
     @torch.no_grad()
     def __init__(self, parts: Parts) -> None:
         """Keep the weights before the step, by the gradients that it is made of."""
-        shares = {} if parts.shares is None else parts.shares()
+        shares = {} if parts.shares is None else _read(parts.shares())
         # A gradient that overflowed has no finite share, and a scaler skips its step.
         self._shares = {p: s for p, s in shares.items() if s != 1 and math.isfinite(s)}
         self._before = {p: p.detach().clone() for p in self._shares}
@@ -448,6 +448,14 @@ class SlowedStep:
         """Leave of what has moved each parameter's share."""
         for parameter, share in self._shares.items():
             parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
+
+
+def _read(shares: Mapping[Tensor, float | Tensor]) -> dict[Tensor, float]:
+    """The shares as numbers: those of a GPU by one transfer, where each by itself would wait."""
+    unread = {p: share for p, share in shares.items() if isinstance(share, Tensor)}
+    numbers = torch.stack([*unread.values()]).tolist() if unread else []
+    read = dict(zip(unread, numbers, strict=True))
+    return {p: read[p] if isinstance(share, Tensor) else share for p, share in shares.items()}
 
 
 def overflowed(optimizer: Optimizer, scaler: Scaler | None = None) -> bool:

@@ -26,6 +26,9 @@ def trainer_callback(
         model: what it guards.
         mask: as for `Guard.automatic`.
         image: as for `Guard.automatic`.
+
+    Raises:
+        AegisError: transformers is not installed.
     """
     try:
         from transformers import TrainerCallback

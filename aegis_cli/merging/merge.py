@@ -125,26 +125,21 @@ def _run(
     displacement = Displacement(
         source.backbone, source.base, rules.keep(source, settings, on_event)
     )
-    if strength is not None:
-        points, baseline, chosen = [], None, strength
-    else:
+    tried, chosen = _Sweep(), strength
+    if strength is None:
         judge = _Judge(source, settings, on_event)
-        points = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
-        baseline, chosen = judge.baseline_accuracy, _weakest(points, max_drop)
+        tried = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
+        chosen = _weakest(tried.points, max_drop)
         if chosen == 0:
             said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
             on_event(Warned("merge", said))
     kept = loss = None
     if chosen is not None and out is not None:
         kept = displacement.keep(chosen)
-        how = {"method": settings.method, "strength": chosen, "damping": settings.damping}
-        loss = {point.strength: point.validation_loss for point in points}.get(chosen)
+        loss = tried.loss_at(chosen)
         if judged:
             loss = _performance(source, chosen).get("validation_loss")
-        result = {"kept": kept, "validation_loss": loss}
-        source.write(
-            out, {**how, "base": source.base_name, **result, **_measured_on(source, settings)}
-        )
+        source.write(out, _made(source, settings, chosen, kept, loss))
     return MergeReport(
         method=settings.method,
         damping=settings.damping,
@@ -155,11 +150,43 @@ def _run(
         max_drop=max_drop,
         passed=None if max_drop is None else chosen is not None,
         out=None if kept is None else str(out),
-        questions=0 if strength is not None else judge.questions,
-        baseline_accuracy=baseline,
-        points=tuple(points),
+        questions=tried.questions,
+        baseline_accuracy=tried.baseline_accuracy,
+        points=tried.points,
         validation_loss=loss,
     )
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """The strengths that were tried, as `MergeReport` has them; none where one was given."""
+
+    points: tuple[MergePoint, ...] = ()
+    baseline_accuracy: float | None = None
+    questions: int = 0
+
+    def loss_at(self, strength: float) -> float | None:
+        """The policy's loss at one of the strengths; None of another, or without a policy."""
+        return {point.strength: point.validation_loss for point in self.points}.get(strength)
+
+
+def _made(
+    source: sources.Source,
+    settings: MergeSettings,
+    strength: float,
+    kept: float,
+    loss: float | None,
+) -> dict[str, Any]:
+    """What the merged weights' own files say of how they were made."""
+    return {
+        "method": settings.method,
+        "strength": strength,
+        "damping": settings.damping,
+        "base": source.base_name,
+        "kept": kept,
+        "validation_loss": loss,
+        **_measured_on(source, settings),
+    }
 
 
 def _performance(source: sources.Source, strength: float) -> dict[str, float]:
@@ -219,13 +246,14 @@ class _Judge:
 
 def _try(
     displacement: Displacement, judge: _Judge, strengths: Sequence[float], on_event: OnEvent
-) -> list[MergePoint]:
-    points = []
+) -> _Sweep:
+    """Judge each of the strengths in turn."""
+    points: list[MergePoint] = []
     for number, strength in enumerate(strengths, 1):
         points.append(judge.point(strength, displacement.keep(strength)))
         shown = {"accuracy": points[-1].accuracy}
         on_event(Progress("merge", number, len(strengths), "strengths", shown))
-    return points
+    return _Sweep(tuple(points), judge.baseline_accuracy, judge.questions)
 
 
 def _weakest(points: Sequence[MergePoint], max_drop: float | None) -> float | None:

@@ -95,7 +95,7 @@ class _Target:
         self._follow(seen.hidden[0].device)
         inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}
         found = _moments(seen, seen.mask & inside[self.scope])
-        return transport_penalty(found, self.anchor, weights=self.weights)
+        return transport_penalty(found, self.anchor, self.weights)
 
     def _follow(self, device: torch.device) -> None:
         """Go where the hidden states are: somebody may have moved the model meanwhile."""

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
-from aegis_cli.core.curvature import taken
+from aegis_cli.core.curvature import bounded, taken
 from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
 
@@ -91,8 +91,9 @@ def _constrain(held: Sequence[_Held], weight: float) -> Callable[[Update], None]
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
+        strength = bounded(weight * update.steps)
         for one in held:
-            share = taken(weight * update.steps * one.importance)
+            share = taken(strength * one.importance)
             rows_here(one.parameter).sub_(one.moved() * share)
 
     return constrain
@@ -104,6 +105,9 @@ def relative_fisher(
     """Each learning parameter's Fisher information, scaled to mean 1 over all their entries.
 
     It has the parameter's shape and dtype.
+
+    Raises:
+        AegisError: a parameter that was not measured, or a mean that is 0 or no number.
     """
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from samples.nullspace import with_one
 from samples.tiny import make_tiny
 from samples.training import images
 from torch import Tensor, nn
@@ -118,7 +119,7 @@ def test_maps_that_do_not_always_read_the_same_have_spectra_of_their_own() -> No
     with torch.no_grad():
         first, second = (model.norm(draw(i)).flatten(0, 1) for i in range(2))
     for name, rows in (("query", (first, second)), ("value", (first, 2 * second))):
-        assert_same(matrix(found[name]), second_moment(torch.cat(rows), True) / 120)
+        assert_same(matrix(found[name]), second_moment(with_one(torch.cat(rows))) / 120)
 
 
 def test_the_curvature_of_such_maps_is_that_of_the_fused_map() -> None:

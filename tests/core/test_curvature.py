@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.curvature import Curvature, curvatures
+from aegis_cli.core.curvature import Curvature, curvatures, taken
 from aegis_cli.core.nullspace import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, decompose, with_rest
 
@@ -158,6 +158,11 @@ def test_a_weight_beyond_float32_takes_what_has_a_curvature_and_leaves_numbers(
     kept = minus(displacement, found.excess(*displacement, given))[0]
     torch.testing.assert_close(kept, drawn_back(found, displacement, 1e30)[0])
     assert kept.isfinite().all() and kept.norm() < displacement[0].norm()
+
+
+def test_all_is_taken_of_a_direction_whose_curvature_is_beyond_float32() -> None:
+    steep = torch.tensor([0.0, 1.0, torch.inf])
+    assert taken(steep).tolist() == [0.0, 0.5, 1.0]
 
 
 def test_damping_holds_outputs_that_answers_do_not_mind_and_frees_no_other_input() -> None:

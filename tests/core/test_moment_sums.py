@@ -44,7 +44,7 @@ def moment(spectrum: Spectrum) -> Tensor:
 
 def test_a_narrow_sum_is_that_of_its_parts_moments_bit_by_bit() -> None:
     parts = rows(90, 40, -0.5).split(30)
-    wanted = second_moment(parts[0], False) + second_moment(parts[1], False)
+    wanted = second_moment(parts[0]) + second_moment(parts[1])
     total = summed(make(40, CPU), *parts[:2])
     assert isinstance(total, Whole) and torch.equal(total.matrix(), wanted)
 
@@ -100,7 +100,7 @@ def test_the_size_is_told_before_anything_is_summed() -> None:
 def test_a_sketch_loses_little_more_energy_than_the_best_directions(decay: float) -> None:
     x = rows(3000, WIDE, decay)
     found = summed(make(WIDE, CPU), x).spectrum(len(x), 1.0)
-    exact = second_moment(x, bias=False) / len(x)
+    exact = second_moment(x) / len(x)
     values = torch.linalg.eigvalsh(exact).flip(0)
     assert found.vectors is not None and not found.whole
     stored = found.vectors.shape[1]
@@ -113,7 +113,7 @@ def test_a_sketch_loses_little_more_energy_than_the_best_directions(decay: float
 def test_the_leading_directions_of_a_sketch_are_the_exact_ones() -> None:
     x = rows(3000, WIDE, DECAYS["middling"])
     found = summed(make(WIDE, CPU), x).spectrum(len(x), 1.0)
-    exact = torch.linalg.eigh(second_moment(x, bias=False))[1].flip(1)
+    exact = torch.linalg.eigh(second_moment(x))[1].flip(1)
     assert found.vectors is not None
     # Cosines of the principal angles between the spans.
     cosines = torch.linalg.svdvals(exact[:, :10].T @ found.vectors[:, :20].double())
@@ -139,7 +139,7 @@ def test_few_rows_are_found_exactly() -> None:
     x = rows(30, WIDE, DECAYS["slow"])
     found = summed(make(WIDE, CPU), x).spectrum(len(x), 1.0)
     assert found.vectors is not None and found.vectors.shape[1] == 30
-    wanted = second_moment(x, bias=False) / len(x)
+    wanted = second_moment(x) / len(x)
     assert (moment(found) - wanted).abs().max() < 1e-5 * wanted.abs().max()
 
 

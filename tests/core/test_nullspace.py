@@ -9,12 +9,14 @@ from samples.nullspace import (
     SITE,
     Case,
     assert_same,
+    dense_rows,
     draw,
     protected_share,
     protection_of,
     random_update,
     rows_of,
     size,
+    with_one,
 )
 from torch import Tensor, nn
 
@@ -111,7 +113,7 @@ def shrunk(moment: Tensor, update: Tensor, soft: float, trace: Tensor) -> Tensor
 @pytest.mark.parametrize("name", DENSE)
 def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
     module, inputs = CASES[name].model().map, CASES[name].any()
-    moment = second_moment(rows_of(module, inputs[0]), module.bias is not None)
+    moment = second_moment(dense_rows(module, inputs[0]))
     update = random_update(CASES[name])
     protection = protect(
         decompose(moment), Strength(0.3, soft), update[0]
@@ -128,7 +130,7 @@ def test_soft_leaves_what_is_nearest_to_the_update_and_least_seen(name: str, sof
     So the soft threshold is a proximal step, as that of `kfac` is, of an update's own effect.
     """
     module, x = CASES[name].model().map, CASES[name].any()[0]
-    moment = second_moment(rows_of(module, x), module.bias is not None)
+    moment = second_moment(dense_rows(module, x))
     update = random_update(CASES[name])
     left = joined(allowed(protect(decompose(moment), Strength(soft=soft), update[0]), update))
     left = left.requires_grad_()
@@ -174,7 +176,7 @@ def test_soft_leads_from_hard_to_nothing(case: Case) -> None:
 
 
 def test_soft_takes_what_is_stored() -> None:
-    moment = second_moment(draw(50, 5) * torch.tensor([9.0, 3, 1, 0.3, 0.1]), bias=False)
+    moment = second_moment(draw(50, 5) * torch.tensor([9.0, 3, 1, 0.3, 0.1]))
     spectrum, update = decompose(moment, energy=0.99), draw(4, 5)
     stored = spectrum.vectors
     assert 0 < stored.shape[1] < 5
@@ -195,7 +197,8 @@ def resolved(moment: Tensor, count: int) -> Spectrum:
 @pytest.mark.parametrize("soft", SOFT)
 @pytest.mark.parametrize("bias", [True, False])
 def test_what_was_never_resolved_is_taken_as_one_scalar(bias: bool, soft: float) -> None:
-    moment = second_moment(draw(50, 5), bias)
+    rows = draw(50, 5)
+    moment = second_moment(with_one(rows) if bias else rows)
     spectrum, weight = resolved(moment, 2), draw(4, 5)
     update = (weight, draw(4) if bias else None)
     u = spectrum.vectors
@@ -208,14 +211,14 @@ def test_what_was_never_resolved_is_taken_as_one_scalar(bias: bool, soft: float)
 
 
 def test_all_that_was_resolved_serves_any_share() -> None:
-    moment, update = second_moment(draw(50, 5), bias=False), draw(4, 5)
+    moment, update = second_moment(draw(50, 5)), draw(4, 5)
     spectrum = resolved(moment, 2)
     left, _ = allowed(protect(spectrum, Strength(1.0), update), (update, None))
     torch.testing.assert_close(left, update - update @ spectrum.vectors @ spectrum.vectors.T)
 
 
 def test_no_protection_copies_the_anchors_directions() -> None:
-    spectrum = decompose(second_moment(draw(50, 5), bias=False))
+    spectrum = decompose(second_moment(draw(50, 5)))
     for strength in (Strength(0.9), Strength(1.0, 0.1)):
         found = protect(spectrum, strength, draw(4, 5))
         assert found.basis.data_ptr() == spectrum.vectors.data_ptr()
@@ -254,7 +257,7 @@ def test_a_lone_row_that_is_read_goes_back(shape: tuple[int, ...], read: bool) -
 
 
 def test_coordinates_are_fewer_numbers_than_weights() -> None:
-    moment = second_moment(draw(3, 64), bias=False)
+    moment = second_moment(draw(3, 64))
     protection = protect(decompose(moment), Strength(1.0), draw(8, 64))
     (known,) = protection.remember(draw(8, 64), None)
     assert known is not None and known.shape == (8, 3)

@@ -86,7 +86,7 @@ def test_penalty_is_the_weighted_mean_over_layers(weighting: str, widens: int) -
     """Of layers of one width, which are compared at once, and of several."""
     anchor = [Moments(10, *gaussian(i, width=5 + widens * i)) for i in range(3)]
     now = [gaussian(i + 20, width=5 + widens * i) for i in range(3)]
-    penalty, w2 = transport_penalty(now, anchor, weighting)
+    penalty, w2 = transport_penalty(now, anchor, layer_weights(anchor, weighting))
     each = [w2_diag(*moments, a.mean, a.var) for moments, a in zip(now, anchor, strict=True)]
     scale = [a.var.sum() if weighting == "variance" else 1.0 for a in anchor]
     torch.testing.assert_close(w2, torch.stack(each))
@@ -96,13 +96,16 @@ def test_penalty_is_the_weighted_mean_over_layers(weighting: str, widens: int) -
 def test_variance_weighting_makes_the_penalty_scale_free() -> None:
     anchor, now = Moments(10, *gaussian(0)), gaussian(1)
     scaled = Moments(10, anchor.mean * 1e3, anchor.var * 1e6), (now[0] * 1e3, now[1] * 1e6)
-    plain = transport_penalty([now], [anchor], "variance")[0]
-    torch.testing.assert_close(transport_penalty([scaled[1]], [scaled[0]], "variance")[0], plain)
+    plain, wide = (
+        transport_penalty([seen], [then], layer_weights([then], "variance"))[0]
+        for then, seen in ((anchor, now), scaled)
+    )
+    torch.testing.assert_close(wide, plain)
 
 
 def test_penalty_carries_the_graph_and_w2_does_not() -> None:
     mean, var = (x.float().requires_grad_() for x in gaussian(0))
-    penalty, w2 = transport_penalty([(mean, var)], [Moments(10, *gaussian(1))])
+    penalty, w2 = transport_penalty([(mean, var)], [Moments(10, *gaussian(1))], torch.ones(1))
     penalty.backward()
     assert mean.grad is not None and mean.grad.dtype == torch.float32 and mean.grad.abs().sum() > 0
     assert not w2.requires_grad
@@ -127,7 +130,7 @@ def test_each_token_moves_as_the_closed_form_says(moments_of: MomentsOf) -> None
     mask = torch.arange(5) < torch.tensor([[3], [5]])
     anchor = [Moments(10, *gaussian(i)) for i in range(3)]
     leaves = [h.requires_grad_() for h in hidden]
-    penalty, _ = transport_penalty(moments_of(leaves, mask), anchor)
+    penalty, _ = transport_penalty(moments_of(leaves, mask), anchor, torch.ones(3))
     for h, then, found in zip(hidden, anchor, torch.autograd.grad(penalty, leaves), strict=True):
         tokens = h.detach()[mask]
         var, mean = torch.var_mean(tokens, 0, correction=0)
@@ -138,7 +141,7 @@ def test_each_token_moves_as_the_closed_form_says(moments_of: MomentsOf) -> None
 
 def test_layers_must_match() -> None:
     with pytest.raises(ValueError, match="zip"):
-        transport_penalty([gaussian(0)], [Moments(1, *gaussian(0)), Moments(1, *gaussian(1))])
+        transport_penalty([gaussian(0)], [Moments(1, *gaussian(i)) for i in (0, 1)], torch.ones(2))
 
 
 def test_unknown_weighting_and_dead_layer_are_refused() -> None:

@@ -52,6 +52,12 @@ def test_others_are_refused(text: str, said: str) -> None:
     assert said in caught.value.expected and text.split("-")[-1] in caught.value.found
 
 
+def test_a_split_of_more_than_a_million_episodes_is_no_list_of_them() -> None:
+    with pytest.raises(AegisError, match="demos.only: all"):
+        episodes.chosen("all", 5, {"all": f"0:{10**15}"}, Path("x"))
+    assert not episodes.are_there("all", 5, {"all": f"0:{10**15}"})
+
+
 def test_a_split_may_have_more_than_there_is() -> None:
     with pytest.raises(AegisError, match="episode 4 of"):
         episodes.chosen("val", 4, SPLITS, Path("x"))

@@ -27,6 +27,7 @@ from aegis_cli.data.vqa.dataset import load_scenes
 from aegis_cli.data.vqa.metrics import Graded, wilson_interval
 from aegis_cli.data.vqa.questions import FAMILIES, Question
 from aegis_cli.evaluation import probe
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Anchor as Settings
 from aegis_cli.recipes import Recipe
@@ -204,6 +205,14 @@ def test_a_drift_between_two_sets_of_questions_says_so(
     assert (
         shown.getvalue().count("scenes and mine.jsonl") == shown.getvalue().count("w2 between") == 1
     )
+
+
+def test_models_alone_are_compared_without_a_digest_of_their_weights(
+    taught: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of billions of weights it takes as long as many answers."""
+    monkeypatch.delattr(Backbone, "fingerprint")
+    assert asked_of(taught, taught).drop_points == 0
 
 
 def test_without_baseline_and_anchor_there_is_no_drop_and_no_drift(taught: Path) -> None:

@@ -324,7 +324,7 @@ def test_a_checkpoint_is_rolled_out_by_its_own_folder(
     train.run(recipe(tiny_folder, steps=4), "naive", demos_file, None, tmp_path / "run")
     loaded: list[torch.Tensor] = []
     monkeypatch.setattr(
-        rollout, "play", lambda policy, *_: loaded.append(next(policy.expert.parameters()))
+        rollout, "play", lambda policy, *_, **__: loaded.append(next(policy.expert.parameters()))
     )
     checkpoints = tmp_path / "run" / "checkpoints"
     for folder in (

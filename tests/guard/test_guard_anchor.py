@@ -171,6 +171,39 @@ def test_the_file_says_what_was_measured(anchor: Path) -> None:
     }
 
 
+def test_a_file_does_not_invent_a_number_of_samples(tmp_path: Path) -> None:
+    """Without layers and a mask, nothing tells how many a pass had."""
+    model, path = make(), tmp_path / "anchor.safetensors"
+    pixels, ids, mask = batch(0)
+    for masks, samples in (([mask, mask], 8), ([mask, None], None)):
+        with Guard.measure(model, parts=("inputs",), vision="vision") as found:
+            for given in masks:
+                with found.watch(given):
+                    model(pixels, ids, torch.ones_like(mask))
+        found.save(path)
+        assert inspection.run(path).facts.get("samples") == samples
+
+
+def test_inputs_that_are_not_finite_are_refused() -> None:
+    """As where float16 has overflowed; the eigensolver's own error would name no map."""
+    model, (pixels, ids, mask) = make(), batch(0)
+    pixels[0, 0, 0, 0] = torch.inf
+    with Guard.measure(model, parts=("inputs",), vision="vision") as found, found.watch(mask):
+        model(pixels, ids, mask)
+    with pytest.raises(AegisError, match=r"'vision.0' that is not finite[\s\S]*float32"):
+        found.anchor()
+
+
+def test_a_mask_of_no_token_is_refused_whatever_is_measured() -> None:
+    model, (pixels, ids, mask) = make(), batch(0)
+    found = Guard.measure(model, parts=("inputs",), vision="vision")
+    with pytest.raises(AegisError, match="a single valid token"), found.watch(mask & False):
+        model(pixels, ids, mask)
+    with found.watch(mask):
+        model(pixels, ids, mask)
+    assert found.anchor().inputs
+
+
 class Loose(Vlm):
     """Uses parameters where no module runs: a table's rows, and a map's weight by itself."""
 

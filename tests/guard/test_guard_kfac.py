@@ -26,6 +26,7 @@ from samples.tiny import make_tiny
 from samples.training import make_questions
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from aegis_cli import Guard, inspection
 from aegis_cli.anchors import curvature
@@ -36,8 +37,9 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.nullspace import minus
 from aegis_cli.core.spectrum import DENSE
+from aegis_cli.guard.stepper import SlowedStep
 from aegis_cli.methods import kfac
-from aegis_cli.methods.base import weights
+from aegis_cli.methods.base import Parts, weights
 
 MAPS = (
     "vision.0",
@@ -227,13 +229,41 @@ def test_every_pass_has_its_answers() -> None:
     with pytest.raises(AegisError, match=r"scores \[0, 8, 23\]"):
         found.answer(scores[:0])
     found.answer(scores[:, PATCHES:])
-    forward()
+    overflowed = forward() * torch.inf
+    with pytest.raises(AegisError, match=r"not finite[\s\S]*float32"):
+        found.answer(overflowed)
     found.remove()
     with pytest.raises(AegisError, match="without the curvature"):
         Guard.measure(model, LAYERS).answer(scores)
 
 
 # --- in a loop ------------------------------------------------------------------------------------
+
+
+class Reads(TorchDispatchMode):
+    """Counts the numbers that are read, for each of which a GPU would wait."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += func is torch.ops.aten._local_scalar_dense.default
+        return func(*args, **(kwargs or {}))
+
+
+def test_the_shares_of_a_device_are_read_together() -> None:
+    model = make()
+    shares = {p: torch.tensor(0.25) for p in model.parameters()}
+    first, second, *_ = shares
+    shares[first], shares[second] = torch.tensor(torch.nan), torch.tensor(1.0)
+    before = [p.detach().clone() for p in shares]
+    with Reads() as reads, torch.no_grad():
+        slowed = SlowedStep(Parts(shares=lambda: shares))
+        for parameter in shares:
+            parameter += 1
+        slowed.go_back()
+    assert len(before) > 10 and reads.count == 0
+    for number, (now, then) in enumerate(zip(shares, before, strict=True)):
+        torch.testing.assert_close(now, then + (1 if number < 2 else 0.25))
 
 
 def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from samples.nullspace import with_one
 from torch import Tensor, nn
 
 from aegis_cli.common import devices
@@ -50,10 +51,11 @@ def rows(width: int) -> Tensor:
 
 def make_anchor() -> Anchor:
     """Of maps with unlike numbers of directions."""
-    inputs = {name: decompose(second_moment(rows(WIDTH), name != "c")) for name in LAYERS}
-    inputs["b"] = decompose(second_moment(rows(WIDTH)[:2], True))
-    inputs["stem"] = decompose(second_moment(rows(2 * 9), True))
-    outputs = {f"{name}.outputs": decompose(second_moment(rows(WIDTH), False)) for name in inputs}
+    inputs = {name: decompose(second_moment(with_one(rows(WIDTH)))) for name in LAYERS}
+    inputs["b"] = decompose(second_moment(with_one(rows(WIDTH)[:2])))
+    inputs["c"] = decompose(second_moment(rows(WIDTH)))  # has no bias
+    inputs["stem"] = decompose(second_moment(with_one(rows(2 * 9))))
+    outputs = {f"{name}.outputs": decompose(second_moment(rows(WIDTH))) for name in inputs}
     curved = {f"{name}.inputs": found for name, found in inputs.items()} | outputs
     norms = {name: decompose(channel_moment(rows(WIDTH), True)) for name in ("first", "second")}
     return Anchor(inputs=inputs | norms | {"row": lone_row()}, curvature=curved)

@@ -239,6 +239,22 @@ def test_a_proximal_ewc_minimises_distance_and_penalty(weight: float, steps: int
         torch.testing.assert_close(found - origin[name], wanted)
 
 
+def test_a_weight_past_float32_holds_what_has_fisher_information_and_frees_the_rest() -> None:
+    setting = make_setting(1e39, step="proximal")
+    setting.backbone.float()
+    fisher = {name: torch.zeros_like(p) for name, p in setting.backbone.named_parameters()}
+    fisher["stem.weight"][0] = 1.0
+    origin = values(setting)
+    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    move(setting)
+    moved = values(setting)
+    parts.constrain(Update({}, {}))
+    after = values(setting)
+    torch.testing.assert_close(after["stem.weight"][0], origin["stem.weight"][0])
+    assert torch.equal(after["stem.weight"][1:], moved["stem.weight"][1:])
+    assert torch.equal(after["layers.0.weight"], moved["layers.0.weight"])
+
+
 def test_a_proximal_ewc_leaves_what_has_no_fisher_information_alone() -> None:
     setting = make_setting(5.0, step="proximal")
     fisher = make_fisher(setting)

@@ -90,7 +90,7 @@ def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[
 
         def hook(_: nn.Module, arguments: tuple[Tensor, ...], output: Tensor) -> None:
             if isinstance(module, DENSE):
-                moment = second_moment(inputs.dense_rows(module, arguments[0]), bias=False)
+                moment = second_moment(inputs.dense_rows(module, arguments[0]))
             else:
                 moment, _ = inputs.moment(module, arguments[0])
             # the shadow has no hooks of its own: it was copied before they were set

@@ -150,6 +150,17 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     return x.flatten(0, -2)
 
 
+def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
+    """What a linear map or convolution multiplies, with a 1 where it has a bias."""
+    rows = rows_of(module, x)
+    return rows if module.bias is None else with_one(rows)
+
+
+def with_one(rows: Tensor) -> Tensor:
+    """Rows [n, d] and a 1, [n, d + 1]."""
+    return torch.cat([rows, rows.new_ones(len(rows), 1)], 1)
+
+
 def measure(module: nn.Module, inputs: Inputs, energy: float = 1.0) -> dict[str, Spectrum]:
     """What an anchor would hold of these inputs."""
     if isinstance(module, nn.Embedding):
@@ -157,10 +168,13 @@ def measure(module: nn.Module, inputs: Inputs, energy: float = 1.0) -> dict[str,
             (torch.bincount(inputs[0].flatten(), minlength=module.num_embeddings) > 0).double(),
             None,
         )
-        scores = [decompose(second_moment(h, bias=False), energy) for h in inputs[1:]]
+        scores = [decompose(second_moment(h), energy) for h in inputs[1:]]
         return {SITE: own} | {f"{SITE}.scores": s for s in scores}
-    moment = channel_moment if isinstance(module, nn.LayerNorm) else second_moment
-    return {SITE: decompose(moment(rows_of(module, inputs[0]), module.bias is not None), energy)}
+    if isinstance(module, nn.LayerNorm):
+        moment = channel_moment(rows_of(module, inputs[0]), module.bias is not None)
+    else:
+        moment = second_moment(dense_rows(module, inputs[0]))
+    return {SITE: decompose(moment, energy)}
 
 
 def protection_of(case: Case, inputs: Inputs, energy: float, soft: float = 0.0) -> Protection:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from aegis_cli.common import devices
 from aegis_cli.core import projection
 from aegis_cli.core.moments import Moments, batch_moments
-from aegis_cli.core.transport import WEIGHTINGS, transport_penalty
+from aegis_cli.core.transport import WEIGHTINGS, layer_weights, transport_penalty
 from aegis_cli.methods import METHODS
 from aegis_cli.methods.base import Method, Parts, Setting, train_all
 from aegis_cli.models.policy import Policy
@@ -171,7 +171,7 @@ def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> N
     with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
         encoding = policy.encode(batch.images, batch.instructions)
     moments = [batch_moments(hidden, encoding.mask) for hidden in encoding.hidden]
-    transport_penalty(moments, anchor)[0].backward()
+    transport_penalty(moments, anchor, layer_weights(anchor, "none"))[0].backward()
     return snapshot_gradients(policy)
 
 

@@ -215,16 +215,16 @@ def _numbers_of(version: str) -> tuple[int, int]:
 def _parse(raw: Mapping[str, Any]) -> Info:
     features = {str(name): _feature(entry) for name, entry in raw["features"].items()}
     info = Info(
-        str(raw["codebase_version"]),
-        float(raw["fps"]),
-        features,
-        int(raw["total_episodes"]),
-        int(raw["total_frames"]),
-        raw.get("robot_type"),
-        str(raw["data_path"]),
-        raw.get("video_path"),
-        _splits(raw.get("splits")),
-        int(raw.get("chunks_size", 1000)),
+        version=str(raw["codebase_version"]),
+        fps=float(raw["fps"]),
+        features=features,
+        episodes=int(raw["total_episodes"]),
+        frames=int(raw["total_frames"]),
+        robot_type=raw.get("robot_type"),
+        data_path=str(raw["data_path"]),
+        video_path=raw.get("video_path"),
+        splits=_splits(raw.get("splits")),
+        chunk_episodes=int(raw.get("chunks_size", 1000)),
     )
     if not 0 < info.fps < math.inf:
         raise ValueError(f"fps is {info.fps:g}")

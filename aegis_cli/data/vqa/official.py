@@ -129,7 +129,11 @@ class _Images:
         self._found: dict[int, Path] = {}
 
     def picture(self, where: str, number: Any) -> Picture:
-        """The image of this number."""
+        """The image of this number.
+
+        Raises:
+            AegisError: no whole number, or no file of it.
+        """
         if type(number) is not int or number < 0:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"

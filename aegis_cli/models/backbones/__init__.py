@@ -69,6 +69,9 @@ def load(name: str) -> Backbone:
         name: as for `locate`; for a Hugging Face model of a family that is not known,
             `NAME#path.of.its.layers`; `random:SHAPE` is a model of a true shape with random
             weights.
+
+    Raises:
+        AegisError: as for `locate`, a model that does not load, or layers of an embedded one.
     """
     if (shape := shapes.of_backbone(name)) is not None:
         _need_transformers(name)
