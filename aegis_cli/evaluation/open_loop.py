@@ -22,6 +22,7 @@ from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations, joints, mixture, renaming
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.mixture import Robot
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
@@ -184,6 +185,7 @@ def run(
     policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
+    _check_robot(policy, meta, data, learned, on_event)
     split, chosen, trained_on = source.choose(learned, data, episodes)
     # The frames of the episodes that were learned from may have been decoded by the training.
     only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
@@ -196,11 +198,8 @@ def run(
         on_event=on_event,
         cache=False,
     )
-    _check_fit(policy, shown, meta, data)
     shown = _as_deployed(policy, shown, meta)
     policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
-    _check_names(shown, meta, data, on_event)
-    _check_rate(shown, meta, data, on_event)
     at = _spread(shown, chosen, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
@@ -344,17 +343,30 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
     return sorted(set(asked))
 
 
-def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], data: Path) -> None:
+def _check_robot(
+    policy: Policy, meta: Mapping[str, Any], data: Path, learned: Selection, on_event: OnEvent
+) -> None:
+    """Compare the robot with the policy's, before anything is decoded, which may take hours.
+
+    Raises:
+        AegisError: another robot, other cameras, or a joint in another place.
+    """
+    robot = mixture.robot_of(data, learned)
+    _check_fit(policy, robot, meta, data)
+    _check_names(robot, meta, data, on_event)
+    _check_rate(robot, meta, data, on_event)
+
+
+def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path) -> None:
     """Raise AegisError for demonstrations of another robot or other cameras."""
-    own = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
-    found = shown.tensors["proprio"].shape[1], shown.tensors["actions"].shape[1]
+    own, found = (len(policy.proprio_scale.mean), len(policy.action_scale.mean)), robot.sizes
     if own != found:
         raise AegisError(
             f"{found[0]} positions and {found[1]} actions in '{data}'",
             f"{own[0]} and {own[1]}, as the run was trained on",
             "give demonstrations of the same robot",
         )
-    cameras = max(1, len(shown.cameras))
+    cameras = max(1, len(robot.cameras))
     if cameras != (wanted := max(1, len(meta.get("cameras", ())))):
         raise AegisError(
             f"{cameras} camera(s) of '{data}' for a policy of {wanted}",
@@ -374,15 +386,13 @@ def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any])
     return shown.fitted(sizes) if sizes else shown
 
 
-def _check_names(
-    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
-) -> None:
+def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
     """Compare the joints' names with the policy's, where both have them; other names are warned of.
 
     Raises:
         AegisError: a joint of the policy that has another place here.
     """
-    for other in joints.differences(meta, shown.recorded):
+    for other in joints.differences(meta, robot.names):
         known, found = ", ".join(other.known), ", ".join(other.found)
         if other.moved is not None:
             raise AegisError(
@@ -398,14 +408,12 @@ def _check_names(
         on_event(Warned("evaluate", text))
 
 
-def _check_rate(
-    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
-) -> None:
+def _check_rate(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
     """Warn of another control rate than the policy's, whose steps have another length."""
     own = meta.get("fps")
-    if own is not None and shown.fps is not None and own != shown.fps:
+    if own is not None and robot.fps is not None and own != robot.fps:
         text = (
-            f"'{data}' has {shown.fps:g} frames a second, and the policy was trained on {own:g}: "
+            f"'{data}' has {robot.fps:g} frames a second, and the policy was trained on {own:g}: "
             "its actions are meant for steps of another length"
         )
         on_event(Warned("evaluate", text))
