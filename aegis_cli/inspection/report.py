@@ -15,7 +15,7 @@ from aegis_cli.common.errors import AegisError
 if TYPE_CHECKING:
     from aegis_cli.continual.report import StreamReport
     from aegis_cli.data.lerobot.summary import FeatureInfo
-    from aegis_cli.evaluation.results import Result
+    from aegis_cli.evaluation.results import PlayedResult, Result
 
 BINS = 64  # parts of a run's steps in `over_time`
 ENERGIES = (0.9, 0.99, 0.999)  # shares of the energy in `SiteSpectrum.kept`
@@ -122,7 +122,7 @@ class InspectReport:
     loss: float | None = None
     validation_loss: float | None = None
     probes: tuple[Result, ...] = ()
-    rollouts: tuple[Result, ...] = ()
+    rollouts: tuple[PlayedResult, ...] = ()
     open_loops: tuple[Result, ...] = ()
     gate: bool | None = None
 

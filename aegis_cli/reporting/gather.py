@@ -90,7 +90,7 @@ class RunDocument:
     energy_shed_mean: float | None
     train: dict[str, Any]
     probes: list[results.Result]
-    rollouts: list[results.Result]
+    rollouts: list[results.PlayedResult]
     open_loops: list[results.Result]
     question_sets: list[str]
     gate: bool | None

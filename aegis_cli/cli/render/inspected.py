@@ -80,7 +80,7 @@ def _measured(report: Any) -> list[RenderableType]:
     """How well a run does, what was lost, and whether its gate is passed."""
     parts: list[RenderableType] = []
     if report.rollouts:
-        parts.append(_played([result.figures for result in report.rollouts]))
+        parts.append(_played(report.rollouts))
     if report.open_loops:
         parts.append(_evaluated(report.open_loops))
     if report.probes:
@@ -94,10 +94,15 @@ def _measured(report: Any) -> list[RenderableType]:
     return [*parts, Text(f"gate: {verdict[report.gate]}\n")]
 
 
-def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
+def _played(rollouts: Sequence[Any]) -> Table:
+    from aegis_cli.evaluation import results  # with it comes torch, as with what it has read
+
     header = ("Task", "Colours", "Success %", "95 % interval", "Return %", "Episodes")
-    rows = [
-        (
+    apart = results.told_apart([result.played for result in rollouts])
+    rows = []
+    for result, otherwise in zip(rollouts, apart, strict=True):
+        found = result.figures
+        row = (
             str(found["task"]),
             str(found.get("colors") or "-"),
             percent(found.get("success")),
@@ -105,9 +110,8 @@ def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
             percent(found.get("return_share")),
             str(found["episodes"]),
         )
-        for found in rollouts
-    ]
-    return plain_table(header, rows, left=2)
+        rows.append((*row, otherwise) if any(apart) else row)
+    return plain_table((*header, "Played with") if any(apart) else header, rows, left=2)
 
 
 def _evaluated(open_loops: Sequence[Any]) -> Table:
