@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -186,48 +186,38 @@ def run(
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
     _check_robot(policy, meta, data, learned, on_event)
-    split, chosen, trained_on = source.choose(learned, data, episodes)
-    # The frames of the episodes that were learned from may have been decoded by the training.
-    only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
-    shown = demonstrations.load(
-        data,
-        None,
-        0,
-        dataclasses.replace(learned, only=only),
-        policy.backbone.image_size,
-        on_event=on_event,
-        cache=False,
-    )
-    shown = _as_deployed(policy, shown, meta)
-    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
-    at = _spread(shown, chosen, frames)
+    chosen = source.choose(learned, data, episodes)
+    shown = _shown(policy, meta, data, learned, chosen, on_event)
+    at = _spread(shown, chosen.episodes, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
-    report = compare(shown, at, predicted, _training_std(policy, meta, on_event))
-    traces: list[Trace] = []
-    if traced:
-        replan = min(meta["replan"], policy.expert.shape.chunk)
-        traces = [_trace(policy, shown, e, replan, seed, batch_size) for e in chosen[:TRACED]]
     report = dataclasses.replace(
-        report,
+        compare(shown, at, predicted, _training_std(policy, meta, on_event)),
         data=str(data),
-        split=split,
-        episodes=chosen,
-        trained_on=trained_on,
+        split=chosen.split,
+        episodes=chosen.episodes,
+        trained_on=chosen.trained_on,
         seed=seed,
-        traces=traces,
+        traces=_traces(policy, meta, shown, chosen, seed, batch_size) if traced else [],
     )
     if keep:
-        path = data.absolute()
-        settings = {"episodes": None if episodes is None else list(episodes), "frames": frames}
-        settings |= {"seed": seed, "path": str(path if path.exists() else data)}
-        settings |= {"rename": dict(rename)} if rename else {}
-        name = f"{results.OPEN_LOOP}-{split}-{path.name}"
-        results.keep_if_possible(run, name, report.kept(), settings, on_event)
+        asked = {"episodes": None if episodes is None else list(episodes), "frames": frames}
+        asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
+        asked |= {"rename": dict(rename)} if rename else {}
+        name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
+        results.keep_if_possible(run, name, report.kept(), asked, on_event)
     return report
 
 
 # --- which episodes -------------------------------------------------------------------------------
+
+
+class _Chosen(NamedTuple):
+    """Episodes: how they are chosen, which they are, and which of them were trained on."""
+
+    split: str
+    episodes: list[int]
+    trained_on: list[int]
 
 
 @dataclass(frozen=True)
@@ -303,17 +293,20 @@ class _Source:
             )
         return None
 
-    def choose(
-        self, learned: Selection, data: Path, asked: Sequence[int] | None
-    ) -> tuple[str, list[int], list[int]]:
-        """How the episodes are chosen, which they are, and which of them were trained on."""
+    def choose(self, learned: Selection, data: Path, asked: Sequence[int] | None) -> _Chosen:
+        """The episodes to predict on.
+
+        Raises:
+            AegisError: some that are not there, or none that is known not to be trained on.
+        """
         count = demonstrations.count_episodes(data)
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
             everything = OTHER if self.digests else UNKNOWN
-            return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
+            split = everything if asked is None else CHOSEN
+            return _Chosen(split, _existing(asked, count, data), [])
         if self.recipe is None:
             if asked is not None:
-                return CHOSEN, _existing(asked, count, data), []
+                return _Chosen(CHOSEN, _existing(asked, count, data), [])
             raise AegisError(
                 f"'{self.name}', a checkpoint outside its run, which was trained on '{data}'",
                 "the run, whose recipe says which episodes were held out",
@@ -324,10 +317,10 @@ class _Source:
         own = demonstrations.learned_from(data, count, self.recipe.demos.only)
         held_out = own[demonstrations.held_out(len(own), share, self.recipe.seed)].tolist()
         if asked is None:
-            return VALIDATION, sorted(held_out), []
+            return _Chosen(VALIDATION, sorted(held_out), [])
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
-        return CHOSEN, chosen, [e for e in chosen if e in trained_on]
+        return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
@@ -373,6 +366,25 @@ def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path
             "the cameras that it was trained on",
             "give the run's folder, whose recipe names them",
         )
+
+
+def _shown(
+    policy: Policy,
+    meta: Mapping[str, Any],
+    data: Path,
+    learned: Selection,
+    chosen: _Chosen,
+    on_event: OnEvent,
+) -> Demonstrations:
+    """The demonstrations as the policy sees them; frames of the chosen episodes at least."""
+    # The frames of the episodes that were learned from may have been decoded by the training.
+    is_own = chosen.split == VALIDATION
+    only = learned.only if is_own else ",".join(map(str, chosen.episodes))
+    selection, side = dataclasses.replace(learned, only=only), policy.backbone.image_size
+    found = demonstrations.load(data, None, 0, selection, side, on_event=on_event, cache=False)
+    shown = _as_deployed(policy, found, meta)
+    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
+    return shown
 
 
 def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any]) -> Demonstrations:
@@ -447,6 +459,20 @@ def _predict(
         found.append(acted.cpu())
         on_event(Progress("evaluate", min(first + batch_size, len(at)), len(at), "frames"))
     return torch.cat(found)
+
+
+def _traces(
+    policy: Policy,
+    meta: Mapping[str, Any],
+    shown: Demonstrations,
+    chosen: _Chosen,
+    seed: int,
+    batch_size: int,
+) -> list[Trace]:
+    """What a plot shows, of the first episodes."""
+    replan = min(meta["replan"], policy.expert.shape.chunk)
+    first = chosen.episodes[:TRACED]
+    return [_trace(policy, shown, episode, replan, seed, batch_size) for episode in first]
 
 
 def _trace(
