@@ -688,6 +688,10 @@ def probe(
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
         if launch.rank() == 0:
             render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
+    if max_drop is None and "--gate" in given(ctx):
+        expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
+        fix = "add --max-drop POINTS, or leave --gate out"
+        raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:
