@@ -1267,8 +1267,11 @@ def recipes(
     if name is None:
         raise AegisError(f"aegis recipes {action} without a name", "one", "see aegis recipes ls")
     source = shipped.path(name)
+    text = source.read_text(encoding="utf-8")
     if action is RecipeAction.show:
-        return render.text(source.read_text(encoding="utf-8"))
+        if not as_json:
+            return render.text(text)
+        return render.show(shipped.Shown(name, str(source), text), render.facts, as_json)
     out = out or Path(source.name)
     if out.exists():
         raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
