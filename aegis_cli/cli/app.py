@@ -498,8 +498,8 @@ def merge(
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="Demonstrations of the run; default: its recipe's, or a file beside it. "
-            "Repeatable, for a run that learned from several sets, in their order.",
+            help="Demonstrations of the run; default: those that it learned from. Repeatable, for "
+            "a run that learned from several sets, in their order.",
         ),
     ] = None,
     anchor: AnchorIn = None,
@@ -757,7 +757,8 @@ def inspect(
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
 
     Of a run it tells what was trained, how well it does, what was lost, and whether its gate is
-    passed, as far as `aegis run`, `aegis probe` and `aegis rollout` have measured that.
+    passed, as far as `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured
+    that.
 
     A study's tables are shown as far as they are finished.
 
@@ -783,7 +784,8 @@ def compare(
 ) -> None:
     """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
 
-    Shown is what `aegis run`, `aegis probe` and `aegis rollout` have measured of each.
+    Shown is what `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured of
+    each.
 
     \b
     Example: aegis compare runs/x runs/y
@@ -1275,7 +1277,9 @@ def recipes(
     out = out or Path(source.name)
     if out.exists():
         raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
-    files.write_text(out, source.read_text(encoding="utf-8"))
+    files.write_text(out, text)
+    if as_json:
+        render.show(shipped.Copied(name, str(out)), render.facts, as_json)
     render.note(f"copied {name} to {out}")
 
 
