@@ -105,6 +105,7 @@ class InspectReport:
         energy_shed_mean: None, with `layers` and `over_time` empty, where no anchor gradient was
             taken.
         probes, rollouts, open_loops: what was measured of a run's last checkpoint.
+        question_sets: that of each of the probes, as somebody named it.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
 
@@ -124,6 +125,7 @@ class InspectReport:
     probes: tuple[Result, ...] = ()
     rollouts: tuple[PlayedResult, ...] = ()
     open_loops: tuple[Result, ...] = ()
+    question_sets: tuple[str, ...] = ()
     gate: bool | None = None
 
     @property

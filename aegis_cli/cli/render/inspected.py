@@ -84,7 +84,7 @@ def _measured(report: Any) -> list[RenderableType]:
     if report.open_loops:
         parts.append(_evaluated(report.open_loops))
     if report.probes:
-        parts.append(_known(report.probes))
+        parts.append(_known(report.probes, report.question_sets))
     if not parts and (into := report.facts.get("merged_into")):
         return [Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")]
     if not parts:
@@ -127,15 +127,16 @@ def _evaluated(open_loops: Sequence[Any]) -> Table:
     return plain_table(header, rows)
 
 
-def _known(probes: Sequence[Any]) -> Table:
-    header = ("Asked", "VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
+def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
+    names = ("VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
     rows = []
-    for result in probes:
+    for result, asked in zip(probes, question_sets, strict=True):
         found = result.figures
         drifts = [layer["w2"] for layer in found["layers"]]
         rows.append(
             (
-                str(result.settings.get("vqa", result.name)),
+                asked,
+                f"{found.get('questions', 0):,}",
                 percent(found["accuracy"]),
                 percent(found["baseline_accuracy"]),
                 fixed(found["drop_points"], 2),
@@ -143,7 +144,7 @@ def _known(probes: Sequence[Any]) -> Table:
                 number(max(drifts, default=None)),
             )
         )
-    return plain_table(header, rows)
+    return plain_table(("Asked", "Questions", *names), rows)
 
 
 def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> str:
