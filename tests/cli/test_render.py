@@ -38,6 +38,7 @@ from aegis_cli.evaluation.open_loop import (
 from aegis_cli.evaluation.results import Result
 from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection import InspectReport
+from aegis_cli.merging.merge import MergeReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
@@ -470,6 +471,18 @@ def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() 
     shown = text_of(render.inspect(InspectReport("run", "x", {}, open_loops=(evaluated,))))
     assert re.search(r"2 held-out episodes of arm +0\.250 +- +- +1,000", shown)
     assert "nothing is measured" not in shown
+
+
+@pytest.mark.parametrize(("kept", "said"), [(0.0, "0.0 % of the displacement"), (None, None)])
+def test_a_merge_all_the_way_back_keeps_none_of_the_displacement(
+    kept: float | None, said: str | None
+) -> None:
+    strength, out = (None, None) if kept is None else (1.0, "merged")
+    report = MergeReport(
+        "linear", 0.01, "run", "embedded", strength, kept, None, None, out, 0, None
+    )
+    shown = " ".join(text_of(render.merge(report)).split())
+    assert (f"kept {said}" in shown) if said else "kept" not in shown
 
 
 def test_a_merge_is_told_without_what_was_not_measured() -> None:
