@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 from samples.artifacts import write as write_artifact
-from samples.reports import write_job
+from samples.reports import probe, write_job
 
 from aegis_cli import inspection
 from aegis_cli.cli import render
 from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.evaluation import results
 from aegis_cli.recipes import Probe, Recipe, study_cells, to_yaml
 
 GROUPS = ["stem", "layers.0"]
@@ -456,6 +457,17 @@ def test_a_run_is_one_page_of_what_how_well_and_what_was_lost(tmp_path, capsys):
     found = json.loads(shown(capsys, job / "aegis", "--json"))
     assert (found["gate"], found["probes"][0]["figures"]["accuracy"]) == (False, 0.7000000000000001)
     assert "wrong" not in found["probes"][0]["figures"] and len(found["rollouts"]) == 2
+
+
+def test_each_probe_of_a_run_says_how_many_questions_of_which_set_it_asked(tmp_path, capsys):
+    job = write_job(tmp_path)
+    again = {**probe("shape"), "questions": 5000}
+    results.keep(job / "naive", "probe-easy", again, {"vqa": "easy-vqa"})
+    lines = [line.split() for line in shown(capsys, job / "naive").splitlines()]
+    asked = [line[:2] for line in lines if line and line[0] in ("scenes", "easy-vqa", "probe")]
+    assert asked == [["scenes", "40"], ["easy-vqa", "5,000"]]
+    found = json.loads(shown(capsys, job / "naive", "--json"))
+    assert found["question_sets"] == ["scenes", "easy-vqa"]
 
 
 def test_a_run_that_nobody_measured_says_who_does(tmp_path, capsys):

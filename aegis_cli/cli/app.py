@@ -54,6 +54,7 @@ from aegis_cli.cli.options import (
     RecipeOrRunArg,
     Rename,
     Resume,
+    ResumePretraining,
     Set,
     SkipBad,
     StoredIn,
@@ -498,8 +499,8 @@ def merge(
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="Demonstrations of the run; default: its recipe's, or a file beside it. "
-            "Repeatable, for a run that learned from several sets, in their order.",
+            help="Demonstrations of the run; default: those that it learned from. Repeatable, for "
+            "a run that learned from several sets, in their order.",
         ),
     ] = None,
     anchor: AnchorIn = None,
@@ -688,6 +689,10 @@ def probe(
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
         if launch.rank() == 0:
             render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
+    if max_drop is None and "--gate" in given(ctx):
+        expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
+        fix = "add --max-drop POINTS, or leave --gate out"
+        raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target)
     if max_drop is not None and baseline is None:
@@ -753,7 +758,8 @@ def inspect(
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
 
     Of a run it tells what was trained, how well it does, what was lost, and whether its gate is
-    passed, as far as `aegis run`, `aegis probe` and `aegis rollout` have measured that.
+    passed, as far as `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured
+    that.
 
     A study's tables are shown as far as they are finished.
 
@@ -779,7 +785,8 @@ def compare(
 ) -> None:
     """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
 
-    Shown is what `aegis run`, `aegis probe` and `aegis rollout` have measured of each.
+    Shown is what `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured of
+    each.
 
     \b
     Example: aegis compare runs/x runs/y
@@ -1060,7 +1067,7 @@ def pretrain(
         Path | None,
         Option(metavar="FOLDER", help="Folder to write; default: runs/<recipe name>."),
     ] = None,
-    resume: Resume = False,
+    resume: ResumePretraining = False,
     overrides: Set = None,
     device: Device = None,
     as_json: Json = False,
@@ -1263,12 +1270,17 @@ def recipes(
     if name is None:
         raise AegisError(f"aegis recipes {action} without a name", "one", "see aegis recipes ls")
     source = shipped.path(name)
+    text = source.read_text(encoding="utf-8")
     if action is RecipeAction.show:
-        return render.text(source.read_text(encoding="utf-8"))
+        if not as_json:
+            return render.text(text)
+        return render.show(shipped.Shown(name, str(source), text), render.facts, as_json)
     out = out or Path(source.name)
     if out.exists():
         raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
-    files.write_text(out, source.read_text(encoding="utf-8"))
+    files.write_text(out, text)
+    if as_json:
+        render.show(shipped.Copied(name, str(out)), render.facts, as_json)
     render.note(f"copied {name} to {out}")
 
 

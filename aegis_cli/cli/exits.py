@@ -1,9 +1,9 @@
 """How a command ends: errors become one message and an exit code, here and nowhere else.
 
 Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `merge --max-drop`, `probe.max_drop` of
-`run` and `probe`, `train --dry-run` where memory or disk are too small), 2 a problem to act on,
-3 a defect of Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the output, 143
-SIGTERM.
+`run` and `probe`, `train --dry-run` where memory or disk are too small, `doctor`), 2 a problem to
+act on, 3 a defect of Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the
+output, 143 SIGTERM.
 """
 
 from __future__ import annotations

@@ -250,14 +250,16 @@ Wide = Annotated[
         "wide goes on below with its next columns.",
     ),
 ]
+_RESUMED = "Continue from the last checkpoint in --out; without a run there, start anew."
 Resume = Annotated[
     bool,
     Option(
         "--resume",
-        help="Continue from the last checkpoint in --out; without a run there, start anew. A "
-        "policy's run that has ended goes on where train.steps is more than it was.",
+        help=f"{_RESUMED} A policy's run that has ended goes on where train.steps is more than it "
+        "was.",
     ),
 ]
+ResumePretraining = Annotated[bool, Option("--resume", help=_RESUMED)]
 Overwrite = Annotated[
     bool,
     Option(

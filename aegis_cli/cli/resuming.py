@@ -63,10 +63,10 @@ def inputs_of(
     """
     from aegis_cli.training import checkpoint, inputs
 
+    if checkpoint.begun(run):
+        checkpoint.kept_state(run)
     kept = inputs.of(run)
     if kept is None:
-        if checkpoint.begun(run):
-            checkpoint.kept_state(run)
         if not demos and recipe.demos.path is None:
             raise _unknown(run, "demonstrations", "--demos PATH")
         return list(demos), anchor or _no_anchor(run)

@@ -256,7 +256,7 @@ def _check_selection(paths: Sequence[Path], selection: Selection) -> None:
 
 
 @dataclass(frozen=True)
-class _Robot:
+class Robot:
     """What a set says of the robot that it was recorded with.
 
     Attributes:
@@ -271,7 +271,7 @@ class _Robot:
     task: str | None
 
 
-def _robot(path: Path, selection: Selection) -> _Robot:
+def robot_of(path: Path, selection: Selection) -> Robot:
     """The robot of a set, of which no frame is decoded for that.
 
     Raises:
@@ -279,8 +279,8 @@ def _robot(path: Path, selection: Selection) -> _Robot:
     """
     here = demonstrations.locate(path)
     if not here.is_dir():
-        selection.check_file(here)
         artifact = artifacts.load(here, "demos")
+        selection.check_file(here)  # a file of another kind has no option to leave out
         meta = artifact.header.meta
         sizes = artifact.tensors["proprio"].shape[1], artifact.tensors["actions"].shape[1]
         names = {
@@ -288,14 +288,14 @@ def _robot(path: Path, selection: Selection) -> _Robot:
             for name in ("action_names", "proprio_names")
         }
         fps = float(meta["control_hz"]) if "control_hz" in meta else None
-        return _Robot((), sizes, _complete(names, sizes), fps, meta["task"])
+        return Robot((), sizes, _complete(names, sizes), fps, meta["task"])
     found = dataset.load(here, selection.rename)
     own = found.cameras(selection.camera)
     cameras = tuple(layout.short(found.called(camera)) for camera in own)
     positions, actions = listed(selection.state), listed(selection.action)
     sizes = sum(map(found.size, positions)), sum(map(found.size, actions))
     names = {"action_names": found.names(actions), "proprio_names": found.names(positions)}
-    return _Robot(cameras, sizes, _complete(names, sizes), found.info.fps, found.info.task)
+    return Robot(cameras, sizes, _complete(names, sizes), found.info.fps, found.info.task)
 
 
 def _complete(
@@ -323,13 +323,13 @@ def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
 
 def _check_alike(paths: Sequence[Path], selection: Selection) -> None:
     """Raise AegisError unless all sets are of one robot, before anything large is read."""
-    robots = [_robot(path, selection) for path in paths]
+    robots = [robot_of(path, selection) for path in paths]
     for place, (path, robot) in enumerate(zip(paths, robots, strict=True)):
         for known_path, known in zip(paths[:place], robots[:place], strict=True):
             _check_robot(path, robot, known_path, known)
 
 
-def _check_robot(path: Path, robot: _Robot, known_path: Path, known: _Robot) -> None:
+def _check_robot(path: Path, robot: Robot, known_path: Path, known: Robot) -> None:
     """Raise AegisError unless two sets are of one robot, as far as both say it."""
     if robot.sizes != known.sizes:
         raise AegisError(

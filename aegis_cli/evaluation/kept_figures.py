@@ -87,6 +87,15 @@ class PartFigures:
 
 
 @dataclass(frozen=True)
+class RolloutSettings:
+    """What `aegis rollout` was asked for, as far as it tells rollouts apart."""
+
+    seed: int | None = None
+    replan: int | None = None
+    ensemble: Number | None = None
+
+
+@dataclass(frozen=True)
 class RolloutFigures:
     """A rollout."""
 
@@ -106,7 +115,7 @@ class RolloutFigures:
     return_share: Number | None = None
     episodes_per_s: Number | None = None
     video: str | None = None
-    settings: dict[str, Any] | None = None
+    settings: RolloutSettings | None = None
     step: int | None = None
 
 

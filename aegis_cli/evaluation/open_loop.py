@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations, joints, mixture, renaming
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
+from aegis_cli.data.mixture import Robot
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
@@ -184,51 +185,39 @@ def run(
     policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
-    split, chosen, trained_on = source.choose(learned, data, episodes)
-    # The frames of the episodes that were learned from may have been decoded by the training.
-    only = learned.only if split == VALIDATION else ",".join(map(str, chosen))
-    shown = demonstrations.load(
-        data,
-        None,
-        0,
-        dataclasses.replace(learned, only=only),
-        policy.backbone.image_size,
-        on_event=on_event,
-        cache=False,
-    )
-    _check_fit(policy, shown, meta, data)
-    shown = _as_deployed(policy, shown, meta)
-    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
-    _check_names(shown, meta, data, on_event)
-    _check_rate(shown, meta, data, on_event)
-    at = _spread(shown, chosen, frames)
+    _check_robot(policy, meta, data, learned, on_event)
+    chosen = source.choose(learned, data, episodes)
+    shown = _shown(policy, meta, data, learned, chosen, on_event)
+    at = _spread(shown, chosen.episodes, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
-    report = compare(shown, at, predicted, _training_std(policy, meta, on_event))
-    traces: list[Trace] = []
-    if traced:
-        replan = min(meta["replan"], policy.expert.shape.chunk)
-        traces = [_trace(policy, shown, e, replan, seed, batch_size) for e in chosen[:TRACED]]
     report = dataclasses.replace(
-        report,
+        compare(shown, at, predicted, _training_std(policy, meta, on_event)),
         data=str(data),
-        split=split,
-        episodes=chosen,
-        trained_on=trained_on,
+        split=chosen.split,
+        episodes=chosen.episodes,
+        trained_on=chosen.trained_on,
         seed=seed,
-        traces=traces,
+        traces=_traces(policy, meta, shown, chosen, seed, batch_size) if traced else [],
     )
     if keep:
-        path = data.absolute()
-        settings = {"episodes": None if episodes is None else list(episodes), "frames": frames}
-        settings |= {"seed": seed, "path": str(path if path.exists() else data)}
-        settings |= {"rename": dict(rename)} if rename else {}
-        name = f"{results.OPEN_LOOP}-{split}-{path.name}"
-        results.keep_if_possible(run, name, report.kept(), settings, on_event)
+        asked = {"episodes": None if episodes is None else list(episodes), "frames": frames}
+        asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
+        asked |= {"rename": dict(rename)} if rename else {}
+        name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
+        results.keep_if_possible(run, name, report.kept(), asked, on_event)
     return report
 
 
 # --- which episodes -------------------------------------------------------------------------------
+
+
+class _Chosen(NamedTuple):
+    """Episodes: how they are chosen, which they are, and which of them were trained on."""
+
+    split: str
+    episodes: list[int]
+    trained_on: list[int]
 
 
 @dataclass(frozen=True)
@@ -304,17 +293,20 @@ class _Source:
             )
         return None
 
-    def choose(
-        self, learned: Selection, data: Path, asked: Sequence[int] | None
-    ) -> tuple[str, list[int], list[int]]:
-        """How the episodes are chosen, which they are, and which of them were trained on."""
+    def choose(self, learned: Selection, data: Path, asked: Sequence[int] | None) -> _Chosen:
+        """The episodes to predict on.
+
+        Raises:
+            AegisError: some that are not there, or none that is known not to be trained on.
+        """
         count = demonstrations.count_episodes(data)
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
             everything = OTHER if self.digests else UNKNOWN
-            return (everything if asked is None else CHOSEN), _existing(asked, count, data), []
+            split = everything if asked is None else CHOSEN
+            return _Chosen(split, _existing(asked, count, data), [])
         if self.recipe is None:
             if asked is not None:
-                return CHOSEN, _existing(asked, count, data), []
+                return _Chosen(CHOSEN, _existing(asked, count, data), [])
             raise AegisError(
                 f"'{self.name}', a checkpoint outside its run, which was trained on '{data}'",
                 "the run, whose recipe says which episodes were held out",
@@ -325,10 +317,10 @@ class _Source:
         own = demonstrations.learned_from(data, count, self.recipe.demos.only)
         held_out = own[demonstrations.held_out(len(own), share, self.recipe.seed)].tolist()
         if asked is None:
-            return VALIDATION, sorted(held_out), []
+            return _Chosen(VALIDATION, sorted(held_out), [])
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
-        return CHOSEN, chosen, [e for e in chosen if e in trained_on]
+        return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
@@ -344,23 +336,55 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
     return sorted(set(asked))
 
 
-def _check_fit(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any], data: Path) -> None:
+def _check_robot(
+    policy: Policy, meta: Mapping[str, Any], data: Path, learned: Selection, on_event: OnEvent
+) -> None:
+    """Compare the robot with the policy's, before anything is decoded, which may take hours.
+
+    Raises:
+        AegisError: another robot, other cameras, or a joint in another place.
+    """
+    robot = mixture.robot_of(data, learned)
+    _check_fit(policy, robot, meta, data)
+    _check_names(robot, meta, data, on_event)
+    _check_rate(robot, meta, data, on_event)
+
+
+def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path) -> None:
     """Raise AegisError for demonstrations of another robot or other cameras."""
-    own = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
-    found = shown.tensors["proprio"].shape[1], shown.tensors["actions"].shape[1]
+    own, found = (len(policy.proprio_scale.mean), len(policy.action_scale.mean)), robot.sizes
     if own != found:
         raise AegisError(
             f"{found[0]} positions and {found[1]} actions in '{data}'",
             f"{own[0]} and {own[1]}, as the run was trained on",
             "give demonstrations of the same robot",
         )
-    cameras = max(1, len(shown.cameras))
+    cameras = max(1, len(robot.cameras))
     if cameras != (wanted := max(1, len(meta.get("cameras", ())))):
         raise AegisError(
             f"{cameras} camera(s) of '{data}' for a policy of {wanted}",
             "the cameras that it was trained on",
             "give the run's folder, whose recipe names them",
         )
+
+
+def _shown(
+    policy: Policy,
+    meta: Mapping[str, Any],
+    data: Path,
+    learned: Selection,
+    chosen: _Chosen,
+    on_event: OnEvent,
+) -> Demonstrations:
+    """The demonstrations as the policy sees them; frames of the chosen episodes at least."""
+    # The frames of the episodes that were learned from may have been decoded by the training.
+    is_own = chosen.split == VALIDATION
+    only = learned.only if is_own else ",".join(map(str, chosen.episodes))
+    selection, side = dataclasses.replace(learned, only=only), policy.backbone.image_size
+    found = demonstrations.load(data, None, 0, selection, side, on_event=on_event, cache=False)
+    shown = _as_deployed(policy, found, meta)
+    policy.backbone.check_prompts(shown.images(shown.read[:1]), shown.texts)
+    return shown
 
 
 def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any]) -> Demonstrations:
@@ -374,15 +398,13 @@ def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any])
     return shown.fitted(sizes) if sizes else shown
 
 
-def _check_names(
-    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
-) -> None:
+def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
     """Compare the joints' names with the policy's, where both have them; other names are warned of.
 
     Raises:
         AegisError: a joint of the policy that has another place here.
     """
-    for other in joints.differences(meta, shown.recorded):
+    for other in joints.differences(meta, robot.names):
         known, found = ", ".join(other.known), ", ".join(other.found)
         if other.moved is not None:
             raise AegisError(
@@ -398,14 +420,12 @@ def _check_names(
         on_event(Warned("evaluate", text))
 
 
-def _check_rate(
-    shown: Demonstrations, meta: Mapping[str, Any], data: Path, on_event: OnEvent
-) -> None:
+def _check_rate(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
     """Warn of another control rate than the policy's, whose steps have another length."""
     own = meta.get("fps")
-    if own is not None and shown.fps is not None and own != shown.fps:
+    if own is not None and robot.fps is not None and own != robot.fps:
         text = (
-            f"'{data}' has {shown.fps:g} frames a second, and the policy was trained on {own:g}: "
+            f"'{data}' has {robot.fps:g} frames a second, and the policy was trained on {own:g}: "
             "its actions are meant for steps of another length"
         )
         on_event(Warned("evaluate", text))
@@ -439,6 +459,20 @@ def _predict(
         found.append(acted.cpu())
         on_event(Progress("evaluate", min(first + batch_size, len(at)), len(at), "frames"))
     return torch.cat(found)
+
+
+def _traces(
+    policy: Policy,
+    meta: Mapping[str, Any],
+    shown: Demonstrations,
+    chosen: _Chosen,
+    seed: int,
+    batch_size: int,
+) -> list[Trace]:
+    """What a plot shows, of the first episodes."""
+    replan = min(meta["replan"], policy.expert.shape.chunk)
+    first = chosen.episodes[:TRACED]
+    return [_trace(policy, shown, episode, replan, seed, batch_size) for episode in first]
 
 
 def _trace(

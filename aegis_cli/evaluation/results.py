@@ -214,28 +214,79 @@ class Result:
     settings: dict[str, Any]
 
 
+@dataclasses.dataclass(frozen=True)
+class Played:
+    """How a rollout was played: the seed of its episodes, and how the policy's chunks were used.
+
+    Where it was by the run's recipe, that says it.
+    """
+
+    seed: int
+    replan: int
+    ensemble: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayedResult(Result):
+    """One rollout of a run."""
+
+    played: Played
+
+
 def probes(run: Path) -> list[Result]:
     """The probes of a run's last checkpoint; that of `aegis run` comes first."""
-    return _read(run, "probe", ProbeFigures)
+    return [found for _, found in _read(run, "probe", ProbeFigures)]
 
 
-def rollouts(run: Path) -> list[Result]:
+def rollouts(run: Path) -> list[PlayedResult]:
     """The rollouts of a run's last checkpoint; those of `aegis run` come first.
 
-    Held-out colours come after those of training.
+    Held-out colours come after those of training. Of those that played the same episodes in the
+    same way, the newest stands for all.
     """
-    return sorted(_read(run, "rollout", RolloutFigures), key=lambda found: "held-out" in found.name)
+    recipe = recipe_of(run)
+    newest = dict[tuple[Any, ...], tuple[int, PlayedResult]]()
+    for path, found in _read(run, "rollout", RolloutFigures):
+        played = _played(found, recipe)
+        episodes = tuple(found.figures.get(name) for name in ("task", "colors", "episodes"))
+        written = path.stat().st_mtime_ns
+        before = newest.get((*episodes, played))
+        if before is None or before[0] <= written:
+            newest[*episodes, played] = written, PlayedResult(**vars(found), played=played)
+    each = [found for _, found in newest.values()]
+    return sorted(each, key=lambda found: found.figures.get("colors") == "held-out")
+
+
+def _played(found: Result, recipe: recipes.Recipe) -> Played:
+    """How a rollout was played; earlier versions did not write all of it down."""
+    said, own = found.settings, recipe.rollout
+    if not said:
+        return Played(own.seed, own.replan, own.ensemble)
+    seed, replan = said.get("seed", recipes.Rollout().seed), said.get("replan", own.replan)
+    return Played(seed, replan, said.get("ensemble"))
+
+
+def told_apart(played: Sequence[Played]) -> list[str]:
+    """In words how each rollout was played, as far as others beside it were played otherwise."""
+    names = [field.name for field in dataclasses.fields(Played)]
+    differ = [name for name in names if len({getattr(one, name) for one in played}) > 1]
+    return [", ".join(_said(name, getattr(one, name)) for name in differ) for one in played]
+
+
+def _said(name: str, value: float | None) -> str:
+    return f"no {name}" if value is None else f"{name} {value}"
 
 
 def open_loops(run: Path) -> list[Result]:
     """The open-loop evaluations of a run's last checkpoint; on its validation episodes first."""
-    found = _read(run, OPEN_LOOP, OpenLoopFigures)
+    found = [found for _, found in _read(run, OPEN_LOOP, OpenLoopFigures)]
     return sorted(found, key=lambda one: one.figures["split"] != VALIDATION)
 
 
 def _read(
     run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
-) -> list[Result]:
+) -> list[tuple[Path, Result]]:
+    """What was measured of a run's last checkpoint, each with its file."""
     by_recipe, own = [], folder.measured_in(run)
     listed = [] if own is None else [own.glob(f"{kind}.json"), own.glob(f"{kind}-*.json")]
     for path in [path for found in listed for path in sorted(found)]:
@@ -251,7 +302,7 @@ def _read(
         # A run that was trained further has forgotten what was measured of it before. Earlier
         # versions wrote no step for a run.
         if step is None or step == last:
-            found.append(Result(path.stem, raw, settings))
+            found.append((path, Result(path.stem, raw, settings)))
     return found
 
 

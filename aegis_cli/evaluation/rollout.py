@@ -188,6 +188,7 @@ def run(
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
         settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
+        settings |= {"replan": replan or planned}
         settings |= {} if decay is None else {"ensemble": decay}
         results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
     return report

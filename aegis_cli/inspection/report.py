@@ -15,7 +15,7 @@ from aegis_cli.common.errors import AegisError
 if TYPE_CHECKING:
     from aegis_cli.continual.report import StreamReport
     from aegis_cli.data.lerobot.summary import FeatureInfo
-    from aegis_cli.evaluation.results import Result
+    from aegis_cli.evaluation.results import PlayedResult, Result
 
 BINS = 64  # parts of a run's steps in `over_time`
 ENERGIES = (0.9, 0.99, 0.999)  # shares of the energy in `SiteSpectrum.kept`
@@ -106,6 +106,7 @@ class InspectReport:
         energy_shed_mean: None, with `layers`, `frozen` and `over_time` empty, where no anchor
             gradient was taken.
         probes, rollouts, open_loops: what was measured of a run's last checkpoint.
+        question_sets: that of each of the probes, as somebody named it.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
 
@@ -124,8 +125,9 @@ class InspectReport:
     loss: float | None = None
     validation_loss: float | None = None
     probes: tuple[Result, ...] = ()
-    rollouts: tuple[Result, ...] = ()
+    rollouts: tuple[PlayedResult, ...] = ()
     open_loops: tuple[Result, ...] = ()
+    question_sets: tuple[str, ...] = ()
     gate: bool | None = None
 
     @property

@@ -148,10 +148,10 @@ class PolicyRun:
         _write_whole(out, fill)
 
     def _copy_records(self, folder: Path, step: int) -> None:
-        """The training's recipe and machine, and its log and ledger up to the step merged."""
-        for name in ("recipe.yaml", run_folder.METRICS, machine.NAME):
-            # An earlier Aegis did not say on which machine it trained.
-            if name != machine.NAME or (self._run / name).is_file():
+        """What is known of the training; of its log and ledger, up to the step merged."""
+        for name in ("recipe.yaml", run_folder.METRICS, machine.NAME, places.NAME):
+            # An earlier Aegis did not say on which machine it trained, nor where its inputs lay.
+            if name not in (machine.NAME, places.NAME) or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")

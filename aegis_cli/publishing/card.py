@@ -16,7 +16,7 @@ from typing import Any
 from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
-from aegis_cli.evaluation.results import Result, evaluated_on
+from aegis_cli.evaluation.results import PlayedResult, Result, evaluated_on, told_apart
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
@@ -273,13 +273,15 @@ def _evaluated(open_loops: Sequence[Result]) -> Iterator[str]:
     yield "error is squared, over the variance of the training's actions: their mean has 1."
 
 
-def _played(rollouts: Sequence[Result]) -> Iterator[str]:
+def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
     """A table of rollouts."""
     yield "| task | colours | episodes | success, with its 95 % interval |"
     yield "|---|---|---|---|"
-    for result in rollouts:
+    apart = told_apart([result.played for result in rollouts])
+    for result, otherwise in zip(rollouts, apart, strict=True):
         figures = result.figures
         cells = [figures["task"], figures.get("colors") or "", f"{figures['episodes']:,}"]
+        cells[-1] += f" ({otherwise})" if otherwise else ""
         yield f"| {' | '.join([*cells, _success(figures)])} |"
 
 

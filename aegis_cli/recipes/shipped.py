@@ -31,6 +31,23 @@ class Listed:
     recipes: list[Shipped]
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A recipe as its file has it."""
+
+    name: str
+    path: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Copied:
+    """A recipe that was copied to `out`."""
+
+    name: str
+    out: str
+
+
 def folder() -> Path:
     """Where the recipes lie.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, recipes
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import results
@@ -17,7 +18,7 @@ from aegis_cli.inspection import InspectReport
 from aegis_cli.reporting import differences
 from aegis_cli.studies import table
 from aegis_cli.studies.pipeline import PipelineReport
-from aegis_cli.training import folder
+from aegis_cli.training import checkpoint, folder
 from aegis_cli.training.up_to_date import refuse_unfinished
 
 Interval = tuple[float, float] | None
@@ -94,7 +95,7 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(one) for _, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
-    _warn_of_unfinished(rows, on_event)
+    _warn_of_unfinished(found, on_event)
     _warn_of_merges(found, on_event)
     facts = [
         differences.of_run(path, row.steps, asked)
@@ -115,15 +116,24 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     return made
 
 
-def _warn_of_unfinished(rows: Sequence[ComparedRun], on_event: OnEvent) -> None:
+def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
     """Say which runs have steps left, for the others may only have had more of them."""
     left = []
-    for row in rows:
-        if None not in (row.steps, row.planned_steps) and row.steps < row.planned_steps:
-            left.append(f"{row.run}, {inspection.steps_taken(row.steps, row.planned_steps)} steps")
+    for path, report in found:
+        steps, planned = report.facts.get("steps"), report.facts.get("planned_steps")
+        if None not in (steps, planned) and steps < planned:
+            taken = f"{path}, {inspection.steps_taken(steps, planned)} steps"
+            left.append(taken + _what_goes_on(path, report))
     if left:
-        text = f"not finished: {'; '.join(left)}; aegis train RUN goes on"
-        on_event(Warned("compare", text))
+        on_event(Warned("compare", f"not finished: {'; '.join(left)}"))
+
+
+def _what_goes_on(path: Path, report: InspectReport) -> str:
+    """How an unfinished run comes to its end; nothing where its training state is gone."""
+    if "merge" in report.facts:
+        return " (merged before its training had ended: what that ends in can be merged again)"
+    state = path / "checkpoints" / checkpoint.LAST / checkpoint.STATE
+    return f" ({commands.aegis('train', path)} goes on)" if state.is_file() else ""
 
 
 def _warn_of_merges(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:

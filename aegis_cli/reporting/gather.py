@@ -90,7 +90,7 @@ class RunDocument:
     energy_shed_mean: float | None
     train: dict[str, Any]
     probes: list[results.Result]
-    rollouts: list[results.Result]
+    rollouts: list[results.PlayedResult]
     open_loops: list[results.Result]
     question_sets: list[str]
     gate: bool | None
@@ -224,7 +224,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
         probes=probes,
         rollouts=list(found.rollouts),
         open_loops=list(found.open_loops),
-        question_sets=[results.question_set(probed, recipe) for probed in probes],
+        question_sets=list(found.question_sets),
         gate=found.gate,
         machine=kept_figures.read(about, kept_figures.Plain) if about.is_file() else {},
         videos=_videos(path) if videos else [],

@@ -514,6 +514,7 @@ class PolicyRunner:
             files.save_json(out / run_folder.JOBS_REPORT, report.to_json())
 
         self.records.fresh(f"{label}/train", key, outputs, make)
+        run_folder.renew_recipe(out, recipe)
         return files.load_json(out / run_folder.JOBS_REPORT)
 
     def _clear_other_run(self, label: str, key: Mapping[str, Any], on_event: OnEvent) -> None:
@@ -565,6 +566,7 @@ class PolicyRunner:
 
         outputs = [report, *(out / "checkpoints" / "last" / name for name in POLICY)]
         self.records.fresh(f"{label}/merge", key, outputs, make)
+        run_folder.renew_recipe(out, recipe)
         return {"validation_loss": files.load_json(report)["validation_loss"]}
 
     def _policy(self, label: str, recipe: Recipe) -> Path:

@@ -206,9 +206,17 @@ def _is_foreign(path: Path, out: Path) -> bool:
 
 
 def merged_in(run: Path) -> Path | None:
-    """The run that `aegis run` has made of a run by a merge; None where it has made none."""
-    merged = run / MERGED
-    return merged if (merged / "recipe.yaml").is_file() else None
+    """The run that `aegis run` has made of a run by a merge and measured in its place.
+
+    Returns:
+        None where it has made none, or where the recipe of its job no longer asks for a merge.
+    """
+    asks = _holds_merged(run) and recipes.load(run / "recipe.yaml").merge.method is not None
+    return run / MERGED if asks else None
+
+
+def _holds_merged(run: Path) -> bool:
+    return (run / MERGED / "recipe.yaml").is_file()
 
 
 def trained_in(run: Path) -> Path:
@@ -229,7 +237,8 @@ def measured_in(run: Path) -> Path | None:
     around = run.parent
     if run.name == MERGED and (around / MERGE_REPORT).is_file():
         return around
-    return None if (run / MERGE_REPORT).is_file() and merged_in(run) else run
+    # The recipe in a run of an earlier Aegis need not say that it was merged.
+    return None if (run / MERGE_REPORT).is_file() and _holds_merged(run) else run
 
 
 def begin(out: Path, recipe: Trained) -> None:
@@ -242,6 +251,16 @@ def begin(out: Path, recipe: Trained) -> None:
 def write_recipe(out: Path, recipe: Trained) -> None:
     """Keep by which recipe a run is trained."""
     files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
+
+
+def renew_recipe(out: Path, recipe: Trained) -> None:
+    """Keep a job's recipe of now in a run that it has not trained again.
+
+    Its questions, its gate or its merge may be others than when the run was trained.
+    """
+    saved = out / "recipe.yaml"
+    if not saved.is_file() or saved.read_bytes() != recipes.to_yaml(recipe).encode():
+        write_recipe(out, recipe)
 
 
 def append_metrics(out: Path, line: Mapping[str, float]) -> None:

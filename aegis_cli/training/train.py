@@ -120,7 +120,7 @@ def run(
             if restored[0] >= recipe.train.steps:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             if ranks.first:
-                if longer.lengthens(out, recipe) or _moved(out, recipe, places):
+                if _says_otherwise(out, recipe, places):
                     folder.write_recipe(out, recipe)
                 inputs.keep(out, places)
             return _train(training, *restored, on_event)
@@ -133,10 +133,15 @@ def run(
         return _train(training, 0, Window(), on_event)
 
 
-def _moved(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
-    """Whether a run's backbone or its inputs lie elsewhere than when it began."""
-    begun = recipes.load(out / "recipe.yaml", kind=Recipe)
-    return begun.backbone != recipe.backbone or inputs.of(out) not in (None, places)
+def _says_otherwise(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
+    """Whether a run goes on by other values than its own recipe has, or with inputs elsewhere.
+
+    Those that shape its weights are the same by now; a longer plan, questions or a gate may not be.
+    """
+    kept = recipes.load(out / "recipe.yaml", kind=Recipe)
+    # One place has several names, and inputs.json says whether the demonstrations lie elsewhere.
+    demos = dataclasses.replace(kept.demos, path=recipe.demos.path)
+    return dataclasses.replace(kept, demos=demos) != recipe or inputs.of(out) not in (None, places)
 
 
 def _restore(run: TrainingRun) -> tuple[int, Window]:

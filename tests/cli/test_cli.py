@@ -393,6 +393,14 @@ def test_a_gate_on_the_upper_end_says_it(aegis, stage):
     assert aegis("probe", "runs/x", "--baseline", "embedded", "--gate", "worst")[0] == 2
 
 
+def test_a_gate_without_a_limit_is_refused_for_it_would_pass_everything(aegis, stage):
+    calls = stage("probe", Report(passed=None))
+    for gate in ("upper", "mean"):
+        command = ("probe", "runs/x", "--baseline", "embedded", "--gate", gate)
+        assert f"--gate {gate} without --max-drop" in refused(aegis(*command))
+    assert not calls and aegis("probe", "runs/x", "--baseline", "embedded")[0] == 0
+
+
 def test_an_error_of_a_stage_is_one_block(aegis, stage):
     stage("demos", error=AegisError("a [red] 'box'", "a ball", "aegis ball"))
     err = refused(aegis("demos", "reach", "--out", "x", "--json"))

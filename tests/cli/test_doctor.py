@@ -99,6 +99,17 @@ def test_recipes_are_listed_shown_and_copied(
     assert (tmp_path / "reach.yaml").read_text() == text
 
 
+def test_each_of_the_three_prints_one_json_document(
+    aegis: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    path = ROOT / "recipes" / "reach.yaml"
+    code, out, _ = aegis("recipes", "show", "reach", "--json")
+    shown = {"name": "reach", "path": str(path), "text": path.read_text()}
+    assert code == 0 and json.loads(out) == shown
+    code, out, _ = aegis("recipes", "cp", "reach", tmp_path / "mine.yaml", "--json")
+    assert code == 0 and json.loads(out) == {"name": "reach", "out": str(tmp_path / "mine.yaml")}
+
+
 @pytest.mark.parametrize(
     ("args", "said"),
     [

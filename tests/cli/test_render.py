@@ -38,6 +38,7 @@ from aegis_cli.evaluation.open_loop import (
 from aegis_cli.evaluation.results import Result
 from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy
+from aegis_cli.merging.merge import MergeReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 
 # --- progress -------------------------------------------------------------------------------------
@@ -481,6 +482,18 @@ def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() 
     assert "nothing has learned" not in text_of(
         render.inspect(InspectReport("ledger", "x", {}, **told))
     )
+
+
+@pytest.mark.parametrize(("kept", "said"), [(0.0, "0.0 % of the displacement"), (None, None)])
+def test_a_merge_all_the_way_back_keeps_none_of_the_displacement(
+    kept: float | None, said: str | None
+) -> None:
+    strength, out = (None, None) if kept is None else (1.0, "merged")
+    report = MergeReport(
+        "linear", 0.01, "run", "embedded", strength, kept, None, None, out, 0, None
+    )
+    shown = " ".join(text_of(render.merge(report)).split())
+    assert (f"kept {said}" in shown) if said else "kept" not in shown
 
 
 def test_a_merge_is_told_without_what_was_not_measured() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from samples.command import refused
-from samples.reports import HOSTILE, METHODS, open_loop, probe, write_job
+from samples.reports import HOSTILE, METHODS, open_loop, probe, rollout, write_job
 from samples.studies import found
 
 from aegis_cli.common import files
@@ -131,6 +131,24 @@ def test_figures_of_a_run_are_those_of_json(aegis, job: Path) -> None:
     assert document["kind"] == "run" and document["label"] == "aegis"
     check_figures(page, document)
     assert "aegis train" in page.said and "aegis rollout NEW_FOLDER" in page.said
+
+
+def test_a_rollout_that_was_repeated_stands_once_and_another_with_what_tells_it_apart(
+    aegis, job: Path
+) -> None:
+    results.keep(job / "naive", "rollout-seen", rollout("seen", 0.75), {"seed": 0})
+    page, document = reported(aegis, job)
+    assert len(document["runs"][0]["rollouts"]) == 2 and "Played with" not in page.said
+    results.keep(job / "naive", "rollout-seen", rollout("seen", 0.25), {"seed": 3})
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    played = [one["played"]["seed"] for one in document["runs"][0]["rollouts"]]
+    assert played == [0, 3, 0] and "Played with" in page.said and "seed 3" in page.said
+    alone, _ = reported(aegis, job / "naive")
+    assert "Success %, seen colours, reach, 4 episodes, seed 3" in alone.said
+    assert "Success %, held-out colours, reach" not in alone.said
+    shown = aegis("inspect", job / "naive")[1]
+    assert "Played with" in shown and "seed 3" in shown
 
 
 def test_the_commands_of_a_run_ask_and_play_by_its_seeds(aegis, job: Path) -> None:

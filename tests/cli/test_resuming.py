@@ -335,6 +335,17 @@ def test_merge_finds_the_demonstrations_where_the_run_learned_from_them(
     assert code == 0 and (place / "merged" / "checkpoints").is_dir(), err
 
 
+def test_a_merged_run_is_evaluated_on_what_its_training_learned_from(
+    place: Path, aegis: Aegis
+) -> None:
+    linear = "--method", "linear", "--strength", 0.5
+    code, _, err = aegis("merge", cut(place, "naive"), *linear, "--out", "merged")
+    assert code == 0, err
+    code, out, err = aegis("evaluate", "merged", "--frames", 8, "--json")
+    assert code == 0 and json.loads(out)["data"] == str(place / "demos.safetensors"), err
+    assert json.loads(out)["split"] == "validation"
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"demos": [3], "anchor": null}', '{"demos": ["x"]']
 )

@@ -512,6 +512,29 @@ def test_joints_in_another_order_are_refused(
     assert f"positions {', '.join(names)}" in refusal(turned, demos_file)
 
 
+def test_another_robot_is_refused_before_any_picture_is_decoded(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """To decode a large data set takes hours."""
+    made = lerobot.episodes(6)
+    known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+    data = lerobot.save(tmp_path / "arm", known)
+    train.run(recipe, "naive", data, None, tmp_path / "run")
+    decoded = sorted(frame_cache.rglob("*"))
+    for name, (feature, names, says) in {
+        "turned": ("action", ["dy", "dx"], "'dx' in another place"),
+        "smaller": ("observation.state", ["x"], "1 positions and 2 actions"),
+    }.items():
+        other = Path(shutil.copytree(data, tmp_path / name))
+
+        def change(info: dict[str, Any], feature: str = feature, names: list[str] = names) -> None:
+            info["features"][feature] |= {"names": names, "shape": [len(names)]}
+
+        lerobot.edit_info(other, change)
+        assert says in refusal(tmp_path / "run", other)
+        assert sorted(frame_cache.rglob("*")) == decoded
+
+
 def evaluated(policy: Path, data: Path, **options: Any) -> tuple[OpenLoopReport, list[str]]:
     """The report, and what was warned of."""
     events: list[Event] = []

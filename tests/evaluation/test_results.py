@@ -35,9 +35,37 @@ def test_what_is_kept_is_read_back_after_that_of_aegis_run(run: Path) -> None:
 def test_a_later_one_replaces_it_and_leaves_that_of_aegis_run(run: Path) -> None:
     before = (run / "rollout-seen.json").read_bytes()
     for success in (0.25, 0.5):
-        results.keep(run, "rollout-seen", rollout("seen", success), {"episodes": 4})
+        results.keep(run, "rollout-seen", rollout("seen", success), {"seed": 1})
     assert [r.figures["success"] for r in results.rollouts(run)] == [0.75, 0.5, 0.5]
     assert (run / "rollout-seen.json").read_bytes() == before
+
+
+def test_a_rollout_that_was_repeated_is_told_once_as_it_was_found_last(run: Path) -> None:
+    again = rollout("seen", 0.25)
+    path = results.keep(run, "rollout-reach-seen", again, {"seed": 0, "replan": 4})
+    assert path is not None
+    assert [r.figures["success"] for r in results.rollouts(run)] == [0.25, 0.5]
+    os.utime(path, (0, 0))  # as if `aegis run` had measured it afterwards
+    assert [r.figures["success"] for r in results.rollouts(run)] == [0.75, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes", "said"),
+    [
+        ({"seed": 1, "replan": 4}, {}, ("seed 0", "seed 1")),
+        ({"seed": 0, "replan": 2}, {}, ("replan 4", "replan 2")),
+        ({"seed": 0, "ensemble": 0.01}, {}, ("no ensemble", "ensemble 0.01")),
+        ({"seed": 0}, {"episodes": 8}, ("", "")),  # which the tables have anyway
+    ],
+)
+def test_a_rollout_that_was_played_otherwise_says_how(
+    settings: dict[str, float], changes: dict[str, int], said: tuple[str, str], run: Path
+) -> None:
+    results.keep(run, "rollout-seen", rollout("seen", 0.25) | changes, settings)
+    first, second, held_out = results.rollouts(run)
+    assert (first.figures["success"], second.figures["success"]) == (0.75, 0.25)
+    apart = results.told_apart([first.played, second.played, held_out.played])
+    assert tuple(apart) == (*said, said[0])
 
 
 def probe_of(drop: float | None, passed: bool | None = None, drift: bool = False):
@@ -107,7 +135,7 @@ def test_one_of_the_last_checkpoint_is_one_of_the_run(run: Path) -> None:
 
 def test_a_run_that_was_trained_further_has_not_what_was_measured_before(run: Path) -> None:
     results.keep(run, "probe-scenes", probe("shape"), {})
-    results.keep(run, "rollout-x-seen", rollout("seen", 0.25), {})
+    results.keep(run, "rollout-x-seen", rollout("seen", 0.25), {"seed": 1})
     before = len(results.probes(run)), len(results.rollouts(run))
     link = run / "checkpoints" / "last"
     link.unlink()

@@ -22,7 +22,7 @@ from samples.small_run import recipe as small
 from aegis_cli import inspection, recipes
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
-from aegis_cli.evaluation.results import Result
+from aegis_cli.evaluation.results import Played, PlayedResult, Result
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export, push
 from aegis_cli.training import checkpoint, train
@@ -254,7 +254,7 @@ def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
 
 def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_where_it_can() -> None:
     evaluated = Result("evaluate-validation-arm", open_loop(1, 2, data="/home/somebody/arm"), {})
-    played = Result("rollout-seen", rollout_figures("seen", 0.75), {})
+    played = PlayedResult("rollout-seen", rollout_figures("seen", 0.75), {}, Played(0, 4, None))
     alone = card.inspection.InspectReport("run", "x", {}, open_loops=(evaluated,))
     line = "| 2 held-out episodes of arm | 50 | 0.250 (0.125 to 0.375) |"
     lines = [*card._acting(alone)]

@@ -11,7 +11,7 @@ from samples.reports import METHODS, open_loop, probe, write_job
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Event
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.evaluation import results
 from aegis_cli.recipes import Probe
 from aegis_cli.reporting import compare
@@ -55,6 +55,26 @@ def test_a_run_that_is_not_finished_says_of_how_many_steps(
     assert (facts["steps"], facts["planned_steps"]) == (6, 3000)
     assert aegis("report", "aegis")[0] == 0
     assert "6 of 3,000 steps" in Path("aegis", "report.html").read_text(encoding="utf-8")
+
+
+def test_only_a_run_with_its_training_state_is_said_to_go_on(job: Path) -> None:
+    """A merged run has none, nor has one whose checkpoints were removed."""
+    merged, going, gone = job / "naive", job / "aegis", write_job(job) / "aegis"
+    for run in (merged, going, gone):
+        recipe = (run / "recipe.yaml").read_text(encoding="utf-8")
+        files.write_text(run / "recipe.yaml", recipe.replace("steps: 6", "steps: 3000"))
+    for run in (merged, going):
+        (run / "checkpoints/last/training_state").mkdir()
+        (run / "checkpoints/last/training_state/state.safetensors").touch()
+    how = {"method": "linear", "strength": 0.5, "damping": 0.01, "base": "embedded", "kept": 0.5}
+    files.save_json(merged / "merge.json", how)
+    told: list[Event] = []
+    compare.run([merged, going, gone], told.append)
+    text = next(event.text for event in told if isinstance(event, Warned))
+    _, of_merged, of_going, of_gone = text.replace(": /", "; /").split("; ")
+    assert "merged before its training had ended" in of_merged and "aegis train" not in of_merged
+    assert of_going == f"{going}, 6 of 3,000 steps (aegis train {going} goes on)"
+    assert of_gone == f"{gone}, 6 of 3,000 steps"
 
 
 def test_what_was_measured_by_hand_counts_where_aegis_run_measured_nothing(job: Path) -> None:

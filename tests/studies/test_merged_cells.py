@@ -12,10 +12,10 @@ import pytest
 from samples.small_run import recipe
 from samples.training_runs import contents
 
-from aegis_cli import inspection
+from aegis_cli import inspection, recipes
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.events import Progress
-from aegis_cli.recipes import Anchor, Merge, Recipe
+from aegis_cli.recipes import Anchor, Merge, Probe, Recipe
 from aegis_cli.reporting import compare, gather
 from aegis_cli.studies import pipeline, table
 from aegis_cli.studies.cells import Cell
@@ -180,6 +180,35 @@ def test_another_strength_merges_anew_and_does_not_train(small: Recipe, tmp_path
     (row,) = pipeline.run(again, tmp_path, on_event=events.append).rows
     assert row.accuracy == row.baseline_accuracy
     assert "naive/train (up to date)" in {event.stage for event in events}
+
+
+def test_the_merge_and_the_gate_of_now_stand_in_the_recipes_of_both_runs(
+    job: Path, small: Recipe, tmp_path: Path
+) -> None:
+    shutil.copytree(job, tmp_path / "small", symlinks=True)
+    asks = replace(small, merge=Merge("linear", 0.5), probe=Probe(questions=14, max_drop=90.0))
+    for merge in (asks.merge, Merge("linear", 1.0)):
+        events: list[Progress] = []
+        now = replace(asks, merge=merge)
+        pipeline.run(now, tmp_path, on_event=events.append)
+        assert "naive/train (up to date)" in {event.stage for event in events}
+        for run in ("naive", "naive/merged"):
+            assert recipes.load(tmp_path / "small" / run / "recipe.yaml") == now
+        assert inspection.run(tmp_path / "small/naive/merged").gate is True
+
+
+def test_where_the_job_no_longer_merges_nobody_is_sent_to_the_merged_run(
+    job: Path, small: Recipe, tmp_path: Path, aegis: Aegis
+) -> None:
+    shutil.copytree(job, tmp_path / "small", symlinks=True)
+    pipeline.run(small, tmp_path)
+    trained = tmp_path / "small/naive"
+    assert table.runs(table.load(tmp_path / "small")) == [trained]
+    found = inspection.run(trained)
+    assert found.probes and "merged_into" not in found.facts
+    code, _, err = aegis("export", trained, "--out", tmp_path / "out")
+    assert code == 0 and "merge" not in err
+    assert "merge" not in aegis("compare", trained, trained / "merged")[2].replace("merged,", "")
 
 
 def test_nothing_large_is_left_of_a_measured_cell(small: Recipe, tmp_path: Path) -> None:

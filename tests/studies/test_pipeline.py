@@ -32,6 +32,7 @@ from aegis_cli.data.vqa.questions import FAMILIES
 from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models.backbones import load
 from aegis_cli.recipes import Anchor, Cotrain, Demos, Probe, Recipe
+from aegis_cli.reporting import gather
 from aegis_cli.studies import pipeline, policy_cells, table
 
 METHODS = ("naive", "aegis")
@@ -359,6 +360,44 @@ def test_more_questions_rerun_only_the_probes(
     pipeline.run(replace(small, probe=replace(small.probe, questions=21)), root)
     assert calls == {"probe": 2}
     assert files.load_json(root / "small" / "naive" / "probe.json")["questions"] == 21
+
+
+def test_what_is_asked_after_the_training_stands_in_each_runs_own_recipe(
+    small: Recipe, root: Path, calls: Counter[str], aegis
+) -> None:
+    trained = {m: content(root / "small" / m / "checkpoints") for m in METHODS}
+    now = replace(small, methods=("aegis", "naive"), probe=Probe(questions=14, max_drop=90.0))
+    pipeline.run(now, root)
+    assert calls == {"probe": 2}
+    for method in METHODS:
+        run = root / "small" / method
+        assert content(run / "checkpoints") == trained[method]
+        kept = recipes.load(run / "recipe.yaml")
+        assert kept == replace(now, train=replace(now.train, method=method))
+    code, _, err = aegis("probe", root / "small" / "naive", "--questions", 14)
+    assert code == 0 and "the gate is at a drop of 90 points, the recipe's probe.max_drop" in err
+    (again,) = gather.run(root / "small").commands
+    assert again.startswith(f"aegis run {root / 'small' / 'aegis' / 'recipe.yaml'} ")
+    before, events = content(root / "small" / "naive"), list[Event]()
+    pipeline.run(now, root, events.append)
+    assert up_to_date(events) == ALL and content(root / "small" / "naive") == before
+
+
+def test_a_run_that_was_cut_goes_on_to_the_same_weights_by_a_recipe_that_asks_otherwise(
+    small: Recipe, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    naive = replace(small, methods=("naive",))
+
+    def cut(event: Event) -> None:
+        if isinstance(event, Progress) and event.stage == "naive/train" and event.done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run(naive, tmp_path / "cut", cut)
+    pipeline.run(replace(naive, probe=Probe(questions=21, max_drop=90.0)), tmp_path / "cut")
+    run = tmp_path / "cut/small/naive"
+    assert content(run / "checkpoints") == content(root / "small/naive/checkpoints")
+    assert recipes.load(run / "recipe.yaml").probe == Probe(questions=21, max_drop=90.0)
 
 
 def test_other_steps_rerun_all_but_demonstrations_and_anchor(

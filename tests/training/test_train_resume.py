@@ -25,13 +25,14 @@ from samples.training_runs import (
 )
 from samples.vqa_files import write_jsonl
 
+from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.data.record import run as record
 from aegis_cli.methods import METHODS
 from aegis_cli.models.policy import Policy
-from aegis_cli.recipes import Cotrain, Insulate, Lora, Recipe, Rollout
+from aegis_cli.recipes import Cotrain, Insulate, Lora, Probe, Recipe, Rollout
 from aegis_cli.training import checkpoint, step, train
 
 # --- resuming -------------------------------------------------------------------------------------
@@ -178,11 +179,17 @@ def test_a_run_goes_on_with_its_own_settings_only(
     assert method.found.endswith("lora here")  # and of lora's options, which naive has not, nothing
 
 
-def test_what_does_not_shape_training_may_change(
-    naive_run: Path, start: Start, recipe: Recipe
+def test_what_does_not_shape_training_may_change_and_the_run_says_so(
+    naive_run: Path, start: Start, recipe: Recipe, tmp_path: Path
 ) -> None:
+    run = Path(shutil.copytree(naive_run, tmp_path / "run", symlinks=True))
     other = replace(recipe, name="other", lora=Lora(rank=2), rollout=Rollout(episodes=3, replan=1))
-    assert start("naive", naive_run, recipe=other, resume=True).steps == STEPS
+    other = replace(other, probe=Probe(max_drop=2.0))
+    assert start("naive", run, recipe=other, resume=True).steps == STEPS
+    kept = recipes.load(run / "recipe.yaml")
+    assert kept == replace(other, train=replace(SETTINGS, method="naive"))
+    before, now = contents(naive_run), contents(run)
+    assert {name for name in now if now[name] != before[name]} == {"recipe.yaml"}
 
 
 def test_a_damaged_line_of_the_log_is_refused(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from aegis_cli.cli.page import charts
@@ -11,7 +11,7 @@ from aegis_cli.cli.page.charts import HeatMap, Row, Series, is_number
 from aegis_cli.cli.page.cursor import At, between, decimal, plain, share, whole, with_interval
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
-from aegis_cli.evaluation.results import evaluated_on
+from aegis_cli.evaluation.results import Played, evaluated_on, told_apart
 
 _TICKS = 5  # below a heat map
 _INSTRUCTIONS = 10  # rows of a table by instruction
@@ -61,14 +61,28 @@ def at_a_glance(run: At) -> Markup:
         if vqa["drop_points"].value is not None:
             ends = between(vqa["drop_interval"], decimal)
             shown.append(("VQA accuracy lost, points", [decimal(vqa["drop_points"]), ends]))
-    for result in run["rollouts"]:
-        shown.append(_acted(result["figures"]))
+    shown += _acted_apart(run["rollouts"])
     for result in run["open_loops"]:
         on = evaluated_on(result["figures"].value)
         shown.append((f"Open-loop error on {on}", _off(result["figures"])))
     if run["gate"].value is not None:
         shown.append(("Gate", verdict(run["gate"].value, "passed", "failed")))
     return pairs(shown, big=True)
+
+
+def _acted_apart(rollouts: At) -> Iterator[tuple[str, Child]]:
+    """Each rollout by its colours; several of the same ones also by what tells them apart."""
+    each = [result["figures"] for result in rollouts]
+    names = [_acted(played)[0] for played in each]
+    for played, otherwise in zip(each, _otherwise(rollouts), strict=True):
+        name, success = _acted(played)
+        told = [str(played["task"]), f"{played['episodes']} episodes", otherwise]
+        yield ", ".join([name, *filter(None, told)]) if names.count(name) > 1 else name, success
+
+
+def _otherwise(rollouts: Iterable[At]) -> list[str]:
+    """How each rollout was played, where others were played otherwise."""
+    return told_apart([Played(**result["played"].value) for result in rollouts])
 
 
 def _acted(played: At) -> tuple[str, Child]:
@@ -83,25 +97,14 @@ def _acted(played: At) -> tuple[str, Child]:
 
 def successes(runs: Sequence[At]) -> Markup | None:
     """Every rollout of every run, with its interval."""
-    rows = []
-    for run in runs:
-        for result in run["rollouts"]:
-            played = result["figures"]
-            acted = _acted(played)[1]
-            distance = played["final_distance_m"]
-            rows.append(
-                (
-                    run["label"],
-                    played["task"],
-                    played["colors"] or "–",
-                    whole(played["episodes"]),
-                    acted,
-                    share(played["wrong_target"]),
-                    "–" if distance.value is None else plain(distance),
-                )
-            )
-    if not rows:
+    each = [(run["label"], result) for run in runs for result in run["rollouts"]]
+    if not each:
         return None
+    apart = _otherwise(result for _, result in each)
+    rows = [
+        (*_success(label, result["figures"]), *([otherwise] if any(apart) else []))
+        for (label, result), otherwise in zip(each, apart, strict=True)
+    ]
     header = (
         "Run",
         "Task",
@@ -110,11 +113,26 @@ def successes(runs: Sequence[At]) -> Markup | None:
         "Success % (or return)",
         "Wrong target %",
         "Final distance (m)",
+        *(["Played with"] if any(apart) else []),
     )
     return section(
         "Success in closed loop",
         note("Under each success, its 95 % interval (Wilson), over the episodes played."),
         table(header, rows, left=3),
+    )
+
+
+def _success(label: At, played: At) -> tuple[Child, ...]:
+    """A row of one rollout."""
+    distance = played["final_distance_m"]
+    return (
+        label,
+        played["task"],
+        played["colors"] or "–",
+        whole(played["episodes"]),
+        _acted(played)[1],
+        share(played["wrong_target"]),
+        "–" if distance.value is None else plain(distance),
     )
 
 

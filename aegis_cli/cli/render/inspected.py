@@ -82,11 +82,11 @@ def _measured(report: Any) -> list[RenderableType]:
     """How well a run does, what was lost, and whether its gate is passed."""
     parts: list[RenderableType] = []
     if report.rollouts:
-        parts.append(_played([result.figures for result in report.rollouts]))
+        parts.append(_played(report.rollouts))
     if report.open_loops:
         parts.append(_evaluated(report.open_loops))
     if report.probes:
-        parts.append(_known(report.probes))
+        parts.append(_known(report.probes, report.question_sets))
     if not parts and (into := report.facts.get("merged_into")):
         return [Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")]
     if not parts:
@@ -96,10 +96,15 @@ def _measured(report: Any) -> list[RenderableType]:
     return [*parts, Text(f"gate: {verdict[report.gate]}\n")]
 
 
-def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
+def _played(rollouts: Sequence[Any]) -> Table:
+    from aegis_cli.evaluation import results  # with it comes torch, as with what it has read
+
     header = ("Task", "Colours", "Success %", "95 % interval", "Return %", "Episodes")
-    rows = [
-        (
+    apart = results.told_apart([result.played for result in rollouts])
+    rows = []
+    for result, otherwise in zip(rollouts, apart, strict=True):
+        found = result.figures
+        row = (
             str(found["task"]),
             str(found.get("colors") or "-"),
             percent(found.get("success")),
@@ -107,9 +112,8 @@ def _played(rollouts: Sequence[dict[str, Any]]) -> Table:
             percent(found.get("return_share")),
             str(found["episodes"]),
         )
-        for found in rollouts
-    ]
-    return plain_table(header, rows, left=2)
+        rows.append((*row, otherwise) if any(apart) else row)
+    return plain_table((*header, "Played with") if any(apart) else header, rows, left=2)
 
 
 def _evaluated(open_loops: Sequence[Any]) -> Table:
@@ -125,15 +129,16 @@ def _evaluated(open_loops: Sequence[Any]) -> Table:
     return plain_table(header, rows)
 
 
-def _known(probes: Sequence[Any]) -> Table:
-    header = ("Asked", "VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
+def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
+    names = ("VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
     rows = []
-    for result in probes:
+    for result, asked in zip(probes, question_sets, strict=True):
         found = result.figures
         drifts = [layer["w2"] for layer in found["layers"]]
         rows.append(
             (
-                str(result.settings.get("vqa", result.name)),
+                asked,
+                f"{found.get('questions', 0):,}",
                 percent(found["accuracy"]),
                 percent(found["baseline_accuracy"]),
                 fixed(found["drop_points"], 2),
@@ -141,7 +146,7 @@ def _known(probes: Sequence[Any]) -> Table:
                 number(max(drifts, default=None)),
             )
         )
-    return plain_table(header, rows)
+    return plain_table(("Asked", "Questions", *names), rows)
 
 
 def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> str:
@@ -214,27 +219,60 @@ def _steps(first: int, last: int) -> str:
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
 _OPEN_LOOP = "Open-loop error"
+# The columns in which the best and the worst are marked: the figure, and whether more is better.
+_BETTER = {
+    "VQA %": ("accuracy", True),
+    "Drop (points)": ("drop_points", False),
+    "Success seen %": ("success_seen", True),
+    "Success held-out %": ("success_held_out", True),
+    "Return % of highest": ("return_share", True),
+    _OPEN_LOOP: ("open_loop_error", False),
+    "W2²": ("w2", False),
+    "Validation loss": ("validation_loss", False),
+    "Step (s)": ("step_s", False),
+}
+_VERDICTS = {True: "passed", False: "failed", None: "-"}
 
 
 def compared(report: Any) -> RenderableType:
     """A line per run; columns that no run has are left out."""
-    verdict = {True: "passed", False: "failed", None: "-"}
-    better = {
-        "VQA %": ("accuracy", True),
-        "Drop (points)": ("drop_points", False),
-        "Success seen %": ("success_seen", True),
-        "Success held-out %": ("success_held_out", True),
-        "Return % of highest": ("return_share", True),
-        _OPEN_LOOP: ("open_loop_error", False),
-        "W2²": ("w2", False),
-        "Validation loss": ("validation_loss", False),
-        "Step (s)": ("step_s", False),
-    }
-    several = len(report.question_sets) > 1  # then their figures are not compared
-    elsewhere = not report.same_open_loop
-    apart = {*(_OF_QUESTIONS if several else ()), *([_OPEN_LOOP] if elsewhere else [])}
-    better = {name: of for name, of in better.items() if name not in apart}
-    columns: dict[str, Callable[[Any], str]] = {
+    names = [(row.run, row.method, row.task or "-") for row in report.rows]
+    shown = _shown_columns(report)
+    figures = zip(*shown.values(), strict=True)
+    rows = [(*name, *own) for name, own in zip(names, figures, strict=True)]
+    table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
+    notes = [MARKS] if len(rows) > 1 else []
+    on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
+    if on is not None and report.same_open_loop:
+        notes.append(f"open-loop error: on {on}")
+    return Group(table, *map(Text, notes))
+
+
+def _shown_columns(report: Any) -> dict[str, list[Cell]]:
+    """The cells of each column that some run has a figure for, marked where they compare."""
+    apart = _not_compared(report)
+    shown = dict[str, list[Cell]]()
+    for name, write in _columns(report).items():
+        cells = [write(row) for row in report.rows]
+        if set(cells) == {"-"}:
+            continue
+        shown[name] = [*cells]
+        if name in _BETTER and name not in apart:
+            figure, more = _BETTER[name]
+            shown[name] = marked(cells, [getattr(row, figure) for row in report.rows], more)
+    return shown
+
+
+def _not_compared(report: Any) -> set[str]:
+    """The columns whose figures were measured on other questions or frames of each run."""
+    of_questions = _OF_QUESTIONS if len(report.question_sets) > 1 else ()
+    return {*of_questions, *([] if report.same_open_loop else [_OPEN_LOOP])}
+
+
+def _columns(report: Any) -> dict[str, Callable[[Any], str]]:
+    """What each column says of a row."""
+    several, elsewhere = len(report.question_sets) > 1, not report.same_open_loop
+    return {
         "Steps": lambda r: _steps_taken(r.steps, r.planned_steps),
         "Questions": lambda r: (r.vqa or "-") if several else "-",
         "VQA %": lambda r: percent(r.accuracy),
@@ -250,20 +288,5 @@ def compared(report: Any) -> RenderableType:
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
         "Validation loss": lambda r: fixed(r.validation_loss, 4),
         "Step (s)": lambda r: fixed(r.step_s, 3),
-        "Gate": lambda r: verdict[r.gate],
+        "Gate": lambda r: _VERDICTS[r.gate],
     }
-    cells = {name: [write(row) for row in report.rows] for name, write in columns.items()}
-    shown: dict[str, list[Cell]] = {n: [*own] for n, own in cells.items() if set(own) != {"-"}}
-    for name in shown.keys() & better.keys():
-        field, more = better[name]
-        shown[name] = marked(cells[name], [getattr(row, field) for row in report.rows], more)
-    named = [(row.run, row.method, row.task or "-") for row in report.rows]
-    rows = [
-        (*name, *own) for name, own in zip(named, zip(*shown.values(), strict=True), strict=True)
-    ]
-    table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
-    notes = [MARKS] if len(rows) > 1 else []
-    on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
-    if on is not None and not elsewhere:
-        notes.append(f"open-loop error: on {on}")
-    return Group(table, *map(Text, notes))

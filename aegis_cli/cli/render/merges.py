@@ -18,12 +18,13 @@ _COLOR, _CHOSEN = "#0072b2", "#d55e00"
 
 def merge(report: Any) -> RenderableType:
     """What was written, and the sweep's points."""
+    kept = None if report.kept is None else f"{percent(report.kept)} % of the displacement"
     facts = {
         "method": report.method,
         "target": report.target,
         "base": report.base,
         "strength": report.strength,
-        "kept": report.kept and f"{percent(report.kept)} % of the displacement",
+        "kept": kept,
         "max_drop_points": report.max_drop,
         "passed": report.passed,
         "out": report.out,
