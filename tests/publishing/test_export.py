@@ -181,6 +181,12 @@ def test_nothing_is_left_of_an_export_that_fails(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_export_left_is_removed_by_the_next(run_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / ".x.12345.tmp" / "backbone").mkdir(parents=True)
+    export.run(run_folder, tmp_path / "x")
+    assert list(tmp_path.iterdir()) == [tmp_path / "x"]
+
+
 def test_what_lies_beside_an_export_stays(run_folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / ".x.tmp" / "notes.txt"
     mine.parent.mkdir()

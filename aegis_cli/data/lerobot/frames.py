@@ -9,7 +9,6 @@ deleting it costs the decoding.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import shutil
@@ -241,6 +240,7 @@ def _write(
     on_event: OnEvent,
 ) -> None:
     """Decode a camera's frames into a file beside `path`, then rename it."""
+    files.sweep_all(path.parent)
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
@@ -250,30 +250,26 @@ def _write(
             "free some space, set AEGIS_CACHE to a folder on a larger disk"
             + (", or --set demos.cache=false" if isinstance(parts[0], VideoPart) else ""),
         )
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
-        done, stage = 0, f"decode {layout.short(camera)}"
-        workers = workers or worker_count(len(parts) // _PER_WORKER)
-        decode = partial(_decode, aside, offset, shape[1:3])
-        with mapped(
-            decode, parts, workers, "a decoding process", "free some memory, then run it again"
-        ) as counts:
-            for decoded in counts:
-                done += decoded
-                on_event(Progress(stage, done, count, "frames"))
-        with open(aside, "rb") as file:
+        with files.aside(path) as (aside, file):
+            offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
+            done, stage = 0, f"decode {layout.short(camera)}"
+            workers = workers or worker_count(len(parts) // _PER_WORKER)
+            decode = partial(_decode, aside, offset, shape[1:3])
+            with mapped(
+                decode, parts, workers, "a decoding process", "free some memory, then run it again"
+            ) as counts:
+                for decoded in counts:
+                    done += decoded
+                    on_event(Progress(stage, done, count, "frames"))
             os.fsync(file.fileno())
-        os.replace(aside, path)
+            os.replace(aside, path)
     except OSError as error:
         raise AegisError(
             f"cannot write '{path}': {error.strerror or error}",
             "a cache that can be written",
             "free some space, or set AEGIS_CACHE to another folder",
         ) from error
-    finally:
-        with contextlib.suppress(OSError):  # after the rename there is nothing to remove
-            aside.unlink()
 
 
 def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:

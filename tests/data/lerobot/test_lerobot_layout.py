@@ -330,6 +330,12 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
+def test_what_a_killed_recording_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".d.12345.tmp" / "data").mkdir(parents=True)
+    save(tmp_path / "d", episodes(2))
+    assert list(tmp_path.iterdir()) == [tmp_path / "d"]
+
+
 def test_a_name_as_long_as_a_file_system_takes(tmp_path: Path) -> None:
     assert save(tmp_path / ("x" * 255)) == next(tmp_path.iterdir())
 
