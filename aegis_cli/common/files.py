@@ -22,6 +22,7 @@ from aegis_cli.common.errors import AegisError
 RENAME = "rename that file or folder"
 _REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
 _NUMBER = r"\.\d+\.tmp"  # how such a name ends
+_LEFT = re.compile(r"\..+" + _NUMBER)
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
 _ATTEMPTS = 100  # at a folder above which others come and go
 
@@ -158,7 +159,19 @@ def sweep(path: Path) -> None:
 
 def sweep_all(folder: Path) -> None:
     """Remove what killed processes have left in a folder to which Aegis alone writes."""
-    _sweep(folder, re.compile(r"\..+" + _NUMBER))
+    _sweep(folder, _LEFT)
+
+
+def is_left(path: Path) -> bool:
+    """Whether a path has the name of what is not whole yet, or never was."""
+    return _LEFT.fullmatch(path.name) is not None
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether nothing is at a path, or a folder with nothing in it that is whole."""
+    if not folder.exists():
+        return True
+    return folder.is_dir() and all(map(is_left, folder.iterdir()))
 
 
 def _sweep(folder: Path, name: re.Pattern[str]) -> None:
