@@ -239,7 +239,7 @@ def _target(path: Path) -> Path:
         AegisError: a device, a pipe or a socket is there. The rename would put a file in its place,
             for every program of the machine.
     """
-    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    target = followed(path)
     if (special := _special(target)) is not None:
         raise AegisError(
             f"the output '{path}' is {special}",
@@ -247,6 +247,11 @@ def _target(path: Path) -> Path:
             "choose another output",
         )
     return target
+
+
+def followed(path: Path) -> Path:
+    """Where a link leads, whether or not something is there; a path that is none as it is."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def _special(path: Path) -> str | None:
@@ -286,7 +291,17 @@ def make_folder(path: Path) -> None:
 
     Another process may remove an empty one of those above meanwhile, as `locks.alone` does at its
     end. Then they are made again.
+
+    Raises:
+        AegisError: it cannot be created, or lies behind a link that leads nowhere.
     """
+    for above in (path, *path.parents):
+        if above.is_symlink() and not above.exists():
+            raise AegisError(
+                f"'{above}' is a link to '{os.readlink(above)}', and nothing is there",
+                "a link that leads to a folder",
+                f"mkdir -p '{followed(above)}', mount its disk, or choose another output",
+            )
     try:
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):

@@ -166,6 +166,17 @@ def test_what_is_swept_before_it_is_locked_is_made_again(
     assert files.load_json(tmp_path / "out.json") == 1
 
 
+@pytest.mark.parametrize("name", ["runs", "runs/x"])
+def test_a_folder_behind_a_link_that_leads_nowhere_is_not_made(name: str, tmp_path: Path) -> None:
+    """As where the disk that it leads to is not mounted."""
+    (tmp_path / "runs").symlink_to("disk/runs")
+    with pytest.raises(AegisError) as caught:
+        files.make_folder(tmp_path / name)
+    assert "link to 'disk/runs'" in caught.value.found
+    assert f"mkdir -p '{tmp_path / 'disk' / 'runs'}'" in caught.value.fix
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
 # --- what is no regular file ----------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_utf8, folder_aside
+from aegis_cli.common.files import check_utf8, folder_aside, followed
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -66,6 +66,7 @@ def check_new(folder: Path) -> None:
         raise AegisError(
             f"'{folder}', which names no folder", "a folder's name", "choose another --out"
         )
+    folder = followed(folder)
     if not folder.parent.is_dir():
         raise AegisError(
             f"no folder '{folder.parent}'",
@@ -89,12 +90,13 @@ def write(
 ) -> None:
     """Write a dataset of one or more episodes; equal episodes give equal bytes.
 
-    One episode is held in memory at a time.
+    One episode is held in memory at a time. A link is followed, and stays.
 
     Raises:
         AegisError: a folder that is not new, or a disk that cannot be written.
     """
     check_new(folder)
+    folder = followed(folder)
     try:
         with folder_aside(folder) as aside:
             _Writer(aside, spec, limits).write(episodes)
