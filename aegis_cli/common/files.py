@@ -366,10 +366,18 @@ def reading(path: str | Path, fix: str) -> Iterator[None]:
 
 
 def _cure(path: Path, error: OSError) -> str:
+    folder = _lasting(path.parent)
     if error.errno == errno.ENOENT:
-        return f"mkdir -p '{path.parent}'"
+        return f"mkdir -p '{folder}'"
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"free space on the disk of '{path.parent}', or choose another output"
+        return f"free space on the disk of '{folder}', or choose another output"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"make '{path.parent}' writable (chmod u+w), or choose another output"
+        return f"make '{folder}' writable (chmod u+w), or choose another output"
     return "choose another output"
+
+
+def _lasting(folder: Path) -> Path:
+    """The folder around what is written aside, for that is removed at an error."""
+    around = (folder, *folder.parents)
+    aside = [one for one in around if one.name.startswith(".") and one.suffix == ".tmp"]
+    return aside[-1].parent if aside else folder

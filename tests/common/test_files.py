@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from samples.disk import disk
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -164,6 +165,15 @@ def test_what_is_swept_before_it_is_locked_is_made_again(
     files.save_json(tmp_path / "out.json", 1)
     assert [path.name for path in tmp_path.iterdir()] == ["out.json"] != [seen[0].name]
     assert files.load_json(tmp_path / "out.json") == 1
+
+
+def test_a_full_disk_is_named_by_a_folder_that_stays(tmp_path: Path) -> None:
+    """What is written aside is gone when the user reads it."""
+    with files.folder_aside(tmp_path / "runs") as aside:
+        (aside / "backbone").mkdir()
+        with disk(10), pytest.raises(AegisError) as caught:
+            files.write_text(aside / "backbone" / "model", "x" * 100)
+    assert f"the disk of '{tmp_path}'" in caught.value.fix
 
 
 @pytest.mark.parametrize("name", ["runs", "runs/x"])
