@@ -15,6 +15,7 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import commands, files, locks, machine
 from aegis_cli.common.errors import AegisError
+from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint, inputs
 
@@ -82,7 +83,7 @@ def continues(out: Path, recipe: Trained) -> bool:
     """
     begun = _begun(out, recipe)
     if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
-        there, here = (each.backbone.partition("#")[2] for each in (begun, recipe))
+        there, here = (backbones.divided(each.backbone)[1] for each in (begun, recipe))
         if there == here:  # other layers of one model have the same weights, and learn otherwise
             begun = dataclasses.replace(begun, backbone=recipe.backbone)
     return recipes.training_part(begun) == recipes.training_part(recipe)
