@@ -128,6 +128,23 @@ def folder_aside(path: Path) -> Iterator[Path]:
         yield place
 
 
+def put(aside: Path, folder: Path) -> None:
+    """Rename a folder that was written aside; there is none yet, or an empty one.
+
+    Raises:
+        AegisError: another process has written it meanwhile.
+        OSError: what else a rename meets.
+    """
+    try:
+        os.rename(aside, folder)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        found = f"'{folder}', which another process has written meanwhile"
+        fix = "use that one, or choose another --out"
+        raise AegisError(found, "a new or empty folder", fix) from error
+
+
 def _place(path: Path) -> Path:
     """Where `path` is written until it is whole.
 

@@ -17,7 +17,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
-from aegis_cli.common.files import check_utf8, folder_aside, make_folder, write_text
+from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
@@ -107,7 +107,7 @@ def run(
             _write_checkpoint(aside, run, policy, meta)
         stored = card.Stored(meta.get("stored", FLOAT32), rounded)
         _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
-        os.rename(aside, out)
+        put(aside, out)
     return ExportReport(
         str(out),
         form,

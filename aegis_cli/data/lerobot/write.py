@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_utf8, folder_aside, followed
+from aegis_cli.common.files import check_utf8, folder_aside, followed, put
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -102,7 +102,7 @@ def write(
             _Writer(aside, spec, limits).write(episodes)
             for path in aside.rglob("*"):
                 _sync(path)
-            os.rename(aside, folder)
+            put(aside, folder)
     except OSError as error:
         raise AegisError(
             f"cannot write '{folder}': {error.strerror or error}",

@@ -341,6 +341,17 @@ def test_a_linked_folder_is_followed_and_the_link_stays(there: bool, tmp_path: P
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_folder_that_another_process_has_written_meanwhile_stays(tmp_path: Path) -> None:
+    def slow() -> Any:
+        yield from episodes(2)
+        save(tmp_path / "d", episodes(1))
+
+    with pytest.raises(AegisError, match="another process has written meanwhile"):
+        save(tmp_path / "d", slow())
+    assert list(tmp_path.iterdir()) == [tmp_path / "d"]
+    assert len(dataset.load(tmp_path / "d").episodes) == 1
+
+
 def test_what_a_killed_recording_left_is_removed_by_the_next(tmp_path: Path) -> None:
     (tmp_path / ".d.12345.tmp" / "data").mkdir(parents=True)
     save(tmp_path / "d", episodes(2))
