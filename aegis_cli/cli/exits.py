@@ -159,14 +159,19 @@ def _say(show: Callable[[Any], None], what: Any) -> None:
     _close_output()
 
 
-# How torch and the C library say on the CPU, in a RuntimeError, that memory is wanting.
+# How torch and the C library say on the CPU, in a RuntimeError, that memory is wanting; and how the
+# linker does, in an ImportError. It says more of a library that is not for this machine, or on a
+# disk from which nothing may be run.
 _WANTING = ("DefaultCPUAllocator", "Cannot allocate memory", "std::bad_alloc", "new thread")
+_UNMAPPED = ("failed to map segment from shared object", "cannot allocate memory")
 
 
 def _is_out_of_memory(error: Exception) -> bool:
     """The GPU's too, whose class torch has; importing that takes seconds."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
+    if isinstance(error, ImportError):
+        return str(error).lower().endswith(_UNMAPPED)
     return isinstance(error, RuntimeError) and any(word in str(error) for word in _WANTING)
 
 

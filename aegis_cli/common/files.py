@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import glob
 import hashlib
 import json
 import os
+import re
+import secrets
+import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -19,6 +21,8 @@ from aegis_cli.common.errors import AegisError
 # What to do about the path of an input that is no text.
 RENAME = "rename that file or folder"
 _REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
+_NUMBER = r"\.\d+\.tmp"  # how such a name ends
+_LEFT = re.compile(r"\..+" + _NUMBER)
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
 _ATTEMPTS = 100  # at a folder above which others come and go
 
@@ -79,23 +83,142 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         AegisError: `path` is there and no regular file, or it cannot be written.
     """
     path = _target(path)
-    temporary = path.with_name(f"{hidden(path)}.{os.getpid()}.tmp")
     try:
-        _sweep(path)
-        with open(temporary, "wb") as file:
-            _mark(file)
+        with aside(path) as (temporary, file):
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+            os.replace(temporary, path)
     except OSError as error:
         problem = f"cannot write '{path}': {error.strerror or error}"
         raise AegisError(problem, "an output that can be written", _cure(path, error)) from error
+
+
+@contextlib.contextmanager
+def aside(path: Path) -> Iterator[tuple[Path, BinaryIO]]:
+    """A new file beside `path`, to be filled and renamed; where it is not renamed it is removed.
+
+    What killed processes have left of the same file is removed first. Everybody else who writes it
+    leaves this one alone, because it is locked.
+    """
+    sweep(path)
+    with contextlib.ExitStack() as stack:
+        file = None
+        while file is None:
+            place = _place(path)
+            opened = stack.enter_context(open(place, "xb"))
+            stack.callback(_remove, place)  # after the rename there is nothing to remove
+            file = opened if _is_locked(opened.fileno(), place) else None
+        yield place, file
+
+
+@contextlib.contextmanager
+def folder_aside(path: Path) -> Iterator[Path]:
+    """A new folder beside `path`, as `aside` makes a file."""
+    sweep(path)
+    with contextlib.ExitStack() as stack:
+        locked = False
+        while not locked:
+            place = _place(path)
+            place.mkdir()
+            stack.callback(_remove, place)
+            descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            locked = _is_locked(descriptor, place)
+        yield place
+
+
+def put(aside: Path, folder: Path) -> None:
+    """Rename a folder that was written aside; there is none yet, or an empty one.
+
+    Raises:
+        AegisError: another process has written it meanwhile.
+        OSError: what else a rename meets.
+    """
+    try:
+        os.rename(aside, folder)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        found = f"'{folder}', which another process has written meanwhile"
+        fix = "use that one, or choose another --out"
+        raise AegisError(found, "a new or empty folder", fix) from error
+
+
+def _place(path: Path) -> Path:
+    """Where `path` is written until it is whole.
+
+    Its number is drawn. A process's own one would come again, in a container with every command.
+    """
+    return path.with_name(f"{hidden(path)}.{secrets.randbelow(10**9)}.tmp")
+
+
+def _is_locked(descriptor: int, place: Path) -> bool:
+    """Lock what was made a moment ago, where the file system can.
+
+    Returns:
+        Whether it is there still. Before it was locked, somebody may have taken it for what a
+        killed process had left.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return place.exists()
+
+
+def sweep(path: Path) -> None:
+    """Remove what processes have left that were killed while they wrote `path`."""
+    _sweep(path.parent, re.compile(re.escape(hidden(path)) + _NUMBER))
+
+
+def sweep_all(folder: Path) -> None:
+    """Remove what killed processes have left in a folder to which Aegis alone writes."""
+    _sweep(folder, _LEFT)
+
+
+def is_left(path: Path) -> bool:
+    """Whether a path has the name of what is not whole yet, or never was."""
+    return _LEFT.fullmatch(path.name) is not None
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether nothing is at a path, or a folder with nothing in it that is whole."""
+    if not folder.exists():
+        return True
+    return folder.is_dir() and all(map(is_left, folder.iterdir()))
+
+
+def _sweep(folder: Path, name: re.Pattern[str]) -> None:
+    with contextlib.suppress(OSError):  # whoever writes there says what is wrong with it
+        for left in [path for path in folder.iterdir() if name.fullmatch(path.name)]:
+            with contextlib.suppress(OSError):
+                _remove_unlocked(left)
+
+
+def _remove_unlocked(left: Path) -> None:
+    """Remove a file or folder that nobody writes.
+
+    Raises:
+        OSError: somebody does, or the file system does not tell.
+    """
+    descriptor = os.open(left, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _remove(left)
     finally:
-        # After the rename there is nothing to remove, and where the folder is missing there never
-        # was.
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+        os.close(descriptor)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+        return
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def hidden(path: Path) -> str:
@@ -106,20 +229,6 @@ def hidden(path: Path) -> str:
     name = os.fsencode(path.name)
     short = path.name if len(name) <= _REPEATED else hashlib.sha256(name).hexdigest()
     return f".{short}"
-
-
-def _mark(file: BinaryIO) -> None:
-    """Lock a file for as long as it is being written, where the file system can."""
-    with contextlib.suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _sweep(path: Path) -> None:
-    """Remove what processes have left that were killed while they wrote `path`."""
-    for left in path.parent.glob(f"{glob.escape(hidden(path))}.*.tmp"):
-        with contextlib.suppress(OSError), open(left, "rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while somebody writes it
-            left.unlink()
 
 
 def check_writable(path: Path) -> None:
@@ -147,7 +256,7 @@ def _target(path: Path) -> Path:
         AegisError: a device, a pipe or a socket is there. The rename would put a file in its place,
             for every program of the machine.
     """
-    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    target = followed(path)
     if (special := _special(target)) is not None:
         raise AegisError(
             f"the output '{path}' is {special}",
@@ -155,6 +264,11 @@ def _target(path: Path) -> Path:
             "choose another output",
         )
     return target
+
+
+def followed(path: Path) -> Path:
+    """Where a link leads, whether or not something is there; a path that is none as it is."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def _special(path: Path) -> str | None:
@@ -194,7 +308,17 @@ def make_folder(path: Path) -> None:
 
     Another process may remove an empty one of those above meanwhile, as `locks.alone` does at its
     end. Then they are made again.
+
+    Raises:
+        AegisError: it cannot be created, or lies behind a link that leads nowhere.
     """
+    for above in (path, *path.parents):
+        if above.is_symlink() and not above.exists():
+            raise AegisError(
+                f"'{above}' is a link to '{os.readlink(above)}', and nothing is there",
+                "a link that leads to a folder",
+                f"mkdir -p '{followed(above)}', mount its disk, or choose another output",
+            )
     try:
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):
@@ -259,10 +383,18 @@ def reading(path: str | Path, fix: str) -> Iterator[None]:
 
 
 def _cure(path: Path, error: OSError) -> str:
+    folder = _lasting(path.parent)
     if error.errno == errno.ENOENT:
-        return f"mkdir -p '{path.parent}'"
+        return f"mkdir -p '{folder}'"
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return f"free space on the disk of '{path.parent}', or choose another output"
+        return f"free space on the disk of '{folder}', or choose another output"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"make '{path.parent}' writable (chmod u+w), or choose another output"
+        return f"make '{folder}' writable (chmod u+w), or choose another output"
     return "choose another output"
+
+
+def _lasting(folder: Path) -> Path:
+    """The folder around what is written aside, for that is removed at an error."""
+    around = (folder, *folder.parents)
+    aside = [one for one in around if one.name.startswith(".") and one.suffix == ".tmp"]
+    return aside[-1].parent if aside else folder

@@ -355,20 +355,15 @@ def check_out(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise AegisError(f"'{out}' is not empty", "a new or empty folder", "choose another --out")
     files.make_folder(out.parent)
-    files.check_writable(out.parent / f"{files.hidden(out)}.tmp")
+    if not os.access(out.parent, os.W_OK):
+        raise AegisError(f"'{out}' cannot be written", "a writable folder", "choose another --out")
 
 
 def _write_whole(out: Path, fill: Callable[[Path], None]) -> None:
     """Let `fill` write a folder aside, and rename it to `out`."""
     out = out.resolve()
-    aside = out.with_name(f"{files.hidden(out)}.tmp")
-    try:
-        with checkpoint.writing(out):
-            shutil.rmtree(aside, ignore_errors=True)
-            aside.mkdir()
-            fill(aside)
-            if out.exists():
-                out.rmdir()
-            os.rename(aside, out)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
+    with checkpoint.writing(out), files.folder_aside(out) as aside:
+        fill(aside)
+        if out.exists():
+            out.rmdir()
+        os.rename(aside, out)

@@ -6,8 +6,6 @@ A checkpoint has float32, to train on. A model that came in bfloat16 goes out in
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
-from aegis_cli.common.files import check_utf8, hidden, make_folder, write_text
+from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
@@ -102,21 +100,14 @@ def run(
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
-    with checkpoint.writing(out):
-        around = Path(tempfile.mkdtemp(prefix=f"{hidden(out)}.", suffix=".tmp", dir=out.parent))
-    aside = around / out.name
-    try:
-        with checkpoint.writing(out):
-            aside.mkdir()  # `around` is for its owner alone, and this as other folders
-            if form == card.LEROBOT:
-                lerobot_folder.write(aside, policy, meta, cameras)
-            else:
-                _write_checkpoint(aside, run, policy, meta)
-            stored = card.Stored(meta.get("stored", FLOAT32), rounded)
-            _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
-            os.rename(aside, out)
-    finally:
-        shutil.rmtree(around, ignore_errors=True)
+    with checkpoint.writing(out), folder_aside(out) as aside:
+        if form == card.LEROBOT:
+            lerobot_folder.write(aside, policy, meta, cameras)
+        else:
+            _write_checkpoint(aside, run, policy, meta)
+        stored = card.Stored(meta.get("stored", FLOAT32), rounded)
+        _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
+        put(aside, out)
     return ExportReport(
         str(out),
         form,

@@ -15,6 +15,7 @@ from typing import Any
 from aegis_cli import recipes
 from aegis_cli.common import commands, files, locks, machine
 from aegis_cli.common.errors import AegisError
+from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint, inputs
 
@@ -43,7 +44,7 @@ def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> 
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not files.is_vacant(out):
             raise AegisError(
                 f"'{out}' is not empty and not a run",
                 "a new or empty folder",
@@ -82,7 +83,7 @@ def continues(out: Path, recipe: Trained) -> bool:
     """
     begun = _begun(out, recipe)
     if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
-        there, here = (each.backbone.partition("#")[2] for each in (begun, recipe))
+        there, here = (backbones.divided(each.backbone)[1] for each in (begun, recipe))
         if there == here:  # other layers of one model have the same weights, and learn otherwise
             begun = dataclasses.replace(begun, backbone=recipe.backbone)
     return recipes.training_part(begun) == recipes.training_part(recipe)
@@ -154,7 +155,7 @@ def clear(out: Path, ours: bool) -> Path | None:
 
 
 def _clear(out: Path, ours: bool) -> Path | None:
-    if not ours and out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not ours and not files.is_vacant(out):
         fix = (
             f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
         )
@@ -182,8 +183,11 @@ def _check_own(out: Path) -> None:
 
 
 def remove(out: Path) -> None:
-    """Remove a run that `check` has let pass; its folder stays, for it is locked."""
-    for path in out.iterdir():
+    """Remove a run that `check` has let pass; its folder stays, for it is locked.
+
+    The recipe goes last. By it the rest is known as a run, if this is cut short.
+    """
+    for path in sorted(out.iterdir(), key=lambda path: path.name == "recipe.yaml"):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
@@ -193,6 +197,8 @@ def remove(out: Path) -> None:
 def _is_foreign(path: Path, out: Path) -> bool:
     """Whether Aegis writes no file or folder of that name into a run."""
     parts = path.relative_to(out).parts
+    if files.is_left(out / parts[0]):
+        return False
     if parts[0] in _FOLDERS:
         return False  # a model's folder holds what its family writes
     if parts[0] == MERGED and (len(parts) > 1 or (path / "recipe.yaml").is_file()):

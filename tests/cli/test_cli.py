@@ -678,6 +678,8 @@ class OutOfMemoryError(RuntimeError):
         ),
         RuntimeError("can't start new thread"),
         OSError(errno.ENOMEM, "Cannot allocate memory"),
+        ImportError("ft2font.so: failed to map segment from shared object"),
+        ImportError("libx.so: cannot map segment: Cannot allocate memory"),
     ],
 )
 def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
@@ -691,6 +693,13 @@ def test_want_of_memory_is_a_problem_to_act_on(error, aegis, stage):
         and "Traceback" not in err
     )
     assert ("2.00 GiB" in err) == isinstance(error, OutOfMemoryError) and "more" not in err
+
+
+def test_a_library_that_may_not_be_run_from_its_disk_is_no_want_of_memory(aegis, stage):
+    said = "failed to map segment from shared object: Operation not permitted"
+    stage("anchor", error=ImportError(said))
+    code, _, err = aegis("anchor", "--out", "a.safetensors")
+    assert code == 3 and said in err and "out of memory" not in err
 
 
 def test_a_defect_is_no_failed_gate(aegis, stage):

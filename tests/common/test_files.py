@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import signal
@@ -12,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from samples.disk import disk
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -100,6 +102,89 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
     finally:
         other.kill()
     assert list(tmp_path.iterdir()) == [path]
+
+
+FILL_AND_DIE = """
+import os, signal, sys
+from pathlib import Path
+from aegis_cli.common import files
+
+with files.folder_aside(Path(sys.argv[1])) as aside:
+    (aside / "inside").mkdir()
+    (aside / "inside" / "half").write_text("half")
+    print(aside, flush=True)
+    os.kill(os.getpid(), getattr(signal, sys.argv[2]))
+    os.rename(aside, sys.argv[1])
+"""
+
+
+def test_half_a_folder_of_a_killed_process_is_removed_by_the_next(tmp_path: Path) -> None:
+    path, mine = tmp_path / "out", tmp_path / ".out.old.tmp"
+    mine.mkdir()
+    command = [sys.executable, "-c", FILL_AND_DIE, str(path), "SIGKILL"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL and (Path(done.stdout.strip()) / "inside").is_dir()
+    with files.folder_aside(path) as aside:
+        assert {*tmp_path.iterdir()} == {mine, aside}
+        os.rename(aside, path)
+    assert {*tmp_path.iterdir()} == {mine, path}
+
+
+def test_a_folder_that_another_process_fills_stays(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    command = [sys.executable, "-c", FILL_AND_DIE, str(path), "SIGSTOP"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout is not None
+            theirs = Path(other.stdout.readline().strip())
+            with files.folder_aside(path) as aside:
+                assert {*tmp_path.iterdir()} == {theirs, aside}
+            other.send_signal(signal.SIGCONT)
+            assert other.wait(60) == 0
+        finally:
+            other.kill()
+    assert list(tmp_path.iterdir()) == [path] and (path / "inside" / "half").is_file()
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_what_is_swept_before_it_is_locked_is_made_again(
+    removed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process looks for leftovers in the moment between making and locking."""
+    lock, seen = fcntl.flock, list[Path]()
+
+    def flock(number: int, operation: int) -> None:
+        if not seen:
+            seen.extend(tmp_path.iterdir())
+            if not removed:
+                raise BlockingIOError
+            seen[0].unlink()
+        lock(number, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    files.save_json(tmp_path / "out.json", 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.json"] != [seen[0].name]
+    assert files.load_json(tmp_path / "out.json") == 1
+
+
+def test_a_full_disk_is_named_by_a_folder_that_stays(tmp_path: Path) -> None:
+    """What is written aside is gone when the user reads it."""
+    with files.folder_aside(tmp_path / "runs") as aside:
+        (aside / "backbone").mkdir()
+        with disk(10), pytest.raises(AegisError) as caught:
+            files.write_text(aside / "backbone" / "model", "x" * 100)
+    assert f"the disk of '{tmp_path}'" in caught.value.fix
+
+
+@pytest.mark.parametrize("name", ["runs", "runs/x"])
+def test_a_folder_behind_a_link_that_leads_nowhere_is_not_made(name: str, tmp_path: Path) -> None:
+    """As where the disk that it leads to is not mounted."""
+    (tmp_path / "runs").symlink_to("disk/runs")
+    with pytest.raises(AegisError) as caught:
+        files.make_folder(tmp_path / name)
+    assert "link to 'disk/runs'" in caught.value.found
+    assert f"mkdir -p '{tmp_path / 'disk' / 'runs'}'" in caught.value.fix
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 # --- what is no regular file ----------------------------------------------------------------------

@@ -117,7 +117,7 @@ def test_a_library_without_a_driver_is_found_by_trying(monkeypatch: pytest.Monke
         AegisError, match="cannot open an OpenGL context .*eglQueryString"
     ) as caught:
         gl.check()
-    assert "libegl-mesa0" in caught.value.fix
+    assert "libegl-mesa0" in caught.value.fix and "ulimit -v" in caught.value.fix
 
 
 WITHOUT = (

@@ -478,6 +478,16 @@ def test_a_folder_that_is_not_empty_is_not_replaced(
     assert snapshot(tmp_path) == before
 
 
+def test_what_a_killed_merge_left_keeps_no_other_from_its_folder(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    for name in (".merged.12345.tmp", ".merged.tmp"):  # the second as an earlier Aegis named it
+        (tmp_path / name / "checkpoints").mkdir(parents=True)
+    out = tmp_path / "merged"
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
+    assert {path.name for path in tmp_path.iterdir()} == {"merged", ".merged.tmp"}
+
+
 def test_a_folder_that_another_process_writes_is_left_to_it(
     aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:

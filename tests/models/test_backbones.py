@@ -29,6 +29,15 @@ def backbone(request: pytest.FixtureRequest, hf_backbone: Callable[[str], Backbo
 # --- the contract ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("inside", ["", "/backbone"])
+def test_a_path_may_have_a_sign_that_else_begins_the_layers(inside: str, tmp_path: Path) -> None:
+    name = f"{tmp_path}/run #2{inside}"
+    make_tiny().save(Path(name))
+    assert backbones.load(name).fingerprint() == make_tiny().fingerprint()
+    with pytest.raises(AegisError, match="'#text.layers' after the embedded VLM"):
+        backbones.load(f"{name}#text.layers")
+
+
 def test_there_are_backbones_to_test() -> None:
     assert BACKBONES
 

@@ -181,6 +181,25 @@ def test_nothing_is_left_of_an_export_that_fails(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_export_that_another_process_has_written_meanwhile_stays(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(*_: Any) -> None:
+        (tmp_path / "x").mkdir()
+        (tmp_path / "x" / "theirs").touch()
+
+    monkeypatch.setattr(lerobot_folder, "write", slow)
+    with pytest.raises(AegisError, match="another process has written meanwhile"):
+        export.run(run_folder, tmp_path / "x")
+    assert [path.name for path in tmp_path.rglob("*")] == ["x", "theirs"]
+
+
+def test_what_a_killed_export_left_is_removed_by_the_next(run_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / ".x.12345.tmp" / "backbone").mkdir(parents=True)
+    export.run(run_folder, tmp_path / "x")
+    assert list(tmp_path.iterdir()) == [tmp_path / "x"]
+
+
 def test_what_lies_beside_an_export_stays(run_folder: Path, tmp_path: Path) -> None:
     mine = tmp_path / ".x.tmp" / "notes.txt"
     mine.parent.mkdir()

@@ -33,7 +33,7 @@ from aegis_cli.data.record import run as record
 from aegis_cli.methods import METHODS
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Insulate, Lora, Probe, Recipe, Rollout
-from aegis_cli.training import checkpoint, step, train
+from aegis_cli.training import checkpoint, folder, step, train
 
 # --- resuming -------------------------------------------------------------------------------------
 
@@ -134,6 +134,41 @@ def test_a_run_is_overwritten_on_request(
     assert_same_run(tmp_path, naive_run)
     start("naive", tmp_path / "new", overwrite=True)
     assert_same_run(tmp_path / "new", naive_run)
+
+
+@pytest.mark.parametrize("left", [None, ".ledger.safetensors.12345.tmp"])
+def test_an_overwriting_that_was_cut_short_can_be_repeated(
+    left: str | None,
+    naive_run: Path,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where a killed process was about to write a file."""
+    start("naive", tmp_path)
+    if left is not None:
+        (tmp_path / left).write_bytes(b"half")
+
+    def cut(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        # An order in which the recipe comes before what takes long to remove.
+        listed = sorted(tmp_path.iterdir(), reverse=True)
+        patched.setattr(Path, "iterdir", lambda _: iter(listed))
+        patched.setattr(folder.shutil, "rmtree", cut)
+        with pytest.raises(KeyboardInterrupt):
+            start("naive", tmp_path, overwrite=True)
+    start("naive", tmp_path, overwrite=True)
+    assert_same_run(tmp_path, naive_run)
+
+
+def test_a_run_that_was_killed_before_its_recipe_was_whole_begins(
+    naive_run: Path, start: Start, tmp_path: Path
+) -> None:
+    (tmp_path / ".recipe.yaml.12345.tmp").write_bytes(b"half")
+    start("naive", tmp_path)
+    assert_same_run(tmp_path, naive_run)
 
 
 def test_nothing_is_overwritten_where_something_is_wrong(

@@ -9,7 +9,6 @@ deleting it costs the decoding.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import shutil
@@ -127,14 +126,32 @@ def load(
     path, count = _file(source, camera, side, digest), source.dataset.info.frames
     kept = path.exists()
     if not kept:
-        files.make_folder(path.parent)
         parts = list(split(source, index, camera))
+        _make_cache(path.parent, parts)
         height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
         _write(path, parts, (count, height, width, 3), workers, camera, on_event)
     frames = _open(path, count)
     if kept:
         _check_some(path, frames, source, index, camera)
     return frames
+
+
+def _make_cache(folder: Path, parts: Sequence[Part]) -> None:
+    """Make the folder of decoded frames.
+
+    Raises:
+        AegisError: it cannot be made.
+    """
+    try:
+        files.make_folder(folder)
+    except AegisError as error:
+        fix = f"set AEGIS_CACHE to a folder that can be written{_without(parts)}"
+        raise AegisError(error.found, "a cache of decoded frames", fix) from error
+
+
+def _without(parts: Sequence[Part]) -> str:
+    """How to do without the cache, where that can be: the end of an advice."""
+    return ", or --set demos.cache=false" if isinstance(parts[0], VideoPart) else ""
 
 
 def are_kept(source: Source, camera: str, side: int | None, digest: str) -> bool:
@@ -241,39 +258,35 @@ def _write(
     on_event: OnEvent,
 ) -> None:
     """Decode a camera's frames into a file beside `path`, then rename it."""
+    files.sweep_all(path.parent)
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
         raise AegisError(
-            f"{free / 1e9:.1f} GB free in '{path.parent}'",
-            f"{needed / 1e9:.1f} GB for the decoded frames",
-            "free some space, set AEGIS_CACHE to a folder on a larger disk"
-            + (", or --set demos.cache=false" if isinstance(parts[0], VideoPart) else ""),
+            f"{free / 1e6:,.2f} MB free in '{path.parent}'",
+            f"{needed / 1e6:,.2f} MB for the decoded frames",
+            f"free some space, set AEGIS_CACHE to a folder on a larger disk{_without(parts)}",
         )
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
-        done, stage = 0, f"decode {layout.short(camera)}"
-        workers = workers or worker_count(len(parts) // _PER_WORKER)
-        decode = partial(_decode, aside, offset, shape[1:3])
-        with mapped(
-            decode, parts, workers, "a decoding process", "free some memory, then run it again"
-        ) as counts:
-            for decoded in counts:
-                done += decoded
-                on_event(Progress(stage, done, count, "frames"))
-        with open(aside, "rb") as file:
+        with files.aside(path) as (aside, file):
+            offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
+            done, stage = 0, f"decode {layout.short(camera)}"
+            workers = workers or worker_count(len(parts) // _PER_WORKER)
+            decode = partial(_decode, aside, offset, shape[1:3])
+            with mapped(
+                decode, parts, workers, "a decoding process", "free some memory, then run it again"
+            ) as counts:
+                for decoded in counts:
+                    done += decoded
+                    on_event(Progress(stage, done, count, "frames"))
             os.fsync(file.fileno())
-        os.replace(aside, path)
+            os.replace(aside, path)
     except OSError as error:
         raise AegisError(
             f"cannot write '{path}': {error.strerror or error}",
             "a cache that can be written",
             "free some space, or set AEGIS_CACHE to another folder",
         ) from error
-    finally:
-        with contextlib.suppress(OSError):  # after the rename there is nothing to remove
-            aside.unlink()
 
 
 def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_utf8, hidden
+from aegis_cli.common.files import check_utf8, folder_aside, followed, put
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -67,6 +66,7 @@ def check_new(folder: Path) -> None:
         raise AegisError(
             f"'{folder}', which names no folder", "a folder's name", "choose another --out"
         )
+    folder = followed(folder)
     if not folder.parent.is_dir():
         raise AegisError(
             f"no folder '{folder.parent}'",
@@ -90,27 +90,25 @@ def write(
 ) -> None:
     """Write a dataset of one or more episodes; equal episodes give equal bytes.
 
-    One episode is held in memory at a time.
+    One episode is held in memory at a time. A link is followed, and stays.
 
     Raises:
         AegisError: a folder that is not new, or a disk that cannot be written.
     """
     check_new(folder)
-    aside = folder.with_name(f"{hidden(folder)}.{os.getpid()}.tmp")
+    folder = followed(folder)
     try:
-        aside.mkdir()
-        _Writer(aside, spec, limits).write(episodes)
-        for path in aside.rglob("*"):
-            _sync(path)
-        os.rename(aside, folder)
+        with folder_aside(folder) as aside:
+            _Writer(aside, spec, limits).write(episodes)
+            for path in aside.rglob("*"):
+                _sync(path)
+            put(aside, folder)
     except OSError as error:
         raise AegisError(
             f"cannot write '{folder}': {error.strerror or error}",
             "a writable folder with free space",
             "free some space, or choose another --out",
         ) from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)  # after the rename there is nothing to remove
 
 
 def _sync(path: Path) -> None:

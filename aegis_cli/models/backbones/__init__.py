@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,24 @@ def locate(name: str) -> Path:
     Raises:
         AegisError: no such model, or one whose path is no text, which no reader of it takes.
     """
-    name = name.partition("#")[0]
+    name = divided(name)[0]
     if (here := _on_disk(name)) is not None:
         files.check_utf8(here, files.RENAME)
         return here
     if not hub.is_local(name) and _has_transformers():
         return _of_repository(model_folder.fetch(name))
     raise _no_backbone(name)
+
+
+def divided(name: str) -> tuple[str, str | None]:
+    """A backbone's name, and what it says of its layers behind a '#'; None: nothing.
+
+    A path that is there may have a '#' of its own.
+    """
+    if "#" not in name or os.path.exists(name):
+        return name, None
+    own, _, layers = name.rpartition("#")
+    return own, layers or None
 
 
 def _of_repository(folder: Path) -> Path:
@@ -78,13 +90,14 @@ def load(name: str) -> Backbone:
         from aegis_cli.models.backbones import of_shape
 
         return of_shape.build(shape)
-    path, layers = locate(name), name.partition("#")[2] or None
+    own, layers = divided(name)
+    path = locate(name)
     if path.is_dir():
         _need_transformers(name)
         from aegis_cli.models.backbones import hf
 
         backbone = hf.load(path, layers)
-        before, own = _before(path), name.partition("#")[0]
+        before = _before(path)
         backbone.stored = before.get("stored") or backbone.stored
         backbone.hub_id = own if _on_disk(own) is None else before.get("base_model")
         return backbone

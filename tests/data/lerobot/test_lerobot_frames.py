@@ -65,6 +65,17 @@ def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path)
         assert np.array_equal(alone, frame)
 
 
+def test_what_a_killed_decoding_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    """Of another dataset too: it might never be decoded again, and is as large as its frames."""
+    folder = camera_frames.cache_folder()
+    folder.mkdir(parents=True)
+    left, own = folder / ".0123456789abcdef.npy.12345.tmp", folder / "mine.tmp"
+    left.write_bytes(b"half")
+    own.write_bytes(b"mine")
+    read(save(tmp_path / "d", episodes(2)))
+    assert not left.exists() and own.exists()
+
+
 def reencode(path: Path, gop: int) -> None:
     with av.open(str(path)) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]

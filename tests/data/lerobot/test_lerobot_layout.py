@@ -330,6 +330,34 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_a_linked_folder_is_followed_and_the_link_stays(there: bool, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("disk")
+    if there:
+        (tmp_path / "disk").mkdir()
+    save(tmp_path / "link", episodes(2))
+    assert (tmp_path / "link").readlink() == Path("disk")
+    assert (tmp_path / "disk" / "meta" / "info.json").is_file()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_folder_that_another_process_has_written_meanwhile_stays(tmp_path: Path) -> None:
+    def slow() -> Any:
+        yield from episodes(2)
+        save(tmp_path / "d", episodes(1))
+
+    with pytest.raises(AegisError, match="another process has written meanwhile"):
+        save(tmp_path / "d", slow())
+    assert list(tmp_path.iterdir()) == [tmp_path / "d"]
+    assert len(dataset.load(tmp_path / "d").episodes) == 1
+
+
+def test_what_a_killed_recording_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".d.12345.tmp" / "data").mkdir(parents=True)
+    save(tmp_path / "d", episodes(2))
+    assert list(tmp_path.iterdir()) == [tmp_path / "d"]
+
+
 def test_a_name_as_long_as_a_file_system_takes(tmp_path: Path) -> None:
     assert save(tmp_path / ("x" * 255)) == next(tmp_path.iterdir())
 

@@ -266,12 +266,14 @@ def test_a_cache_that_cannot_be_is_one_error(
     usage = camera_frames.shutil.disk_usage(tmp_path)._replace(free=10)
     with monkeypatch.context() as patch:
         patch.setattr(camera_frames.shutil, "disk_usage", lambda _: usage)
-        with pytest.raises(AegisError, match="AEGIS_CACHE"):
+        with pytest.raises(AegisError, match="AEGIS_CACHE") as full:
             demonstrations.load(folder, 0.3, 0)
+    assert "0.00 MB free" in full.value.found and not full.value.expected.startswith("0.00 MB")
     (tmp_path / "file").touch()
     monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "file"))
-    with pytest.raises(AegisError, match="cannot create the folder"):
+    with pytest.raises(AegisError, match="cannot create the folder") as nowhere:
         demonstrations.load(folder, 0.3, 0)
+    assert "set AEGIS_CACHE" in nowhere.value.fix
 
 
 # --- frames on demand ----------------------------------------------------------------------------
