@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import gc
 import os
+import signal
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -46,6 +47,11 @@ pytest_plugins = [
     "samples.user_folder",
     "samples.vqa_truth",
 ]
+
+
+def pytest_configure() -> None:
+    """Heed Ctrl-C, which a script's background jobs ignore, and so the processes of tests too."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -247,7 +247,7 @@ def test_a_backbone_whose_activations_overflow(bad: Callable[..., str], place: P
         "7",
         "--out",
         "a.safetensors",
-        says=("a.safetensors", "NaN or infinite"),
+        says=("'layers.0.norm1' that is not finite", "its weights are finite"),
     )
 
 

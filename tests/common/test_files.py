@@ -137,6 +137,7 @@ def test_a_folder_that_another_process_fills_stays(tmp_path: Path) -> None:
         try:
             assert other.stdout is not None
             theirs = Path(other.stdout.readline().strip())
+            os.waitpid(other.pid, os.WUNTRACED)  # until it has stopped, or going on comes too soon
             with files.folder_aside(path) as aside:
                 assert {*tmp_path.iterdir()} == {theirs, aside}
             other.send_signal(signal.SIGCONT)
