@@ -160,6 +160,15 @@ def test_the_command_shows_one_line_a_run(
     assert [row["drop_points"] for row in json.loads(out)["rows"]] == [10.0, 20.0]
 
 
+def test_marks_are_explained_where_there_are_some(
+    aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    assert "* best of its column" in aegis("compare", "naive", "aegis")[1]
+    alike = aegis("compare", "naive", "naive")[1]
+    assert "naive" in alike and "*" not in alike
+
+
 def test_what_is_no_run_is_refused(aegis, job: Path, tmp_path: Path) -> None:
     assert "is no run" in refused(aegis("compare", job, tmp_path))
     with pytest.raises(AegisError):

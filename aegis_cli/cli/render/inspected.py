@@ -241,7 +241,8 @@ def compared(report: Any) -> RenderableType:
     figures = zip(*shown.values(), strict=True)
     rows = [(*name, *own) for name, own in zip(names, figures, strict=True)]
     table = plain_table(("Run", "Method", "Task", *shown), rows, left=3)
-    notes = [MARKS] if len(rows) > 1 else []
+    is_marked = any(isinstance(cell, Text) for cells in shown.values() for cell in cells)
+    notes = [MARKS] if is_marked else []
     on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
     if on is not None and report.same_open_loop:
         notes.append(f"open-loop error: on {on}")
