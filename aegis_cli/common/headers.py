@@ -61,6 +61,7 @@ Migration = Callable[
 ]
 MIGRATIONS: dict[str, tuple[Migration, ...]] = {}
 
+_CUT = "smaller than the required mapping size"
 _UPGRADE = "upgrade aegis: git pull && pip install -e ."
 
 
@@ -105,7 +106,10 @@ def opened(
     try:
         with reading(path, fix), safe_open(path, framework=framework) as file:
             yield file
-    except SafetensorError as error:
+    except (SafetensorError, RuntimeError) as error:
+        # torch maps the file after its header was read, and says so if it was cut meanwhile.
+        if not isinstance(error, SafetensorError) and _CUT not in str(error):
+            raise
         check_utf8(path, RENAME)
         refuse_pointer(path)
         problem = f"'{path}' is truncated or not a safetensors file ({error})"

@@ -43,6 +43,23 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
         artifacts.sha256_file(tmp_path / "a.safetensors")
 
 
+def test_a_file_that_is_cut_after_its_header_was_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As torch says it of the mapping; other errors of a reader pass."""
+    path = write(tmp_path, "demos")
+    said = f"file <{path}> size <4096> is smaller than the required mapping size <617656>"
+
+    def cut(*_: object, **__: object) -> None:
+        raise RuntimeError(said)
+
+    monkeypatch.setattr("safetensors.safe_open", cut)
+    refused(path, "truncated", "aegis demos", kind="demos")
+    said = "a defect"
+    with pytest.raises(RuntimeError, match="a defect"):
+        artifacts.load(path, "demos")
+
+
 @pytest.mark.parametrize("keep", [0, 4, 20, 0.5, -1])
 def test_truncated_file(tmp_path: Path, keep: float) -> None:
     path = write(tmp_path, "demos")
