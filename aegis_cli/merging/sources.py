@@ -364,6 +364,4 @@ def _write_whole(out: Path, fill: Callable[[Path], None]) -> None:
     out = out.resolve()
     with checkpoint.writing(out), files.folder_aside(out) as aside:
         fill(aside)
-        if out.exists():
-            out.rmdir()
-        os.rename(aside, out)
+        files.put(aside, out)
