@@ -33,6 +33,14 @@ def anchors(path: Path) -> set[str]:
     }
 
 
+def test_a_page_has_no_section_twice() -> None:
+    """A link could lead to one of them alone."""
+    for path in [*LINKING, ROOT / "CHANGELOG.md"]:
+        text = _FENCE.sub("", path.read_text(encoding="utf-8"))
+        own = re.findall(r"^## .+$", text, re.MULTILINE)
+        assert sorted(set(own)) == sorted(own), path
+
+
 def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= 150
 
