@@ -28,7 +28,7 @@ from aegis_cli.inspection.report import (
 )
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, folder
 
 # What a merged checkpoint and a report of `aegis run` tell alike.
@@ -129,16 +129,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["merge"] = merged
     elif (into := folder.merged_in(path)) is not None:
         facts["merged_into"] = str(into)
-    if cameras := header.meta.get("cameras", settings.demos.camera):
-        facts["cameras"] = cameras
-    if dataset_id := header.meta.get("dataset"):
-        facts["dataset"] = dataset_id
-    if isinstance(settings.demos.path, tuple):
-        facts["demos"] = list(settings.demos.path)
-    if settings.demos.rename is not None:
-        facts["rename"] = dict(settings.demos.rename)
-    if settings.demos.weights is not None:
-        facts["weights"] = list(settings.demos.weights)
+    facts |= _data_facts(header, settings.demos)
     if base_model := header.meta.get("base_model"):
         facts["base_model"] = base_model
     losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
@@ -185,6 +176,22 @@ def _run_facts(
         "loss": metrics.get("loss"),
         "validation_loss": metrics.get("validation_loss"),
     }
+
+
+def _data_facts(header: Header, demos: Demos) -> dict[str, Any]:
+    """What a run has learned from, as far as it is not the task's own demonstrations."""
+    facts: dict[str, Any] = {}
+    if cameras := header.meta.get("cameras", demos.camera):
+        facts["cameras"] = cameras
+    if dataset_id := header.meta.get("dataset"):
+        facts["dataset"] = dataset_id
+    if isinstance(demos.path, tuple):
+        facts["demos"] = list(demos.path)
+    if demos.rename is not None:
+        facts["rename"] = dict(demos.rename)
+    if demos.weights is not None:
+        facts["weights"] = list(demos.weights)
+    return facts
 
 
 def _steps(path: Path, metrics: Mapping[str, Any]) -> int | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from aegis_cli.recipes.keys import changed
 from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
-from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
+from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
 
@@ -19,16 +19,11 @@ def cross_checks(
     """What a single key cannot tell."""
     if isinstance(recipe, StreamRecipe):
         return
-    if isinstance(recipe, PretrainRecipe | DualRecipe):
-        section, model = (
-            ("model", recipe.model)
-            if isinstance(recipe, PretrainRecipe)
-            else ("towers", recipe.towers)
-        )
-        if model.width % model.heads:
-            found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
-            fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
-            yield Problem(found, "a width that the heads divide", fix)
+    if isinstance(recipe, PretrainRecipe):
+        yield from _width_checks("model", recipe.model)
+        return
+    if isinstance(recipe, DualRecipe):
+        yield from _width_checks("towers", recipe.towers)
         return
     if recipe.rollout.replan > recipe.train.chunk:
         found = f"rollout.replan: {recipe.rollout.replan} with train.chunk: {recipe.train.chunk}"
@@ -39,7 +34,20 @@ def cross_checks(
         )
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
-        return
+    else:
+        yield from _policy_checks(recipe)
+
+
+def _width_checks(section: str, model: Model | Towers) -> Iterator[Problem]:
+    """Whether a model's width is a multiple of its heads."""
+    if model.width % model.heads:
+        found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
+        fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
+        yield Problem(found, "a width that the heads divide", fix)
+
+
+def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
+    """Whether the keys of a policy's recipe go together."""
     if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
         yield Problem(
             f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
