@@ -152,6 +152,13 @@ def _inspected(path: Path) -> InspectReport:
     return found
 
 
+def _gate(path: Path, asked: _Named | None) -> bool | None:
+    """The verdict on the drop that the row shows; of all the run's probes, `aegis inspect` tells."""
+    if asked is None:
+        return None
+    return results.gate([asked[1]], results.recipe_of(path).probe.max_drop)
+
+
 def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
     """The run's probes by their question sets, the first of each."""
     recipe, probed = results.recipe_of(path), dict[str, results.Result]()
@@ -236,5 +243,5 @@ def _compared(
         loss=found.loss,
         validation_loss=found.validation_loss,
         step_s=statistics.median_high(times) if times else None,
-        gate=found.gate,
+        gate=_gate(path, asked),
     )

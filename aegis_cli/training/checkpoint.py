@@ -25,7 +25,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from aegis_cli import sim
+from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, files, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import sharded_as
@@ -331,7 +331,9 @@ def step_of(path: Path) -> int:
 def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
     """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
-    Its meta holds the task, the method and what else a user has to know.
+    Its meta holds the task, the method and what else a user has to know. How its chunks are
+    executed is read from the recipe of its run, where it lies in one: a job's `rollout` may be
+    another than when it was trained.
 
     Args:
         folder: such a folder, or the id on the hub of a policy that was pushed.
@@ -351,7 +353,20 @@ def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
     backbone = backbones.load(str(path / BACKBONE))
     expert, meta, scales = _load_expert(path / EXPERT, backbone)
     relative = relative_of(meta, expert.shape.actions, expert.shape.proprio)
-    return Policy(backbone, expert, *scales, relative).eval(), meta
+    return Policy(backbone, expert, *scales, relative).eval(), _executed_now(path, meta)
+
+
+def _executed_now(path: Path, meta: Mapping[str, Any]) -> dict[str, Any]:
+    """A checkpoint's meta with `replan` and `ensemble` as its run's recipe says them by now."""
+    run = run_of(path)
+    if run is None:
+        return dict(meta)
+    settings = recipes.load(run / "recipe.yaml").rollout
+    now = {name: value for name, value in meta.items() if name != "ensemble"}
+    now["replan"] = settings.replan
+    if settings.ensemble is not None:
+        now["ensemble"] = settings.ensemble
+    return now
 
 
 def load_expert(folder: str | Path) -> tuple[ActionExpert, dict[str, Any]]:

@@ -98,6 +98,18 @@ def test_the_set_that_all_runs_were_probed_on_is_compared(job: Path) -> None:
     assert [(row.vqa, row.drop_points) for row in found.rows] == [("b", 20.0)] * 2 and not told
 
 
+@pytest.mark.parametrize("passed", [True, False, None])
+def test_the_gate_is_that_of_the_drop_beside_it(passed: bool | None, job: Path) -> None:
+    """The first probe of a run is shown, which a gate on others says nothing of."""
+    run = job / "naive"
+    (run / "probe.json").unlink()
+    for which, verdict in (("a", passed), ("b", False), ("c", True)):
+        figures = probe("x", ord(which) - 97) | {"passed": verdict}
+        results.keep(run, f"probe-{which}", figures, {"vqa": which})
+    row = compare.run([run]).rows[0]
+    assert (row.vqa, row.gate) == ("a", passed)
+
+
 def test_figures_of_different_questions_are_not_compared_without_a_word(
     aegis, job: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -227,6 +227,24 @@ def test_what_does_not_shape_training_may_change_and_the_run_says_so(
     assert {name for name in now if now[name] != before[name]} == {"recipe.yaml"}
 
 
+@pytest.mark.parametrize("ensemble", [None, 0.1])
+def test_chunks_are_executed_as_the_runs_recipe_says_by_now(
+    ensemble: float | None, naive_run: Path, recipe: Recipe, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(naive_run, tmp_path / "run", symlinks=True))
+    trained = checkpoint.load_policy(run)[1]
+    other = replace(recipe, rollout=Rollout(replan=1, ensemble=ensemble))
+    folder.renew_recipe(run, other)
+    taken = Path(shutil.copytree(run / "checkpoints" / "last", tmp_path / "taken"))
+    assert checkpoint.load_policy(taken)[1] == trained and trained["replan"] != 1
+    for path in (run, run / "checkpoints" / "last"):
+        now = checkpoint.load_policy(path)[1]
+        assert (now["replan"], now.get("ensemble")) == (1, ensemble)
+        assert now == trained | {n: now[n] for n in ("replan", "ensemble") if n in now}
+    folder.renew_recipe(run, recipe)
+    assert checkpoint.load_policy(run)[1] == trained
+
+
 def test_a_damaged_line_of_the_log_is_refused(
     naive_run: Path, start: Start, tmp_path: Path
 ) -> None:
