@@ -5,8 +5,11 @@ What they hold, a checkpoint knows by digests; these are only the places.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -14,6 +17,7 @@ from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
 
 NAME = "inputs.json"
+_RELATIVE = "relative"  # of its keys: the places as they are seen from the run
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,12 @@ class Inputs:
         )
 
 
+    def each(self, change: Callable[[str], str]) -> Inputs:
+        """The same with every place changed."""
+        anchor = None if self.anchor is None else change(self.anchor)
+        return Inputs(tuple(map(change, self.demos)), anchor)
+
+
 def is_gone(place: str) -> bool:
     """Whether nothing is there; the id of a dataset is the hub's to find."""
     path = Path(place)
@@ -44,12 +54,20 @@ def is_gone(place: str) -> bool:
 
 
 def keep(out: Path, inputs: Inputs) -> None:
-    """Write them into a run's folder."""
-    files.save_json(out / NAME, asdict(inputs))
+    """Write them into a run's folder, also as they are seen from there."""
+    here = out.absolute()
+
+    def relative(place: str) -> str:
+        return os.path.relpath(place, here) if Path(place).is_absolute() else place
+
+    files.save_json(out / NAME, asdict(inputs) | {_RELATIVE: asdict(inputs.each(relative))})
 
 
 def of(out: Path) -> Inputs | None:
     """Those of a run; None of one that an earlier version has begun.
+
+    What is gone from its place, but lies as it did before when it is seen from the run, has been
+    moved together with the run.
 
     Raises:
         AegisError: a damaged file.
@@ -58,14 +76,29 @@ def of(out: Path) -> Inputs | None:
     if not path.is_file():
         return None
     said = files.load_json(path)
+    kept = _read(said)
+    relative = _read(said[_RELATIVE]) if kept and _RELATIVE in said else kept
+    if kept is None or relative is None or len(relative.demos) != len(kept.demos):
+        raise AegisError(
+            f"'{path}' is damaged: no places of demonstrations and an anchor",
+            "what Aegis has written there",
+            "delete it, and say where they lie: aegis train RUN --demos PATH --anchor FILE",
+        )
+    seen = dict(zip((*kept.demos, kept.anchor), (*relative.demos, relative.anchor), strict=True))
+
+    def found(place: str) -> str:
+        moved = Path(os.path.normpath(out.absolute() / str(seen[place])))
+        return str(moved) if is_gone(place) and moved.exists() else place
+
+    return kept.each(found)
+
+
+def _read(said: Any) -> Inputs | None:
+    """The places that a file's JSON holds; None where it does not hold them."""
     places = [said.get(name) for name in ("demos", "anchor")] if isinstance(said, dict) else []
     match places:
         case [[str(), *_] as demos, (str() | None) as anchor] if all(
             isinstance(each, str) for each in demos
         ):
             return Inputs(tuple(demos), anchor)
-    raise AegisError(
-        f"'{path}' is damaged: no places of demonstrations and an anchor",
-        "what Aegis has written there",
-        "delete it, and say where they lie: aegis train RUN --demos PATH --anchor FILE",
-    )
+    return None
