@@ -153,7 +153,7 @@ def _inspected(path: Path) -> InspectReport:
 
 
 def _gate(path: Path, asked: _Named | None) -> bool | None:
-    """The verdict on the drop that the row shows; of all the run's probes, `aegis inspect` tells."""
+    """The verdict on the drop that the row shows; `aegis inspect` tells of all the probes."""
     if asked is None:
         return None
     return results.gate([asked[1]], results.recipe_of(path).probe.max_drop)
