@@ -40,7 +40,6 @@ class Inputs:
             None if anchor is None else str(anchor.absolute()),
         )
 
-
     def each(self, change: Callable[[str], str]) -> Inputs:
         """The same with every place changed."""
         anchor = None if self.anchor is None else change(self.anchor)
