@@ -18,7 +18,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Expert, Lora, Recipe, Rollout, Train
-from aegis_cli.training import checkpoint, train
+from aegis_cli.training import checkpoint, inputs, train
 from samples.nullspace import share_of_displacement
 
 STEPS, EVERY = 6, 2
@@ -100,6 +100,10 @@ def metrics(out: Path, without: frozenset[str] | set[str] = frozenset()) -> list
 def assert_same_run(one: Path, other: Path) -> None:
     a, b = contents(one), contents(other)
     assert a.keys() == b.keys()
+    # The file also says how its places are seen from the run, which lies elsewhere.
+    assert inputs.of(one) == inputs.of(other)
+    for found in (a, b):
+        found.pop(inputs.NAME, None)
     assert [name for name in a if a[name] != b[name]] == []
     assert metrics(one, TIMES) == metrics(other, TIMES)
 
