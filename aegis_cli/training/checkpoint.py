@@ -361,7 +361,7 @@ def _executed_now(path: Path, meta: Mapping[str, Any]) -> dict[str, Any]:
     run = run_of(path)
     if run is None:
         return dict(meta)
-    settings = recipes.load(run / "recipe.yaml").rollout
+    settings = recipes.load(run / "recipe.yaml", kind=recipes.Recipe).rollout
     now = {name: value for name, value in meta.items() if name != "ensemble"}
     now["replan"] = settings.replan
     if settings.ensemble is not None:

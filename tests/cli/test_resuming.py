@@ -139,20 +139,13 @@ def test_what_has_moved_is_named_and_taken_from_where_it_lies_now(
     assert aegis("train", "cut")[0] == 0
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_what_has_moved_together_with_its_run_is_found(
-    beside: bool, place: Path, aegis: Aegis, bad: Bad
-) -> None:
+def test_what_has_moved_together_with_its_run_is_found(place: Path, aegis: Aegis) -> None:
     """As a job of `aegis run` is moved, or a project with its data."""
     cut(place)
     moved = place / "moved"
     moved.mkdir()
-    for name in ("cut", "demos.safetensors", "anchor.safetensors") if beside else ("cut",):
+    for name in ("cut", "demos.safetensors", "anchor.safetensors"):
         (place / name).rename(moved / name)
-    if not beside:
-        shutil.move(place / "demos.safetensors", place / "other.safetensors")
-        bad("evaluate", "moved/cut", says=(f"'{place / 'demos.safetensors'}' is gone",))
-        return
     code, out, err = aegis("evaluate", "moved/cut", "--frames", 8, "--json")
     assert code == 0, err
     assert json.loads(out)["data"] == str(moved / "demos.safetensors")
@@ -161,6 +154,13 @@ def test_what_has_moved_together_with_its_run_is_found(
     assert code == 0 and steps_of(moved / "cut") == 3, err
     where = inputs.Inputs((str(moved / "demos.safetensors"),), str(moved / "anchor.safetensors"))
     assert inputs.of(moved / "cut") == where
+
+
+def test_what_has_not_moved_with_its_run_is_asked_for(place: Path, bad: Bad) -> None:
+    (place / "moved").mkdir()
+    cut(place).rename(place / "moved" / "cut")
+    (place / "demos.safetensors").rename(place / "other.safetensors")
+    bad("evaluate", "moved/cut", says=(f"'{place / 'demos.safetensors'}' is gone",))
 
 
 def test_of_several_sets_the_one_that_has_moved_is_asked_for_beside_the_others(
