@@ -39,7 +39,7 @@ LENGTH = 64  # tokens of a passage
 PASSAGES = 128  # for the anchor, and as many for the probe
 COLORS = ("red", "blue", "green", "black")
 HELD_OUT = ("yellow", "purple")  # in no demonstration
-STEPS, BATCH = 300, 8  # of a training
+STEPS, BATCH = 300, 8  # of a training, unless --steps says otherwise
 SAMPLES = 8  # flow samples a prompt, which share one pass of the backbone
 METHODS = ("frozen", "naive", "aegis", "aegis-without-first", "nullspace", "kfac")
 # The first token of a text is an attention sink: in the middle layers its activations are a hundred
@@ -50,8 +50,8 @@ WITHOUT_FIRST = "aegis-without-first"
 # --- what the model knows -------------------------------------------------------------------------
 
 
-def load_model() -> tuple[nn.Module, Any]:
-    """The published weights in float32, and their tokenizer."""
+def load_model(device: str) -> tuple[nn.Module, Any]:
+    """The published weights in float32 on a device, and their tokenizer."""
     import transformers
 
     # The package is not imported, for its own code needs llama.cpp.
@@ -64,7 +64,7 @@ def load_model() -> tuple[nn.Module, Any]:
     model = transformers.AutoModelForCausalLM.from_pretrained(
         folder, gguf_file=name, dtype=torch.float32
     )
-    return model.eval(), tokenizer
+    return model.eval().to(device), tokenizer
 
 
 def passages(tokenizer: Any, for_anchor: bool) -> Tensor:
@@ -100,7 +100,7 @@ def _hashed(text: str) -> int:
 def text_loss(model: nn.Module, ids: Tensor) -> float:
     """Mean cross-entropy of the next token, in nats."""
     total = 0.0
-    for batch in ids.split(16):
+    for batch in ids.to(model.device).split(16):
         scores = model(input_ids=batch).logits[:, :-1]
         total += float(
             functional.cross_entropy(scores.flatten(0, 1), batch[:, 1:].flatten())
@@ -116,13 +116,14 @@ def capitals_known(model: nn.Module, tokenizer: Any) -> dict[str, float]:
     for start in range(0, len(pairs), 32):
         chosen = pairs[start : start + 32]
         whole = tokenizer([a + b for a, b in chosen], return_tensors="pt", padding=True)
+        whole = whole.to(model.device)
         scores = model(**whole).logits[:, :-1].log_softmax(-1)
         for row, (question, _) in enumerate(chosen):
             first = len(tokenizer(question).input_ids)
             answer = whole.input_ids[row, first : int(whole.attention_mask[row].sum())]
             predicted = scores[row, first - 1 : first - 1 + len(answer)]
             named += bool((predicted.argmax(-1) == answer).all())
-            losses -= float(predicted[torch.arange(len(answer)), answer].mean())
+            losses -= float(predicted.gather(1, answer[:, None]).mean())
     return {"capitals": named / len(pairs), "capitals_loss": losses / len(pairs)}
 
 
@@ -170,7 +171,7 @@ class Expert(nn.Module):
         A sample is one query; queries do not see each other.
         """
         asked = self.enter(torch.cat([noisy[:, :, 0], times[..., None]], -1))
-        apart = ~torch.eye(asked.shape[1], dtype=torch.bool)
+        apart = ~torch.eye(asked.shape[1], dtype=torch.bool, device=asked.device)
         read = self.read(hidden)
         out = self.body(asked, read, tgt_mask=apart, memory_key_padding_mask=~mask)
         return self.leave(out)[:, :, None]
@@ -187,6 +188,7 @@ class Policy:
     def read(self, texts: list[str]) -> tuple[Tensor, Tensor]:
         """Token ids and mask, [B, T] each."""
         batch = self.tokenizer(texts, return_tensors="pt", padding=True)
+        batch = batch.to(self.backbone.device)
         return batch.input_ids, batch.attention_mask.bool()
 
     def hidden(self, ids: Tensor, mask: Tensor) -> Tensor:
@@ -196,9 +198,10 @@ class Policy:
     def loss(
         self, hidden: Tensor, mask: Tensor, actions: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """The flow-matching loss of a batch."""
-        times = flow.draw_times((len(actions), SAMPLES), generator)
-        noise = torch.randn(len(actions), SAMPLES, 1, 2, generator=generator)
+        """The flow-matching loss of a batch; the CPU draws, so that a GPU trains on the same."""
+        times = flow.draw_times((len(actions), SAMPLES), generator).to(hidden.device)
+        noise = torch.randn(len(actions), SAMPLES, 1, 2, generator=generator).to(hidden.device)
+        actions = actions.to(hidden.device)
         noisy, target = flow.interpolate(actions[:, None], noise, times)
         velocity = self.expert(noisy, times, hidden, mask)
         return functional.mse_loss(velocity, target)
@@ -209,9 +212,12 @@ class Policy:
         total = 0.0
         for start in range(0, len(held.texts), 32):
             ids, mask = self.read(held.texts[start : start + 32])
-            hidden, actions = self.hidden(ids, mask), held.actions[start : start + 32]
+            hidden, actions = (
+                self.hidden(ids, mask),
+                held.actions[start : start + 32].to(ids.device),
+            )
             generator = torch.Generator().manual_seed(start)
-            noise = torch.randn(len(actions), SAMPLES, 1, 2, generator=generator)
+            noise = torch.randn(len(actions), SAMPLES, 1, 2, generator=generator).to(ids.device)
 
             def velocity(
                 x: Tensor, t: Tensor, hidden: Tensor = hidden, mask: Tensor = mask
@@ -226,7 +232,7 @@ class Policy:
 # --- a run ----------------------------------------------------------------------------------------
 
 
-def anchor_of(method: str, folder: Path) -> Path:
+def anchor_of(method: str, folder: Path, device: str) -> Path:
     """The anchor that a method reads, measured on passages unless it is there already."""
     part = {"nullspace": "inputs", "kfac": "curvature"}.get(method, "moments")
     path = (
@@ -234,10 +240,10 @@ def anchor_of(method: str, folder: Path) -> Path:
     )
     if path.exists():
         return path
-    model, tokenizer = load_model()
+    model, tokenizer = load_model(device)
     _leave_maps_alone_learning(model)
     with Guard.measure(model, LAYERS, parts=(part,)) as measured:
-        for ids in passages(tokenizer, for_anchor=True).split(8):
+        for ids in passages(tokenizer, for_anchor=True).to(device).split(8):
             mask = compared(torch.ones_like(ids, dtype=torch.bool), method)
             with measured.watch(mask, image=torch.zeros_like(mask)):
                 scores = model(input_ids=ids).logits[:, :-1]
@@ -269,6 +275,8 @@ class Setting:
     method: str
     rate: float
     seed: int
+    steps: int
+    device: str
 
     @property
     def name(self) -> str:
@@ -278,24 +286,30 @@ class Setting:
 def train(setting: Setting, folder: Path) -> dict[str, float]:
     """Train one policy, and measure what it knows and how well it acts."""
     torch.manual_seed(setting.seed)
-    model, tokenizer = load_model()
+    model, tokenizer = load_model(setting.device)
     if setting.method == "frozen":
         model.requires_grad_(False)
     else:  # of the same parameters for all methods, those that `kfac` can hold
         _leave_maps_alone_learning(model)
-    policy = Policy(model, Expert(model.config.hidden_size), tokenizer)
+    policy = Policy(model, Expert(model.config.hidden_size).to(setting.device), tokenizer)
     guard = None
     if setting.method not in ("frozen", "naive"):
         method = setting.method.removesuffix("-without-first")
         options: dict[str, Any] = {} if method == "aegis" else {"every": 4}
-        anchor = anchor_of(setting.method, folder)
+        anchor = anchor_of(setting.method, folder, setting.device)
         guard = Guard(policy.backbone, anchor, LAYERS, method=method, **options)
     learning = [p for p in model.parameters() if p.requires_grad]
     groups = [{"params": policy.expert.parameters(), "lr": 1e-3, "weight_decay": 0.0}]
     if learning:
         groups.append({"params": learning, "lr": setting.rate, "weight_decay": 0.0})
     optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.95))
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, _share)
+    warm = setting.steps // 10
+
+    def share(step: int) -> float:
+        """Of the rate: a tenth of the steps up, then down to zero."""
+        return min((step + 1) / warm, (setting.steps - step) / (setting.steps - warm))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
     began = time.perf_counter()
     for i, loss in enumerate(_steps(setting, policy, guard, optimizer, schedule)):
         if i % 20 == 0:
@@ -304,17 +318,11 @@ def train(setting: Setting, folder: Path) -> dict[str, float]:
     return measure(policy)
 
 
-def _share(step: int) -> float:
-    """Of the rate: a tenth of the steps up, then down to zero."""
-    warm = STEPS // 10
-    return min((step + 1) / warm, (STEPS - step) / (STEPS - warm))
-
-
 def _steps(
     setting: Setting, policy: Policy, guard: Guard | None, optimizer: Any, schedule: Any
 ) -> Iterator[float]:
     generator = torch.Generator().manual_seed(setting.seed)
-    for _ in range(STEPS):
+    for _ in range(setting.steps):
         batch = frames(BATCH, COLORS, generator)
         ids, mask = policy.read(batch.texts)
         watched = contextlib.nullcontext()
@@ -360,7 +368,7 @@ def activations() -> str:
 
     W2^2 is that between 16 robot prompts and 16 passages, with all tokens and without the first.
     """
-    model, tokenizer = load_model()
+    model, tokenizer = load_model("cpu")
     texts = frames(16, COLORS, torch.Generator().manual_seed(5)).texts
     prompts = tokenizer(texts, return_tensors="pt", padding=True)
     read = [(prompts.input_ids, prompts.attention_mask.bool())]
@@ -432,6 +440,8 @@ def main() -> None:
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--rate", type=float, default=1e-4)
+    parser.add_argument("--steps", type=int, default=STEPS, help="of a training")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("runs/published"))
     parser.add_argument("--activations", action="store_true", help="print their sizes alone")
     chosen = parser.parse_args()
@@ -441,17 +451,23 @@ def main() -> None:
     chosen.out.mkdir(parents=True, exist_ok=True)
     cells = chosen.out / "cells.json"
     done = json.loads(cells.read_text()) if cells.exists() else {}
+    others = [
+        name for name, cell in done.items() if cell.get("steps", chosen.steps) != chosen.steps
+    ]
+    if others:
+        raise SystemExit(f"{cells} has runs of another number of steps: give another --out")
     if "pretrained" not in done:
-        model, tokenizer = load_model()
+        model, tokenizer = load_model(chosen.device)
         done["pretrained"] = {
             "text_loss": text_loss(model, passages(tokenizer, for_anchor=False)),
             **capitals_known(model, tokenizer),
         }
     for seed in map(int, chosen.seeds.split(",")):
         for method in chosen.methods.split(","):
-            setting = Setting(method, chosen.rate, seed)
+            setting = Setting(method, chosen.rate, seed, chosen.steps, chosen.device)
             if setting.name not in done:
-                done[setting.name] = train(setting, chosen.out)
+                figures = train(setting, chosen.out)
+                done[setting.name] = {**figures, "steps": setting.steps}
                 cells.write_text(json.dumps(done, indent=1) + "\n")
     print(table(done))
 
