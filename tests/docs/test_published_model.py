@@ -22,7 +22,7 @@ def script() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["published", "published-first"])
+@pytest.mark.parametrize("name", ["published", "published-longer", "published-first"])
 def test_the_pages_table_is_that_of_the_cells(name: str) -> None:
     cells = json.loads((RESULTS / f"{name}.cells.json").read_text(encoding="utf-8"))
     table = script().table(cells)
