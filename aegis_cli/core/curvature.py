@@ -110,33 +110,45 @@ class Curvature:
         if bias is not None:
             # The bias is the weight of an input that is always 1.
             flat = torch.cat([flat, bias[..., None]], -1)
-        flat, inputs = flat.to(self.c.dtype), self.inputs.to(self.c.dtype)
-        read = flat @ inputs  # [o, k]
-        found = self._along(read, strength, self.c, factor) @ inputs.mT  # [o, d]
-        # Else what lies outside the stored inputs is not read on VQA, and stays.
+        flat = flat.to(self.c.dtype)
+        inputs, outputs = self.inputs.to(flat.dtype), self.outputs.to(flat.dtype)
+        floor, above = self._shares(strength, self.c, factor)
         rest = self.c_rest
-        if isinstance(rest, Tensor) or rest:
-            outside = flat - read @ inputs.mT
+        resolved = not isinstance(rest, Tensor) and rest == 0
+        if not resolved:
+            # All inputs have the share of those that were never resolved, and the stored ones what
+            # theirs is more. Else what lies outside them is not read on VQA, and stays.
             if not isinstance(rest, Tensor):
                 rest = self.c.new_full((1,), rest)
-            found = found + self._along(outside, strength, rest, factor)
+            floor_rest, above_rest = self._shares(strength, rest, factor)
+            floor, above = floor - floor_rest, above - above_rest
+        read = flat @ inputs  # [o, k]
+        found = (read * floor + outputs @ (self._stored(outputs, read) * above)) @ inputs.mT
+        if not resolved:
+            found += flat * floor_rest
+            found += outputs @ (self._stored(outputs, flat) * above_rest)
         found_weight = found[..., :width].reshape(weight.shape)
         return found_weight, None if bias is None else found[..., width]
 
-    def _along(
-        self, read: Tensor, strength: float | Tensor, c: Tensor, factor: Callable[[Tensor], Tensor]
-    ) -> Tensor:
-        """A displacement [o, k] along inputs of curvature c [k] or [1], weighed per output."""
-        # Outputs outside the stored eigenvectors are damped too, so all of them have this share at
-        # least; along the stored ones the rest is added.
+    def _shares(
+        self, strength: float | Tensor, c: Tensor, factor: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Shares of a displacement along inputs of curvature c [k] or [1].
+
+        Outputs outside the stored eigenvectors are damped too, so all of them have one share at
+        least; along the stored ones more is added.
+
+        Returns:
+            That of all outputs, [1, k]; and what is added along each stored one, [m, k].
+        """
         floor = factor(strength * (self.g_rest + self.damping) * c)[..., None, :]
         damped = self.g + self.damping
-        shares = factor(strength * (damped[..., :, None] * c[..., None, :]))  # [m, k] or [m, 1]
-        outputs = self.outputs.to(read.dtype)
-        stored = outputs.mT @ read  # [m, k]
-        if self.total is not None:
-            stored = self.total(stored)
-        return read * floor + outputs @ (stored * (shares - floor))
+        return floor, factor(strength * (damped[..., :, None] * c[..., None, :])) - floor
+
+    def _stored(self, outputs: Tensor, read: Tensor) -> Tensor:
+        """A displacement [o, k] along the stored outputs, [m, k], of all processes."""
+        stored = outputs.mT @ read
+        return stored if self.total is None else self.total(stored)
 
 
 def stacked(found: Sequence[Curvature]) -> Curvature:
