@@ -2,7 +2,7 @@
 
 They are written beside this file, or into FOLDER, as SVG whose letters are paths, so that they look
 the same everywhere; `--png` writes PNG instead, to look at.
-The other pictures of this folder are Aegis's own output:
+`published.py` draws `published.png`. The other pictures of this folder are Aegis's own output:
 
     compare.png   aegis inspect runs/compare --plot docs/pictures/compare.png
     rollout.gif   aegis rollout runs/quickstart/naive --episodes 6 --colors held-out \\

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -13,8 +14,8 @@ from samples.command_blocks import ROOT
 RESULTS = ROOT / "docs/results"
 
 
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("published", ROOT / "docs/published_model.py")
+def script(path: str = "docs/published_model.py") -> ModuleType:
+    spec = importlib.util.spec_from_file_location("published", ROOT / path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["published"] = module  # where its dataclasses look for their types
@@ -28,3 +29,15 @@ def test_the_pages_table_is_that_of_the_cells(name: str) -> None:
     table = script().table(cells)
     assert len(cells) > 5 and len(table.splitlines()) > 6
     assert table in (RESULTS / "published.md").read_text(encoding="utf-8")
+
+
+def test_every_run_of_the_cells_is_in_the_picture(tmp_path: Path) -> None:
+    pictures = script("docs/pictures/published.py")
+    drawn = tmp_path / "published.png"
+    pictures.draw(drawn)
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    shown = set(pictures.LOOKS)
+    for name in pictures.PANELS.values():
+        cells = json.loads((RESULTS / f"{name}.cells.json").read_text(encoding="utf-8"))
+        runs = {tuple(cell.rsplit("_", 2)[:2]) for cell in cells if cell != "pretrained"}
+        assert runs and runs <= shown
