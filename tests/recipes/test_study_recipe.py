@@ -416,7 +416,7 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
         ("merges", 34, 34),
         ("plateau", 12, 12),
         ("longer", 9, 9),
-        ("longer-rivals", 3, 3),
+        ("longer-rivals", 12, 12),
         ("rivals", 139, 139),
         ("metaworld-study", 24, 24),
         ("metaworld-stream-study", 9, 9),
