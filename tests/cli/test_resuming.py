@@ -314,6 +314,10 @@ def test_a_recipe_needs_a_folder_and_a_run_has_its_own(place: Path, bad: Bad) ->
     bad("train", "cut", "--out", "new", says=says)
 
 
+def test_a_run_that_is_not_there_is_missed_before_its_out(place: Path, bad: Bad) -> None:
+    bad("train", "runs/mistyped", says=("no file runs/mistyped",))
+
+
 def test_a_folder_that_is_no_run_says_what_may_be_meant(place: Path, bad: Bad) -> None:
     run = cut(place)
     last = checkpoint.last(run).resolve()
