@@ -33,9 +33,9 @@ class Variant:
     A knob is a key and the values it is chosen among; several knobs are tried in all combinations.
     """
 
-    method: str = key(choice(*METHODS), doc="Method, or learner, of the variant.")
+    method: str = key(choice(*METHODS), doc="Method of the variant.")
     set: dict[str, Any] = key(
-        factory=dict, doc="Keys of its own: dotted recipe key -> value, e.g. lora.rank: 8."
+        factory=dict, doc="Keys of its own: dotted recipe key -> value, e.g. train.steps: 900."
     )
     tune: dict[str, Any] = key(
         factory=dict,
