@@ -82,7 +82,7 @@ class PolicyVariant(Variant):
 
 @section
 class Tuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation success is near the best of `naive`, it is the one with the
     highest validation accuracy.
@@ -157,7 +157,7 @@ class Pairs:
 
 @section
 class StreamTuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation Last is near its best, it is the one with the fewest final
     parameters.
@@ -203,7 +203,7 @@ class RobotStreamVariant(Variant):
 
 @section
 class RobotStreamTuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose success on all tasks, on validation episodes after the last task, is near
     its best, it is the one with the highest VQA accuracy.
