@@ -387,11 +387,11 @@ def train(
     run = recipe if recipe.is_dir() else None
     if run is not None:
         recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
+    chosen = [f"train.method={method}"] if method is not None else []
+    resolved = load_training(recipe, (overrides or []) + chosen)  # a path may be mistyped
     if out is None:
         fix = commands.aegis("train", recipe, "--out", "runs/NAME")
         raise AegisError("no --out", "a folder for the run", fix)
-    chosen = [f"train.method={method}"] if method is not None else []
-    resolved = load_training(recipe, (overrides or []) + chosen)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
     as_they_are = [] if device is None else ["--device", device]
@@ -606,8 +606,12 @@ def _check_sweep(
     of_sweep = {"--sweep": sweep, "--max-drop": max_drop, "--plot": plot}
     given_too = [name for name, value in of_sweep.items() if value is not None]
     if strength is not None and given_too:
-        found = f"--strength with {', '.join(given_too)}"
-        raise AegisError(found, "one strength, or a sweep", "leave --strength out")
+        options = " and ".join(given_too)
+        raise AegisError(
+            f"--strength with {options}, of a sweep",
+            "one strength, or a sweep",
+            f"leave out --strength, or {options}",
+        )
     writes = strength is not None or max_drop is not None
     if writes and out is None:
         name = "--strength" if strength is not None else "--max-drop"

@@ -44,6 +44,7 @@ _TYPES: dict[Any, str] = {
     str | tuple[str, ...]: "text or list of words",
     str | tuple[str, ...] | None: "text or list of words",
     tuple[int, ...]: "list of whole numbers",
+    tuple[int, ...] | None: "list of whole numbers",
     tuple[float, ...] | None: "list of numbers",
     tuple: "list of words",
 }

@@ -88,14 +88,15 @@ def demonstrations_of(run: Path) -> Path:
     """The demonstrations that a run learned from, for `aegis evaluate` that is given none.
 
     Raises:
-        AegisError: they are not known, are no longer there, or are several sets.
+        AegisError: no policy; or they are not known, are no longer there, or are several sets.
     """
-    from aegis_cli.evaluation import results
+    from aegis_cli.evaluation import open_loop, results
     from aegis_cli.training import inputs
 
     home = results.run_of(run)
     kept = None if home is None else inputs.of(home)
     if kept is None:
+        open_loop.check_policy(run)
         raise AegisError(
             f"no --demos for '{run}', which does not say where those of its training lie",
             "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",

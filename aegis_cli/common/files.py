@@ -12,6 +12,7 @@ import re
 import secrets
 import shutil
 import stat
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -293,7 +294,16 @@ def check_utf8(path: str | Path, fix: str) -> None:
         str(path).encode()
     except UnicodeEncodeError as error:
         found = f"the path {str(path)!r}, whose bytes are not UTF-8"
-        raise AegisError(found, "a path in UTF-8", fix) from error
+        try:
+            named = os.fsencode(path).decode()
+        except UnicodeDecodeError:
+            raise AegisError(found, "a path in UTF-8", fix) from error
+        # The name is well, and Python has been told that names are ASCII.
+        raise AegisError(
+            f"the path '{named}' in a locale of {sys.getfilesystemencoding()} names",
+            "a locale that reads names as UTF-8",
+            "LC_ALL=C.UTF-8, and no PYTHONUTF8=0",
+        ) from error
 
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:

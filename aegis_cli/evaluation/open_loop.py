@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import artifacts, devices, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations, joints, mixture, renaming
@@ -220,6 +220,22 @@ class _Chosen(NamedTuple):
     trained_on: list[int]
 
 
+def check_policy(run: Path) -> None:
+    """Raise AegisError for what is here and no policy; the hub is not asked for what is not."""
+    _refuse_stream(run)
+    if (run.exists() or hub.is_local(str(run))) and not lerobot_folder.is_policy(run):
+        checkpoint.chosen(run)
+
+
+def _refuse_stream(run: Path) -> None:
+    if recipes.is_stream_run(run):
+        raise AegisError(
+            f"'{run}', the run of a stream",
+            "the run of one policy",
+            "evaluate a run that aegis train wrote from a recipe of kind policy",
+        )
+
+
 @dataclass(frozen=True)
 class _Source:
     """A checkpoint, and what is known of its training.
@@ -238,12 +254,7 @@ class _Source:
 
     @classmethod
     def find(cls, run: Path) -> _Source:
-        if recipes.is_stream_run(run):
-            raise AegisError(
-                f"'{run}', the run of a stream",
-                "the run of one policy",
-                "evaluate a run that aegis train wrote from a recipe of kind policy",
-            )
+        _refuse_stream(run)
         name, run = str(run), download.locate(run)
         if lerobot_folder.is_policy(run):
             return cls(name, run, None, frozenset())

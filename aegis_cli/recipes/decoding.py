@@ -27,6 +27,7 @@ _PHRASES: dict[Any, str] = {
     str | tuple[str, ...] | None: "text, or a list of different words such as [a, b]",
     tuple[float, ...] | None: "a list of numbers such as [2, 1]",
     tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
+    tuple[int, ...] | None: "a list of different whole numbers such as [100, 200]",
     dict: "a section of keys and values",
     dict[str, str] | None: "names with theirs, such as {overhead: top}",
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aegis_cli.data.streams.names import STREAMS
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     FOLDER_NAME,
@@ -305,7 +306,10 @@ class StreamRecipe:
     """Lets a dual encoder learn a stream of classification tasks one after the other."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run.")
-    stream: str = key(NOT_EMPTY, doc="Name of the stream.")
+    stream: str = key(
+        NOT_EMPTY,
+        doc=f"Name of the stream: one of {', '.join(STREAMS)}, or with `path` any name.",
+    )
     path: str | None = key(
         NOT_EMPTY,
         None,

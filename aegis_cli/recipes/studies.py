@@ -33,9 +33,9 @@ class Variant:
     A knob is a key and the values it is chosen among; several knobs are tried in all combinations.
     """
 
-    method: str = key(choice(*METHODS), doc="Method, or learner, of the variant.")
+    method: str = key(choice(*METHODS), doc="Method of the variant.")
     set: dict[str, Any] = key(
-        factory=dict, doc="Keys of its own: dotted recipe key -> value, e.g. lora.rank: 8."
+        factory=dict, doc="Keys of its own: dotted recipe key -> value, e.g. train.steps: 900."
     )
     tune: dict[str, Any] = key(
         factory=dict,
@@ -82,7 +82,7 @@ class PolicyVariant(Variant):
 
 @section
 class Tuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation success is near the best of `naive`, it is the one with the
     highest validation accuracy.
@@ -157,7 +157,7 @@ class Pairs:
 
 @section
 class StreamTuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation Last is near its best, it is the one with the fewest final
     parameters.
@@ -203,7 +203,7 @@ class RobotStreamVariant(Variant):
 
 @section
 class RobotStreamTuning:
-    """How each variant's knob is chosen.
+    """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose success on all tasks, on validation episodes after the last task, is near
     its best, it is the one with the highest VQA accuracy.

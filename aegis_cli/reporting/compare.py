@@ -17,6 +17,7 @@ from aegis_cli.evaluation import results
 from aegis_cli.inspection import InspectReport
 from aegis_cli.reporting import differences
 from aegis_cli.studies import table
+from aegis_cli.studies.cells import CELLS
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import checkpoint, folder
 from aegis_cli.training.up_to_date import refuse_unfinished
@@ -191,7 +192,8 @@ def _runs(path: Path) -> Iterator[Path]:
             yield from table.runs(found)
             return
     if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
-        refuse_unfinished(path, "compare")
+        if not (path / CELLS).is_file():  # a study's has stages too, and no table of runs
+            refuse_unfinished(path, "compare")
         there = path.exists()
         raise AegisError(
             f"'{path}' is no run of a policy" if there else f"nothing is at '{path}'",

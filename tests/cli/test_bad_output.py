@@ -113,6 +113,21 @@ def test_a_path_that_is_no_text_is_refused_before_the_work(
     bad(*command, says=("caf\\udce9", "not UTF-8", "choose another --out"))
 
 
+def test_a_locale_that_cannot_read_a_name_is_told_from_a_name_that_is_no_text(
+    place: Path,
+) -> None:
+    """The user has to change the one or the other."""
+    ascii_names = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, "-m", "aegis_cli", "demos", "point", "--out", "caf\u00e9"],
+        cwd=place,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **ascii_names},
+        capture_output=True,
+    )
+    assert done.returncode == 2
+    assert b"a locale of ascii names" in done.stderr and b"LC_ALL=C.UTF-8" in done.stderr
+
+
 @pytest.mark.parametrize(("output", "free"), [("demos", 100_000), ("anchor", 1000)])
 def test_a_full_disk_leaves_no_artifact(output: str, free: int, bad: Callable[..., str]) -> None:
     with disk(free):

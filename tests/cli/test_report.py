@@ -266,6 +266,13 @@ def test_a_job_that_is_not_finished_says_so(aegis, job: Path) -> None:
         assert f"aegis {command} {job / 'aegis'}" in said
 
 
+def test_a_study_is_not_compared_as_a_job_that_is_not_finished(aegis, tmp_path: Path) -> None:
+    for name in ("stages.json", "cells.json"):
+        (tmp_path / name).write_text("{}")
+    said = refused(aegis("compare", tmp_path))
+    assert "has not finished" not in said and "aegis inspect shows studies" in said
+
+
 @pytest.mark.parametrize(
     ("name", "changed"),
     [

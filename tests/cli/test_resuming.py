@@ -314,6 +314,19 @@ def test_a_recipe_needs_a_folder_and_a_run_has_its_own(place: Path, bad: Bad) ->
     bad("train", "cut", "--out", "new", says=says)
 
 
+def test_a_run_that_is_not_there_is_missed_before_its_out(place: Path, bad: Bad) -> None:
+    bad("train", "runs/mistyped", says=("no file runs/mistyped",))
+
+
+def test_demonstrations_are_asked_for_of_a_policy_alone(place: Path, bad: Bad) -> None:
+    """Who mistypes a run has to look for the run, and not for its demonstrations."""
+    bad("evaluate", "./mistyped", says=("no checkpoint in 'mistyped'",))
+    (place / "stream").mkdir()
+    recipe = "kind: robot-stream\nname: s\ntasks: [reach, point]\n"
+    (place / "stream" / "recipe.yaml").write_text(recipe)
+    bad("evaluate", "stream", says=("the run of a stream",))
+
+
 def test_a_folder_that_is_no_run_says_what_may_be_meant(place: Path, bad: Bad) -> None:
     run = cut(place)
     last = checkpoint.last(run).resolve()

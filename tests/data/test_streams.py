@@ -126,6 +126,16 @@ def test_a_damaged_cache_is_one_error_that_says_what_to_delete(tmp_path: Path) -
     assert f"rm '{path}'" in caught.value.fix
 
 
+def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(embedded, "make")
+    (tmp_path / "file").touch()
+    with pytest.raises(AegisError, match="cannot create the folder") as nowhere:
+        streams.load("primer-1", names.SIZE, tmp_path / "file" / "streams")
+    assert "set AEGIS_CACHE" in nowhere.value.fix
+
+
 @pytest.mark.parametrize("size", [24, 32, 96])
 def test_another_size_is_the_same_picture(size: int, cache: Path, load: Tasks) -> None:
     rows = torch.arange(8)

@@ -408,7 +408,8 @@ def bad(aegis: Aegis, *words: object, says: tuple[str, ...]) -> None:
 def test_options_that_do_not_go_together(aegis: Aegis, merge_place: Place, tmp_path: Path) -> None:
     run, out = merge_place.run, tmp_path / "merged"
     bad(aegis, run, "--method", "factor", "--sweep", "1", says=("factor", "did you mean"))
-    bad(aegis, run, "--strength", 1, "--sweep", "1", "--out", out, says=("--sweep",))
+    says = ("leave out --strength, or --sweep",)
+    bad(aegis, run, "--strength", 1, "--sweep", "1", "--out", out, says=says)
     bad(aegis, run, "--strength", 1, says=("--out",))
     bad(aegis, run, "--max-drop", 1, says=("--out",))
     unasked = ("--strength", 0.5, "--out", out, "--vqa", "nonsense.jsonl")

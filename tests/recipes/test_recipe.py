@@ -212,6 +212,7 @@ def test_an_optional_key_takes_null(tmp_path):
         ("methods=[]", "a list"),
         ("methods=[aegis, aegis]", "different words"),
         ("demos.camera=3", "text, or a list of different words"),
+        ("train.extended_from=[a]", "a list of different whole numbers"),
         ("demos.camera=[]", "text, or a list"),
         ("demos.camera=[top, top]", "different words"),
         ("demos.camera=[top, ' ']", "not empty"),

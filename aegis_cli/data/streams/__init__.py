@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.streams.names import STREAMS
@@ -24,11 +25,24 @@ def load(
         cache: a folder, which is made if it is not there.
 
     Raises:
-        AegisError: no such stream, or what its pictures are made with is missing.
+        AegisError: no such stream, what its pictures are made with is missing, or the cache lacks
+            some and cannot be written to.
     """
     from aegis_cli.data.streams import embedded
 
-    return tuple(embedded.task(task, image_size, cache, on_event) for task in _tasks(name))
+    tasks = _tasks(name)
+    if not all(embedded.file(cache, task).exists() for task in tasks):
+        _make_cache(cache)  # before minutes of drawing
+    return tuple(embedded.task(task, image_size, cache, on_event) for task in tasks)
+
+
+def _make_cache(folder: Path) -> None:
+    try:
+        files.make_folder(folder)
+        files.check_writable(folder / "pictures")
+    except AegisError as error:
+        fix = "set AEGIS_CACHE to a folder that can be written"
+        raise AegisError(error.found, "a cache of a stream's pictures", fix) from error
 
 
 def edition(name: str) -> list[dict[str, object]]:

@@ -26,9 +26,14 @@ REPORT_EVERY = 250
 Painter = Callable[[int, np.random.Generator], np.ndarray]
 
 
+def file(cache: Path, name: str) -> Path:
+    """Where the pictures of a task are kept."""
+    return Path(cache) / f"{name}.safetensors"
+
+
 def task(name: str, image_size: int, cache: Path, on_event: OnEvent) -> StreamTask:
     """One of `names.TASKS`, from `cache` or made and kept there."""
-    path = Path(cache) / f"{name}.safetensors"
+    path = file(cache, name)
     if not _current(path, name):
         masks.need_freetype()
         images, labels = make(name, on_event)
