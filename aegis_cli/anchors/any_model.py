@@ -83,6 +83,7 @@ class Measurement(Removable):
             raise AegisError(f"energy {energy}", "above 0 and up to 1", "energy=0.9999")
         model = structure.part_of(model, part)
         refuse_sharded(model)
+        structure.refuse_offloaded(model)
         if found := structure.compiled(model):
             raise AegisError(
                 f"'{found[0]}' under torch.compile",

@@ -69,8 +69,7 @@ class Commands(TyperGroup):
             raise typer.Exit(ended_by(error)) from None
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
-            ended = "interrupted" if number == signal.SIGINT else signal.Signals(number).name
-            _say(render.note, ended + _resume_hint(ctx.meta))
+            _say(render.note, f"{_ended(number)}; {_what_now(ctx.meta)}")
             raise typer.Exit(128 + number) from None
         except (typer.Exit, typer.Abort):
             raise
@@ -200,17 +199,26 @@ def _refused(error: OSError) -> AegisError:
     return AegisError(found, "a path that can be used", fix)
 
 
-def _resume_hint(meta: Mapping[str, Any]) -> str:
+def _ended(number: int) -> str:
+    """By what a command was ended."""
+    return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+
+
+def _what_now(meta: Mapping[str, Any]) -> str:
+    """What a command has left that was ended, and how its work goes on, or begins again."""
     args = meta["aegis.args"]
+    if args[0] == "serve":
+        return "the server is closed"
     flag = _WITH_RESUME.get(args[0])
-    if flag is None:
-        return ""
+    if flag is None or "--dry-run" in args:
+        again = f"{_program()} {shlex.join(args)}"
+        return f"no half-written file is left; begin again with: {again}"
     alone = _alone(meta.get(GOES_ON))
     if alone is not None:
-        return f"; resume with: {_program()} {shlex.join(alone)}"
+        return f"resume with: {_program()} {shlex.join(alone)}"
     args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
     command = f"{_program()} {shlex.join(args)}" + ("" if flag.strip() in args else flag)
-    return f"; resume with: {command}"
+    return f"resume with: {command}"
 
 
 def _alone(goes_on: Callable[[], list[str] | None] | None) -> list[str] | None:

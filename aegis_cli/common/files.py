@@ -23,7 +23,7 @@ from aegis_cli.common.errors import AegisError
 RENAME = "rename that file or folder"
 _REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
 _NUMBER = r"\.\d+\.tmp"  # how such a name ends
-_LEFT = re.compile(r"\..+" + _NUMBER)
+_LEFT = re.compile(r"\.(.+)" + _NUMBER)  # with the name of what it was to become
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
 _ATTEMPTS = 100  # at a folder above which others come and go
 
@@ -91,8 +91,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             os.fsync(file.fileno())
             os.replace(temporary, path)
     except OSError as error:
-        problem = f"cannot write '{path}': {error.strerror or error}"
-        raise AegisError(problem, "an output that can be written", _cure(path, error)) from error
+        problem = f"cannot write '{_meant(path)}': {error.strerror or error}"
+        fix = cure(path.parent, error)
+        raise AegisError(problem, "an output that can be written", fix) from error
 
 
 @contextlib.contextmanager
@@ -337,7 +338,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         problem = f"cannot create the folder '{path}': {error.strerror or error}"
-        raise AegisError(problem, "a place to write to", _cure(path, error)) from error
+        raise AegisError(problem, "a place to write to", cure(path.parent, error)) from error
 
 
 def refuse_special(path: str | Path) -> None:
@@ -392,8 +393,9 @@ def reading(path: str | Path, fix: str) -> Iterator[None]:
         ) from error
 
 
-def _cure(path: Path, error: OSError) -> str:
-    folder = _lasting(path.parent)
+def cure(folder: Path, error: OSError) -> str:
+    """What to do about a folder in which something could not be written."""
+    folder = _lasting(folder)
     if error.errno == errno.ENOENT:
         return f"mkdir -p '{folder}'"
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -401,6 +403,15 @@ def _cure(path: Path, error: OSError) -> str:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"make '{folder}' writable (chmod u+w), or choose another output"
     return "choose another output"
+
+
+def _meant(path: Path) -> Path:
+    """The path that one of what is written aside will have, for that is all that a user knows."""
+    found = path
+    for around in path.parents:
+        if match := _LEFT.fullmatch(around.name):
+            found = around.with_name(match[1]) / path.relative_to(around)
+    return found
 
 
 def _lasting(folder: Path) -> Path:

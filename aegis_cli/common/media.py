@@ -254,6 +254,7 @@ class Mp4Writer:
         self._options = {"g": str(keyframe_every), "crf": "18", "bf": "0", "threads": "1"}
         self._stream: Any = None
         self._frames = self._bytes = 0
+        self._failed = False  # FFmpeg would use what it has freed once its first write has failed
 
     def write(self, frames: Sequence[np.ndarray] | np.ndarray) -> None:
         """Append T frames [H, W, 3] uint8; the first is a key frame."""
@@ -279,12 +280,19 @@ class Mp4Writer:
         return self._bytes
 
     def close(self) -> None:
-        """Write what the encoder has kept back, and end the file."""
-        if self._stream is not None:
+        """Write what the encoder has kept back, and end the file.
+
+        After a write that failed nothing more is written.
+        """
+        if self._stream is not None and not self._failed:
             self._mux(None)
         self._container.close()
 
     def _mux(self, picture: Any) -> None:
         for packet in self._stream.encode(picture):
             self._bytes += packet.size
-            self._container.mux(packet)
+            try:
+                self._container.mux(packet)
+            except BaseException:
+                self._failed = True
+                raise

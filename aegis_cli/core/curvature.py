@@ -188,19 +188,19 @@ def curvatures(
     # of the memory, and a proximal step is off by a thousandth of what it takes away.
     sketched = not all(spectrum.whole for spectrum in anchor.curvature.values())
     found = {}
-    held: dict[int, Tensor] = {}
+    held: dict[tuple[int, torch.device], Tensor] = {}
     for site, weight in weights.items():
         like = weight.new_empty(0, dtype=torch.promote_types(weight.dtype, torch.float32))
         kept_in = like.half() if sketched else like
         inputs, outputs = (anchor.curvature[name] for name in factors[site])
         for spectrum in (inputs, outputs):
             # Queries, keys and values read the same, and have one tensor.
-            if id(spectrum) not in held:
+            if (id(spectrum), like.device) not in held:
                 assert spectrum.vectors is not None
-                held[id(spectrum)] = spectrum.vectors.to(kept_in)
+                held[id(spectrum), like.device] = spectrum.vectors.to(kept_in)
         found[site] = Curvature(
-            inputs=held[id(inputs)],
-            outputs=held[id(outputs)],
+            inputs=held[id(inputs), like.device],
+            outputs=held[id(outputs), like.device],
             c=_relative(inputs).to(like),
             g=_relative(outputs).to(like),
             damping=damping,

@@ -175,11 +175,16 @@ def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
     groups: list[list[Tensor]] = []
     for h in hidden:
         last = groups[-1] if groups else []
-        alike = bool(last) and (last[0].shape, last[0].dtype) == (h.shape, h.dtype)
+        alike = bool(last) and _kind(last[0]) == _kind(h)
         if not alike or (len(last) + 1) * h.numel() > joint.MOST:
             groups.append([])
         groups[-1].append(h)
     return [torch.stack(group) for group in groups]
+
+
+def _kind(h: Tensor) -> tuple[torch.Size, torch.dtype, torch.device]:
+    """What hidden states have in common that can be stacked; a model may lie on several GPUs."""
+    return h.shape, h.dtype, h.device
 
 
 def _all_rows(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,13 +193,14 @@ def _all_rows(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     They are in float32, or float64 if h is.
     """
     x = h.flatten(-3, -2)
-    return x if x.dtype == torch.float64 else x.float(), mask.flatten()[:, None]
+    valid = mask.to(h.device).flatten()[:, None]
+    return x if x.dtype == torch.float64 else x.float(), valid
 
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
     """The valid rows [n, D] of hidden states [B, T, D], in float32, or float64 if h is."""
     # The backward pass of index_select takes half the time of that of h[mask] on a CPU.
-    index = mask.flatten().nonzero().squeeze(1)
+    index = mask.flatten().nonzero().squeeze(1).to(h.device)
     rows = h.flatten(0, 1).index_select(0, index)
     return rows if rows.dtype == torch.float64 else rows.float()
 

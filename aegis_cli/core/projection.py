@@ -41,11 +41,11 @@ def inner(
     for g, a in zip(gs, as_, strict=True):
         for u, v in _widened(g, a):
             if u is not None:
-                tt = tt + u.dot(u)
+                tt = tt + u.dot(u).to(tt.device)
             if v is not None:
-                aa = aa + v.dot(v)
+                aa = aa + v.dot(v).to(aa.device)
             if u is not None and v is not None:
-                ta = ta + u.dot(v)
+                ta = ta + u.dot(v).to(ta.device)
     return tt, ta, aa
 
 
@@ -55,7 +55,7 @@ def _inner_by_few_kernels(
     """The same on a GPU, which takes longer to start a kernel than to run it on one bias."""
     ta = torch.zeros((), dtype=torch.float64, device=device)
     for u, v in _joined(gs, as_):
-        ta = ta + u.double().dot(v.double())
+        ta = ta + u.double().dot(v.double()).to(device)
     return _energy(gs, device), ta, _energy(as_, device)
 
 
@@ -65,7 +65,8 @@ def _energy(gradients: Gradients, device: torch.device) -> Tensor:
     if not there:
         return torch.zeros((), dtype=torch.float64, device=device)
     norms = torch._foreach_norm(there, dtype=torch.float64)
-    return torch.stack(norms).square().sum()
+    # A loop of somebody else's may have its layers on several GPUs.
+    return torch.stack([norm.to(device) for norm in norms]).square().sum()
 
 
 def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
@@ -75,7 +76,8 @@ def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
         if g is None or a is None:
             continue
         for block in zip(_blocks(g), _blocks(a), strict=True):
-            if waiting and size + len(block[0]) > _GPU_BLOCK:
+            full = size + len(block[0]) > _GPU_BLOCK
+            if waiting and (full or waiting[0][0].device != block[0].device):
                 yield _one(waiting)
                 waiting, size = [], 0
             waiting.append(block)

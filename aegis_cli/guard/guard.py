@@ -111,6 +111,8 @@ class Guard(Removable):
         if dual:
             accumulation.check_group(process_group)
         _refuse_sparse(model)
+        structure.refuse_offloaded(model)
+        _refuse_spread_together(model)
         if not structure.learning(model):
             raise AegisError(
                 f"a {type(model).__name__} without trainable parameters",
@@ -448,6 +450,20 @@ def _refuse_sparse(model: nn.Module) -> None:
                 "dense gradients",
                 "make it with sparse=False, or freeze it",
             )
+
+
+def _refuse_spread_together(model: nn.Module) -> None:
+    """Raise AegisError where several processes each have a model that lies on several devices.
+
+    They would exchange gradients of a device that is another process's.
+    """
+    devices = sorted({str(p.device) for p in model.parameters()})
+    if len(devices) > 1 and accumulation.processes() > 1:
+        raise AegisError(
+            f"a model on {' and '.join(devices)} in one of {accumulation.processes()} processes",
+            "a model on one device in each process, or on several devices in one process",
+            "load it without device_map in each process, or start a single process",
+        )
 
 
 def _owners(model: nn.Module, group: dist.ProcessGroup | None) -> Ranks:

@@ -52,7 +52,7 @@ class GuardedStepper:
         self._model, self._parts = model, parts
         self._averaging = averaging or {}
         self._learning = structure.learning(model)
-        self._device = next(iter(self._learning.values())).device
+        self._devices = [p.device for p in self._learning.values()]
         self._types = [p.dtype for p in self._learning.values()]
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
         self._stepping, self._count = False, 0
@@ -258,12 +258,14 @@ class GuardedStepper:
 
     def _refuse_another_place(self) -> None:
         """Refuse a model that is elsewhere, or of another type, than what constrains it."""
-        device = next(iter(self._learning.values())).device
-        if self._parts.constrains and device != self._device:
+        devices = [p.device for p in self._learning.values()]
+        if self._parts.constrains and devices != self._devices:
+            moved = zip(self._devices, devices, strict=True)
+            then, now = next((then, now) for then, now in moved if then != now)
             raise AegisError(
-                f"a model that was on {self._device} when the guard was made, and is on {device}",
+                f"a model that was on {then} when the guard was made, and is on {now}",
                 "one and the same",
-                f"model.to('{device}') before Guard(...), also where a trainer would do it",
+                f"model.to('{now}') before Guard(...), also where a trainer would do it",
             )
         types = [p.dtype for p in self._learning.values()]
         if self._parts.constrains and types != self._types:

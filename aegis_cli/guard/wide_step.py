@@ -89,7 +89,8 @@ class WideStep:
                 flags.append(torch.zeros((), dtype=torch.bool, device=parameter.device))
             else:
                 flags.append((master.to(parameter.dtype) == parameter.data).all())
-        return torch.stack(flags).tolist()
+        # The program may have its layers on several GPUs.
+        return torch.stack([flag.to(flags[0].device) for flag in flags]).tolist()
 
 
 @contextlib.contextmanager

@@ -94,7 +94,12 @@ class _Target:
         """The transport cost of a pass, with its graph, and W2^2 of each layer [L]."""
         self._follow(seen.hidden[0].device)
         inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}
-        found = _moments(seen, seen.mask & inside[self.scope])
+        # The layers of somebody else's model may lie on several GPUs, their Gaussians lie on one.
+        at = self.anchor[0].mean.device
+        found = [
+            (mean.to(at), variance.to(at))
+            for mean, variance in _moments(seen, seen.mask & inside[self.scope])
+        ]
         return transport_penalty(found, self.anchor, self.weights)
 
     def _follow(self, device: torch.device) -> None:

@@ -228,7 +228,8 @@ def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
     # All in few kernels, where a GPU would start thousands.
     found = torch._foreach_norm(gradients) if gradients else ()
     for place, norm in zip(places, found, strict=True):
-        norms[place] = norm
+        # A loop of somebody else's may have its layers on several GPUs.
+        norms[place] = norm.to(like.device)
     widest = reduce(torch.promote_types, (norm.dtype for norm in norms))
     both = torch.stack([norm.to(widest) for norm in norms]).double()
     return both.view(-1, 2).square().sum(1)

@@ -54,6 +54,22 @@ def part_of(model: nn.Module, name: str | None) -> nn.Module:
     return found
 
 
+def refuse_offloaded(model: nn.Module) -> None:
+    """Refuse weights that are fetched only for the moment in which a layer is called.
+
+    Raises:
+        AegisError: there are some, as `device_map` leaves what no device has room for.
+    """
+    away = [name for name, parameter in model.named_parameters() if parameter.is_meta]
+    if away:
+        raise AegisError(
+            f"'{away[0]}' first of {len(away)} parameters without values: they are offloaded",
+            "weights that stay on a device, of one GPU or of several",
+            "load the model with a device_map that leaves nothing on 'disk' or to accelerate's "
+            "offloading, or in half precision, or on more GPUs",
+        )
+
+
 def compiled(model: nn.Module) -> list[str]:
     """Names of the parts under torch.compile."""
     # `torch.compile(module)` wraps a module, `module.compile()` sets its call.

@@ -27,6 +27,7 @@ from aegis_cli.studies.figures import Divergence, Figures, Outcome
 from aegis_cli.studies.tuning import Point, Rule
 
 CELLS = "cells.json"
+CLEARING = "clearing.json"  # which measured cell's run is being removed, while it is
 _LISTEN_S = 0.2  # between looks at what the processes report
 _FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
 CellRecipe = Recipe | StreamRecipe | RobotStreamRecipe
@@ -149,6 +150,20 @@ class CellStore:
         self.cells = _load(folder / CELLS)
         self.done = self.total = 0
 
+    def finish_clearing(self) -> None:
+        """Remove what a killed process has left of a measured cell's run.
+
+        Raises:
+            AegisError: what it has noted about that is damaged.
+        """
+        note = self.folder / CLEARING
+        if not note.exists():
+            return
+        key, label = _noted(note)
+        if key in self.cells:  # else it is measured again, and needs what is there
+            self.runner.clear(label)
+        note.unlink()
+
     def begin_anew(self) -> None:
         """Forget every finished cell, here and in the folder."""
         self.cells.clear()
@@ -179,9 +194,10 @@ class CellStore:
         with contextlib.closing(self._measure(list(todo.values()), together)) as found:
             for first, figures in found:
                 key = keys[first.label]
-                self.keep(key, figures)
-                if not self.kind.recipe.keep_runs:
-                    self.runner.clear(first.label)
+                if self.kind.recipe.keep_runs:
+                    self.keep(key, figures)
+                else:
+                    self._keep_and_clear(key, figures, first.label)
                 for cell in waiting:
                     if keys[cell.label] == key:
                         yield cell, self._deliver(key)
@@ -212,6 +228,17 @@ class CellStore:
         self.cells[key] = dataclasses.asdict(found)
         files.write_text(self.folder / CELLS, files.canonical(self.cells) + "\n")
 
+    def _keep_and_clear(self, key: str, found: Outcome, label: str) -> None:
+        """Store what was found, and remove the run.
+
+        A process that is killed meanwhile leaves a note, by which the next one removes the rest.
+        """
+        note = self.folder / CLEARING
+        files.save_json(note, {"cell": key, "run": label})
+        self.keep(key, found)
+        self.runner.clear(label)
+        note.unlink()
+
     def known(self, key: str, kind: type[Entry]) -> Entry:
         """A finished entry.
 
@@ -239,6 +266,24 @@ def _load(path: Path) -> dict[str, Any]:
             "delete it, or bring the file of a study",
         )
     return cells
+
+
+def _noted(note: Path) -> tuple[str, str]:
+    """The key and the label of a cell whose run was being removed."""
+    try:
+        left = files.load_json(note)
+        key, label = left["cell"], left["run"]
+        if not isinstance(key, str) or not isinstance(label, str):
+            raise TypeError("a name that is no text")
+        if Path(label).is_absolute() or not {".", ".."}.isdisjoint(label.split("/")):
+            raise ValueError(f"'{label}' is no run of the study")
+    except (TypeError, KeyError, ValueError) as error:
+        raise AegisError(
+            f"'{note}' is damaged: {error}",
+            "which measured cell's run was being removed",
+            f"rm '{note}', then remove the checkpoints of the measured cells by hand",
+        ) from error
+    return key, label
 
 
 # --- several processes ----------------------------------------------------------------------------

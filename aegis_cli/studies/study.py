@@ -62,6 +62,7 @@ def run(
     folder = Path(root) / study.name
     with locks.alone(folder):
         store = CellStore(kind, folder, on_event, workers)
+        store.finish_clearing()
         if overwrite:
             store.begin_anew()
         return _run(kind, tried, store)

@@ -216,10 +216,12 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, SafetensorError) as error:
+        known = isinstance(error, OSError)
+        fix = files.cure(folder, error) if known else "free some space or choose another --out"
         raise AegisError(
             f"cannot write to '{folder}': {getattr(error, 'strerror', None) or error}",
             "a writable folder with free space",
-            "free some space or choose another --out; what was complete before is still there",
+            f"{fix}; what was complete before is still there",
         ) from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import shutil
 import sys
@@ -165,10 +166,16 @@ def _clear(out: Path, ours: bool) -> Path | None:
     if not any(_is_foreign(path, out) for path in out.rglob("*")):
         shutil.rmtree(out, ignore_errors=True)
         return None
-    aside = out.with_name(f"{out.name}.{time.strftime('%Y-%m-%d_%H%M%S')}")
+    aside = _free(out.with_name(f"{out.name}.{time.strftime('%Y-%m-%d_%H%M%S')}"))
     with checkpoint.writing(out):
         out.rename(aside)
     return aside
+
+
+def _free(path: Path) -> Path:
+    """A path at which nothing is, of this name; a clock that was set back tells a time twice."""
+    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([path], numbered) if not one.exists())
 
 
 def _check_own(out: Path) -> None:

@@ -35,6 +35,7 @@ from aegis_cli.recipes import Anchor
 STAGES = {
     "demos": "aegis_cli.data.record",
     "anchor": "aegis_cli.anchors.measure",
+    "dry-run": "aegis_cli.training.dry_run",
     "train": "aegis_cli.training.train",
     "probe": "aegis_cli.evaluation.probe",
     "rollout": "aegis_cli.evaluation.rollout",
@@ -724,7 +725,7 @@ def test_of_several_processes_the_launcher_is_named_too(
 
 
 def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
-    for name in ("train", "pipeline", "demos"):
+    for name in ("train", "dry-run", "pipeline", "demos"):
         stage(name, error=KeyboardInterrupt())
     code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
     assert (code, out) == (130, "") and "Traceback" not in err
@@ -735,4 +736,7 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
     again = aegis("run", recipe, "--overwrite")[2]
     assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
-    assert aegis("demos", "reach", "--out", "x")[2].endswith("interrupted\n")
+    whole = "interrupted; no half-written file is left; begin again with: aegis"
+    assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")
+    dry = ("--demos", "d", "--out", "r", "--dry-run")
+    assert aegis("train", recipe, *dry)[2].endswith(f"{whole} train {recipe} {' '.join(dry)}\n")

@@ -175,6 +175,7 @@ def test_a_full_disk_is_named_by_a_folder_that_stays(tmp_path: Path) -> None:
         with disk(10), pytest.raises(AegisError) as caught:
             files.write_text(aside / "backbone" / "model", "x" * 100)
     assert f"the disk of '{tmp_path}'" in caught.value.fix
+    assert f"cannot write '{tmp_path / 'runs' / 'backbone' / 'model'}'" in caught.value.found
 
 
 @pytest.mark.parametrize("name", ["runs", "runs/x"])

@@ -8,6 +8,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from samples.command import python
 
 from aegis_cli.common import media
 from aegis_cli.common.media import Clip, Moment
@@ -183,3 +184,26 @@ def test_what_is_appended_begins_with_a_key_frame(every: int, tmp_path: Path) ->
     assert len(frames) == 11 and {0, 7} <= set(keys)
     assert max(np.diff([*keys, 11])) <= every
     assert [float(frame.time) for frame in frames] == pytest.approx([i / 10 for i in range(11)])
+
+
+@pytest.mark.parametrize("frames", [1, 60])  # the encoder keeps some dozens back
+def test_a_disk_without_room_for_a_videos_beginning_is_an_error(frames: int) -> None:
+    """FFmpeg would crash where somebody goes on after its first write has failed."""
+    code = f"""
+import errno
+import numpy
+from pathlib import Path
+from aegis_cli.common.media import Mp4Writer
+
+writer = Mp4Writer(Path("/dev/full"), 10, 10)
+try:
+    try:
+        writer.write(numpy.zeros(({frames}, 64, 64, 3), numpy.uint8))
+    finally:
+        writer.close()
+except OSError as error:
+    assert error.errno == errno.ENOSPC, error
+    print("refused")
+"""
+    done = python(code)
+    assert (done.returncode, done.stdout) == (0, "refused\n"), done.stderr

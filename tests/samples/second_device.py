@@ -41,6 +41,8 @@ INDEXING = {
     aten._index_put_impl_.default,
 }
 MIXES = {aten._to_copy.default, aten.copy_.default, aten._pin_memory.default, *INDEXING}
+# Operations that take no number of the CPU's beside tensors of the device.
+STRICT = {aten.cat.default, aten.stack.default}
 # Those whose result, or its shape, depends on numbers that have to be read.
 READS = {
     aten._local_scalar_dense.default,
@@ -119,6 +121,8 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
     """
     tensors = [x for x in pytree.tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
     of_device = [x for x in tensors if isinstance(x, StandIn)]
+    if 0 < len(of_device) < len(tensors) and "_foreach_" in str(func):
+        return _one_by_one(func, args, kwargs)
     if of_device:
         _check(func, args, tensors)
         if _reads(func, args, kwargs):
@@ -150,6 +154,16 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
     return pytree.tree_map(wrap, func(*own_args, **own_kwargs))
 
 
+def _one_by_one(func: Any, args: Any, kwargs: Any) -> Any:
+    """An operation on lists of tensors, place by place: each place may be of another device."""
+    lists = [x for x in args if isinstance(x, list | tuple)]
+    found = []
+    for place in range(len(lists[0])):
+        own = [[x[place]] if isinstance(x, list | tuple) else x for x in args]
+        found.append(compute(func, own, kwargs))
+    return None if found[0] is None else [one for (one,) in found]
+
+
 def _check(func: Any, args: Any, tensors: Sequence[Tensor]) -> None:
     if func in INDEXING:
         tensors = [args[0], *args[2:3]]  # the places may be a CPU's
@@ -157,7 +171,7 @@ def _check(func: Any, args: Any, tensors: Sequence[Tensor]) -> None:
         return
     for x in tensors:
         # A number may be a CPU's.
-        if not isinstance(x, StandIn) and x.dim() > 0:
+        if not isinstance(x, StandIn) and (x.dim() > 0 or func in STRICT):
             shapes = [(tuple(one.shape), str(one.device)) for one in tensors]
             raise Mixed(f"{func} of {shapes}")
 

@@ -306,4 +306,5 @@ def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:
             with pytest.raises(ConnectionClosed):
                 client.socket.recv()
         assert process.wait(20) == 128 + signal.SIGTERM
-        assert process.stderr.read() == "SIGTERM\n" and process.stdout.read() == ""
+        said = "ended by SIGTERM; the server is closed\n"
+        assert process.stderr.read() == said and process.stdout.read() == ""

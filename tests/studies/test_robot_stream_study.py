@@ -244,6 +244,22 @@ def test_a_file_of_somebody_elses_is_moved_with_its_run_not_removed(tmp_path: Pa
     assert [p.read_text() for p in (tmp_path / "stream").rglob("my-notes.txt")] == ["mine"]
 
 
+def test_runs_moved_at_the_same_time_by_the_clock_are_both_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after the clock was set back."""
+    monkeypatch.setattr("aegis_cli.training.folder.time.strftime", lambda _: "2026-01-01_120000")
+    runner = RobotStreamRunner(tmp_path, ignore)
+    run = tmp_path / "stream" / "igsp" / "3"
+    for note in ("first", "second", "third"):
+        run.mkdir(parents=True)
+        (run / "my-notes.txt").write_text(note)
+        runner.clear("stream/igsp/3")
+    kept = {path.parent.name: path.read_text() for path in tmp_path.rglob("my-notes.txt")}
+    name = "3.2026-01-01_120000"
+    assert kept == {name: "first", f"{name}-2": "second", f"{name}-3": "third"}
+
+
 def test_begun_anew_a_study_records_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded: list[str] = []
 

@@ -28,7 +28,7 @@ from aegis_cli.data.vqa import sets
 from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
 from aegis_cli.studies import policy_cells, table
 from aegis_cli.studies import study as stage
-from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.cells import CLEARING, Cell, CellStore
 from aegis_cli.studies.comparison import StudyReport
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner, PolicyStudy, cell_key
@@ -314,6 +314,75 @@ def test_a_study_cut_anywhere_loses_nothing(
     assert [*first, *second] == [*TUNED, *COMPARED]
     invent(monkeypatch)
     assert without_place(resumed) == without_place(stage.run(small, tmp_path / "elsewhere"))
+
+
+@pytest.mark.parametrize("reached", ["kept", "half removed", "removed"])
+def test_what_a_killed_study_left_of_a_measured_cell_is_removed(
+    reached: str, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clear = PolicyRunner.clear
+
+    def killed(self: PolicyRunner, label: str) -> None:
+        last = self.folder / label / "checkpoints" / "last"
+        (last.with_name("000002") / "backbone").mkdir(parents=True)
+        if reached == "half removed":
+            last.rmdir()
+        if reached == "removed":
+            clear(self, label)
+        raise Stop
+
+    first = invent(monkeypatch)
+    monkeypatch.setattr(PolicyRunner, "clear", killed)
+    with pytest.raises(Stop):
+        stage.run(small, tmp_path)
+    folder = tmp_path / "small"
+    assert len(files.load_json(folder / "cells.json")) == len(first) == 1
+    assert bool(list(folder.rglob("checkpoints"))) == (reached != "removed")
+
+    monkeypatch.setattr(PolicyRunner, "clear", clear)
+    again = invent(monkeypatch)
+    stage.run(small, tmp_path)
+    assert [*first, *again] == [*TUNED, *COMPARED]  # the cell counts as measured
+    assert not list(folder.rglob("checkpoints")) and not (folder / CLEARING).exists()
+
+
+def test_a_study_killed_before_its_cell_was_kept_removes_nothing(
+    small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(self: CellStore, key: str, found: Any) -> None:
+        raise Stop
+
+    invent(monkeypatch)
+    monkeypatch.setattr(CellStore, "keep", killed)
+    with pytest.raises(Stop):
+        stage.run(small, tmp_path)
+    folder = tmp_path / "small"
+    assert (folder / CLEARING).exists()
+    CellStore(PolicyStudy(small), folder, ignore).finish_clearing()
+    assert [str(path.parent.relative_to(folder)) for path in folder.rglob("checkpoints")] == [
+        TUNED[0]
+    ]
+
+
+def test_checkpoints_that_were_kept_on_request_stay_when_the_request_is_withdrawn(
+    tiny_folder: Path, small: StudyRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    invent(monkeypatch)
+    stage.run(study(tmp_path, tiny_folder, keep_runs=True), tmp_path)
+    stage.run(small, tmp_path)
+    assert len(list(tmp_path.rglob("checkpoints"))) == len([*TUNED, *COMPARED])
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "broken", '{"cell": 1, "run": "a"}', '{"cell": "a", "run": "../b"}']
+)
+def test_a_damaged_note_of_a_run_being_removed_is_refused(
+    content: str, small: StudyRecipe, tmp_path: Path
+) -> None:
+    (tmp_path / "small").mkdir()
+    (tmp_path / "small" / CLEARING).write_text(content)
+    with pytest.raises(AegisError, match=CLEARING):
+        stage.run(small, tmp_path)
 
 
 def changed(name: str, **keys: Any) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import resource
 import shutil
 from collections.abc import Callable, Iterator
@@ -542,3 +544,22 @@ def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
 def test_a_listener_that_fails_is_heard(start: Start, tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         start("naive", tmp_path, on_event=stop_at(2, ZeroDivisionError()))
+
+
+@pytest.mark.parametrize(
+    ("code", "cure"),
+    [
+        (errno.ENOSPC, "free space"),
+        (errno.EDQUOT, "free space"),
+        (errno.EROFS, "writable"),
+        (errno.EIO, "choose another output"),
+        (errno.ENAMETOOLONG, "choose another output"),
+    ],
+)
+def test_a_disk_that_refuses_is_told_with_a_cure_for_that(
+    code: int, cure: str, tmp_path: Path
+) -> None:
+    with pytest.raises(AegisError) as caught, checkpoint.writing(tmp_path):
+        raise OSError(code, os.strerror(code))
+    assert os.strerror(code) in caught.value.found and cure in caught.value.fix
+    assert ("free" in caught.value.fix) == (code in (errno.ENOSPC, errno.EDQUOT))

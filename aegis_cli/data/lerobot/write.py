@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import check_utf8, folder_aside, followed, put
+from aegis_cli.common.files import check_utf8, cure, folder_aside, followed, put
 from aegis_cli.common.media import Mp4Writer
 from aegis_cli.data.lerobot import layout, pictures, statistics, tables, version_3
 from aegis_cli.data.lerobot.statistics import Statistics
@@ -107,7 +107,7 @@ def write(
         raise AegisError(
             f"cannot write '{folder}': {error.strerror or error}",
             "a writable folder with free space",
-            "free some space, or choose another --out",
+            cure(folder.parent, error),
         ) from error
 
 

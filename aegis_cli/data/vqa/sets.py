@@ -186,15 +186,18 @@ class Listed:
     def state(self) -> dict[str, Any]:
         """What changes when a question or an image does.
 
-        It holds digests of the question files, and sizes and times of the image files.
+        It holds digests of the question files and of the image files. Their times would change
+        where somebody copies a folder, and everything would be trained anew.
         """
         images = {entry.picture.key: entry.picture.source for entry in self.entries}
-        stats = {}
+        digests: dict[str, str | None] = {}
         for key, source in images.items():
             if isinstance(source, Path):
-                found = source.stat()
-                stats[key] = found.st_size, found.st_mtime_ns
-        return {"question_files": self.sha256, "image_files": _digest(canonical(stats))}
+                try:
+                    digests[key] = sha256_file(source)
+                except AegisError:  # whoever looks at the image says so, or leaves it out
+                    digests[key] = None
+        return {"question_files": self.sha256, "image_files": _digest(canonical(digests))}
 
 
 class EasyVqa(Listed):

@@ -571,3 +571,19 @@ def test_a_word_that_the_model_does_not_know_is_refused() -> None:
     ):
         with pytest.raises(AegisError, match="zebra|mauve"):
             make_tiny().check_text(question, answer)
+
+
+def test_images_that_are_copied_without_their_times_are_the_same_and_changed_ones_are_not(
+    tmp_path: Path,
+) -> None:
+    path = write_jsonl(tmp_path, images=2)
+    before = sets.read(str(path)).state
+    image = tmp_path / "images" / "0.png"
+    for time_ns in (12345, 2**62):  # the clock may have been set back since
+        os.utime(image, ns=(time_ns, time_ns))
+        assert sets.read(str(path)).state == before
+    changed = bytearray(image.read_bytes())
+    changed[-1] ^= 1
+    image.write_bytes(changed)
+    os.utime(image, ns=(2**62, 2**62))
+    assert sets.read(str(path)).state != before  # though size and time are what they were
