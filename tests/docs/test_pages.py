@@ -10,7 +10,9 @@ import yaml
 from samples.command_blocks import ROOT
 
 from aegis_cli import recipes
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.sim.contract import TaskEnv
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("**/*.md"))
@@ -117,3 +119,17 @@ def test_what_can_be_chosen_has_a_row(page: str, names: tuple[str, ...]) -> None
 def test_every_method_has_a_section() -> None:
     found = re.findall(r"^## (.+)$", (ROOT / "docs" / "methods.md").read_text(), re.MULTILINE)
     assert [name for name in recipes.METHODS if name not in found] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "members"),
+    [
+        (Backbone, {*Backbone.__abstractmethods__, "depth", "width", "heads", "kv_heads"}),
+        (TaskEnv, {*TaskEnv.__annotations__, *(n for n in vars(TaskEnv) if n.islower())}),
+    ],
+)
+def test_contributors_are_told_all_that_a_new_one_needs(kind: type, members: set[str]) -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    own = {name for name in members if not name.startswith("_")}
+    assert len(own) >= 6, kind
+    assert [name for name in sorted(own) if f"`{name}`" not in text] == []
