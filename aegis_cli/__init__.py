@@ -1,6 +1,12 @@
 """Aegis: fine-tune a vision-language model into a robot policy without losing what it knew."""
 
+from typing import TYPE_CHECKING
+
 from aegis_cli.common.version import __version__
+
+if TYPE_CHECKING:
+    from aegis_cli.deploy import load_policy
+    from aegis_cli.guard import Guard
 
 __all__ = ["Guard", "__version__", "load_policy"]
 
@@ -16,3 +22,8 @@ def __getattr__(name: str) -> object:
 
         return load_policy
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """What there is, so that a notebook offers the two before they are loaded."""
+    return sorted({*globals(), *__all__})

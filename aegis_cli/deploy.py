@@ -274,8 +274,12 @@ class DeployedPolicy:
         """The picture of the camera of that number in the size that training showed."""
         side = self.image_size
         if side is not None:
-            return np.ascontiguousarray(fit(picture, side, side))
-        return np.ascontiguousarray(fit(picture, *self.sizes[camera]) if self.sizes else picture)
+            picture = fit(picture, side, side)
+        elif self.sizes:
+            picture = fit(picture, *self.sizes[camera])
+        # PyTorch takes no negative strides, and warns of what nobody may write to, such as the
+        # pixels of a file. Then it is copied.
+        return np.require(picture, requirements=["C_CONTIGUOUS", "WRITEABLE"])
 
 
 def _numbers(given: Positions) -> np.ndarray:

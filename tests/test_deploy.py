@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,37 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
     np.testing.assert_array_equal(found, expected.numpy())
     assert found.shape == (own.chunk, own.actions) and own.positions == len(positions)
     assert (own.task, own.cameras, own.replan) == ("reach", (), meta["replan"])
+
+
+@pytest.fixture(params=[torch.float64, torch.bfloat16], ids=str)
+def another_default(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A program whose new tensors are of another type, as one that simulates in float64."""
+    torch.set_default_dtype(request.param)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.usefixtures("another_default")
+def test_the_programs_default_type_changes_no_action(run_folder: Path, tmp_path: Path) -> None:
+    """Neither loading nor acting asks for it."""
+    export.run(run_folder, tmp_path / "lerobot")
+    found = []
+    for folder in (run_folder, tmp_path / "lerobot"):
+        own = load_policy(folder)
+        found.append(own.select_action(frame(), TEXT, [0.1] * own.positions))
+    torch.set_default_dtype(torch.float32)
+    own = load_policy(run_folder)
+    expected = own.select_action(frame(), TEXT, [0.1] * own.positions)
+    for action in found:
+        np.testing.assert_array_equal(action, expected)
+
+
+def test_a_picture_that_nobody_may_write_to_is_taken_as_it_is() -> None:
+    """So are those of PIL and of a file; a warning here would be an error."""
+    picture = frame()
+    expected = deployed().select_action(picture, TEXT, POSITIONS)
+    picture.flags.writeable = False
+    np.testing.assert_array_equal(deployed().select_action(picture, TEXT, POSITIONS), expected)
 
 
 def test_it_knows_the_names_of_its_numbers_and_its_rate(run_folder: Path, tmp_path: Path) -> None:

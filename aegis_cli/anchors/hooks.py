@@ -169,7 +169,8 @@ class LayerHooks:
                 "use_reentrant=True, or under no_grad",
                 "hidden states with their graph",
                 "use_reentrant=False; Hugging Face: "
-                'gradient_checkpointing_kwargs={"use_reentrant": False}',
+                'gradient_checkpointing_kwargs={"use_reentrant": False}; in the place of '
+                "torch.no_grad(), layer.requires_grad_(False) before the guard is made",
             )
         self._calls[index].append(first.flatten(1, -2))  # [B, ..., D] -> [B, T, D]
 

@@ -400,8 +400,9 @@ def _checked_shape(
             # A robot with fewer joints than the widest has shorter scales.
             mean = saved.tensors.get(f"tasks.{task}.{kind}.mean")
             length = size if mean is None else min(mean.numel(), size)
-            scale = {f"tasks.{task}.{kind}.{part}": torch.empty(length) for part in ("mean", "std")}
-            wanted |= scale
+            for part in ("mean", "std"):
+                name = f"tasks.{task}.{kind}.{part}"
+                wanted[name] = torch.empty(length, dtype=torch.float32)
     check_state(f"'{path}'", saved.tensors, wanted)
     return shape
 

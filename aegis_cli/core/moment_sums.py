@@ -150,13 +150,14 @@ class Sketch(MomentSum):
     def __init__(self, width: int, device: torch.device) -> None:
         self._width, self._device = width, device
         count = columns(width)
-        self._seen = torch.zeros(width, count, device=device)  # Y [d, l]
+        # Y [d, l], in float32 in a program of another default type too.
+        self._seen = torch.zeros(width, count, dtype=torch.float32, device=device)
         self._trace = torch.zeros((), dtype=torch.float64, device=device)
 
     @torch.no_grad()
     def add(self, rows: Tensor) -> None:
-        x = _widened(rows)
-        probe = _probe(self._width, columns(self._width), str(self._device)).to(x.dtype)
+        x = rows.to(self._seen.dtype)  # to round them costs far less than the sketch does
+        probe = _probe(self._width, columns(self._width), str(self._device))
         with torch.autocast(x.device.type, enabled=False):
             for block in x.split(_ROWS):
                 self._seen.addmm_(block.T, block @ probe)
@@ -187,7 +188,7 @@ class Sketch(MomentSum):
         values = (values[:resolved] - shift).cpu()
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
-        vectors = torch.empty(self._width, kept)
+        vectors = torch.empty(self._width, kept, dtype=torch.float32)
         parts = vectors.split(_WIDE_ROWS)
         for part, half in zip(parts, self._halves(root, count, shift), strict=True):
             part.copy_(half @ scaled[:, :kept])
@@ -235,7 +236,8 @@ class TraceOnly(MomentSum):
 
     def spectrum(self, count: int, energy: float) -> Spectrum:
         rest = self._trace.cpu() / count / self._width
-        return with_rest(rest.new_zeros(0), torch.zeros(self._width, 0), rest)
+        none = torch.zeros(self._width, 0, dtype=torch.float32)
+        return with_rest(rest.new_zeros(0), none, rest)
 
 
 def merged(sums: Sequence[MomentSum]) -> MomentSum:
@@ -268,5 +270,6 @@ def _probe(width: int, count: int, device: str) -> Tensor:
 
     So few of them in so many dimensions are nearly orthogonal, which is all the method asks.
     """
-    drawn = torch.randn(width, count, generator=torch.Generator().manual_seed(width))
+    generator = torch.Generator().manual_seed(width)
+    drawn = torch.randn(width, count, generator=generator, dtype=torch.float32)
     return drawn.mul_(width**-0.5).to(device)

@@ -106,7 +106,7 @@ class Guard(Removable):
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
         model, path = structure.part_of(model, part), Path(anchor)
-        dual = methods.get(method).dual
+        dual = methods.get(method).compares_layers
         self._owners = _owners(model, accumulation.resolved(process_group))
         if dual:
             accumulation.check_group(process_group)

@@ -273,7 +273,7 @@ class ProtectedAdamW(torch.optim.AdamW):
             # AdamW fills an empty state by itself, so nothing may be there before.
             if state := self.state.get(parameter):
                 for name, number in numbers.items():
-                    state.setdefault(name, torch.tensor(float(number)))
+                    state.setdefault(name, torch.tensor(float(number), dtype=torch.float32))
 
 
 def _kinds(

@@ -88,7 +88,7 @@ def start(
         plain = _names(model, header, path)
     sites: Mapping[str, str] = {}
     unprotected: tuple[str, ...] = ()
-    if not methods.get(method).dual:
+    if not methods.get(method).compares_layers:
         maps, dense = structure.find_maps(model, vision), method == "kfac"
         sites, unprotected = _protected(model, maps, chosen["protect"], "protect" in options, dense)
         unmeasured = header.meta.get("unmeasured", {})
@@ -119,7 +119,7 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
         AegisError: an option that the method does not have, or a value that is for training alone.
     """
     problems: list[Problem] = []
-    every = {} if methods.get(method).dual else {"every": 1}
+    every = {} if methods.get(method).compares_layers else {"every": 1}
     given = every | dict(options)
     protect = {}
     if method == "kfac":

@@ -29,8 +29,7 @@ class Setting:
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
         groups: every parameter that learns in exactly one group, `layers.{i}` for each language
-            layer; in a loop of somebody else's, which may let more of them learn later, every
-            parameter of the backbone.
+            layer; in a loop of somebody else's none for a method that compares no layers.
         sites: each map whose inputs an anchor can describe, or lone row that it has used -> its
             kind: maps, norms, embeddings or stem. What the user has frozen is none of them.
         options: the method's own part of the recipe.
@@ -163,8 +162,9 @@ class Parts:
     """A method at work in one run; what it leaves out costs nothing.
 
     Attributes:
-        penalty: pass -> what the anchor gradient is the gradient of, and W2^2 of each layer [L]; a
-            second backward is paid for it.
+        penalty: pass -> what the anchor gradient is the gradient of, a scalar with its graph, and
+            how far each layer is from the anchor, detached [L] (W2^2, where the anchor's moments
+            say so); a second backward pass is paid for it.
         combine: inner products of task and anchor gradient, per group -> their weights.
         refresh: steps that share one anchor gradient, taken at the first of them.
         fraction: share of the batch that the anchor gradient is taken on; below 1, from a graph of
@@ -202,6 +202,11 @@ class Parts:
     def reuses(self, step: int) -> bool:
         """Whether a step, from 0, takes the anchor gradient of one before it."""
         return step % self.refresh != 0
+
+    @property
+    def dual(self) -> bool:
+        """Whether a second backward pass is taken, so that a ledger has inner products."""
+        return self.penalty is not None
 
     @property
     def constrains(self) -> bool:
@@ -244,8 +249,8 @@ class Method:
     shards: bool = True
 
     @property
-    def dual(self) -> bool:
-        """Whether it takes a second backward pass, against the anchor's moments."""
+    def compares_layers(self) -> bool:
+        """Whether it compares the hidden states after each layer with the anchor's moments."""
         return "moments" in self.needs
 
     def trains_on_questions(self, options: Options) -> bool:

@@ -123,6 +123,7 @@ class ActionExpert(nn.Module):
     """
 
     def __init__(self, shape: ExpertShape) -> None:
+        """Draw the weights, in float32 whatever `torch.set_default_dtype` says."""
         super().__init__()
         self.shape, self.recomputes = shape, False
         width = shape.width
@@ -135,6 +136,7 @@ class ActionExpert(nn.Module):
         self.layers = nn.ModuleList(ExpertLayer(shape) for _ in range(shape.depth))
         self.final_norm = nn.LayerNorm(width)
         self.action_out = nn.Linear(width, shape.actions)
+        self.float()
 
     def compile_layers(self, backend: str = "inductor") -> None:
         """Compile the layers, which share what was compiled for the first of them."""
@@ -192,7 +194,7 @@ class ActionExpert(nn.Module):
 def _time_features(times: Tensor, width: int) -> Tensor:
     """Sines and cosines [B, K, width] of the flow time [B, K], at geometrically spaced periods."""
     low, high = _PERIODS
-    share = torch.linspace(0, 1, width // 2, device=times.device)
+    share = torch.linspace(0, 1, width // 2, dtype=times.dtype, device=times.device)
     period = low * (high / low) ** share  # [width / 2]
     angle = times[..., None] * (2 * math.pi / period)  # [B, K, width / 2]
     return torch.cat([angle.sin(), angle.cos()], dim=-1)

@@ -26,6 +26,11 @@ def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
     return (beta * 0.999 + 0.001).float()
 
 
+def draw_noise(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    """Standard normal noise, float32 on the CPU whatever a program's default type is."""
+    return torch.randn(shape, generator=generator, dtype=torch.float32)
+
+
 def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     """Noisy chunks x_t = t eps + (1 - t) a and their target velocity dx/dt = eps - a.
 
@@ -64,6 +69,6 @@ def integrate(
     x = noise
     # From noise to action the time falls, so that a step goes against the velocity.
     for i in range(steps):
-        t = torch.full((len(x),), 1 - i / steps, device=x.device)
+        t = torch.full((len(x),), 1 - i / steps, dtype=x.dtype, device=x.device)
         x = x - velocity(x, t) / steps
     return x

@@ -163,7 +163,8 @@ def fill(policy: Policy, tensors: Mapping[str, Tensor], source: str) -> None:
 def _unit(size: int) -> Normalizer:
     if size < 1:
         raise ValueError(f"a size of {size}")
-    return Normalizer(torch.zeros(size), torch.ones(size))
+    zeros = torch.zeros(size, dtype=torch.float32)
+    return Normalizer(zeros, torch.ones_like(zeros))
 
 
 # --- LeRobot's own files --------------------------------------------------------------------------

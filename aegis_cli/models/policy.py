@@ -111,7 +111,7 @@ class Policy(nn.Module):
         # whole batch, so that they are the same whatever the shares.
         rows = of.share.rows(of.frames)
         times = send(flow.draw_times(shape[:2], generator)[rows], device)
-        noise = send(torch.randn(shape, generator=generator)[rows], device)
+        noise = send(flow.draw_noise(shape, generator)[rows], device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
@@ -144,7 +144,7 @@ class Policy(nn.Module):
     def draw_noise(self, frames: int, generator: torch.Generator) -> Tensor:
         """The noise [frames, H, A] that the flow begins with, on the CPU."""
         size = len(self.action_scale.mean)
-        return torch.randn(frames, self.expert.shape.chunk, size, generator=generator)
+        return flow.draw_noise((frames, self.expert.shape.chunk, size), generator)
 
     @torch.no_grad()
     def act_from(

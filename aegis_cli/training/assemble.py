@@ -273,7 +273,7 @@ def build(
         parts,
         Stepper(backbone, parts, may_shard=owners.several),
         made,
-        _ledger(method, backbone),
+        _ledger(parts, backbone),
         ranks,
         plain,
         read.watched,
@@ -387,9 +387,9 @@ def _loaded(
     return load_demonstrations(recipe, backbone, demos, on_event) if found is None else found
 
 
-def _ledger(method: Method, backbone: Backbone) -> Ledger:
+def _ledger(parts: Parts, backbone: Backbone) -> Ledger:
     """A ledger of what learns and of all layers, or without columns for one backward pass."""
-    if not method.dual:
+    if not parts.dual:
         return Ledger([], [])
     return Ledger(list(backbone.learning_groups()), [f"layers.{i}" for i in range(backbone.depth)])
 

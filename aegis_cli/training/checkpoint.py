@@ -411,8 +411,9 @@ def _load_expert(
         relative_of(meta, shape.actions, shape.proprio)
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
-        wanted |= {f"proprio.{name}": torch.empty(shape.proprio) for name in ("mean", "std")}
-        wanted |= {f"action.{name}": torch.empty(shape.actions) for name in ("mean", "std")}
+        for kind, size in (("proprio", shape.proprio), ("action", shape.actions)):
+            for name in ("mean", "std"):
+                wanted[f"{kind}.{name}"] = torch.empty(size, dtype=torch.float32)
     check_state(f"'{file}'", tensors, wanted)
     expert = ActionExpert(shape)
     parts: dict[str, dict[str, torch.Tensor]] = {}

@@ -214,7 +214,7 @@ def _check_behind(
     # Steps in which the backbone stands still have no row.
     moving = moving_steps(settings.steps, settings.backbone_until)
     moved = min(done, moving)
-    wanted = list(range(1, moved + 1)) if run.method.dual else []
+    wanted = list(range(1, moved + 1)) if run.parts.dual else []
     columns = [list(run.ledger.groups), list(run.ledger.layers)]
     problem = ""
     if method != run.method.name:
@@ -678,7 +678,7 @@ def _report(run: TrainingRun) -> TrainReport:
         steps=run.recipe.train.steps,
         loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
-        energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.method.dual else None,
+        energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.parts.dual else None,
         step_s=times[len(times) // 2],
         cameras=list(run.demos.cameras),
         out=str(run.out),

@@ -149,6 +149,29 @@ def test_rows_of_zeros_have_no_direction() -> None:
     assert not found.values.any()
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16], ids=str)
+def test_a_programs_default_type_changes_no_sketch(dtype: torch.dtype) -> None:
+    """Somebody who loads models in bfloat16 may have made that the default."""
+    drawn = rows(500, WIDE, DECAYS["middling"])
+    wanted = summed(make(WIDE, CPU), drawn).spectrum(500, 1.0)
+    moment_sums._probe.cache_clear()
+    torch.set_default_dtype(dtype)
+    try:
+        found = summed(make(WIDE, CPU), drawn).spectrum(500, 1.0)
+    finally:
+        torch.set_default_dtype(torch.float32)
+        moment_sums._probe.cache_clear()
+    assert wanted.vectors is not None and found.vectors is not None
+    assert torch.equal(found.values, wanted.values) and torch.equal(found.vectors, wanted.vectors)
+
+
+def test_rows_in_float64_are_sketched_as_their_rounded_ones() -> None:
+    drawn = rows(500, WIDE, DECAYS["middling"])
+    wanted = summed(make(WIDE, CPU), drawn).spectrum(500, 1.0)
+    found = summed(make(WIDE, CPU), drawn.double()).spectrum(500, 1.0)
+    assert torch.equal(found.values, wanted.values)
+
+
 def test_the_widest_have_their_trace() -> None:
     width = moment_sums.SKETCHED + 1
     found = summed(make(width, CPU), 2 * torch.ones(3, width)).spectrum(3, 0.99)

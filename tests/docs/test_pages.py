@@ -9,6 +9,11 @@ import pytest
 import yaml
 from samples.command_blocks import ROOT
 
+from aegis_cli import recipes
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.families import FAMILIES
+from aegis_cli.sim.contract import TaskEnv
+
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted((ROOT / "docs").glob("**/*.md"))
 LINKING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
@@ -92,3 +97,39 @@ def test_every_page_is_in_the_navigation() -> None:
     site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     pages = [str(path.relative_to(ROOT / "docs")) for path in PAGES]
     assert len(pages) >= 18 and sorted(listed(site["nav"])) == pages
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("methods", recipes.METHODS),
+        ("tasks", recipes.TASKS),
+        ("streams", recipes.LEARNERS),
+        ("hugging-face", tuple(FAMILIES)),
+    ],
+)
+def test_what_can_be_chosen_has_a_row(page: str, names: tuple[str, ...]) -> None:
+    """Whoever adds one is told that its page is still without it."""
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    assert names
+    assert [name for name in names if f"`{name}`" not in rows] == []
+
+
+def test_every_method_has_a_section() -> None:
+    found = re.findall(r"^## (.+)$", (ROOT / "docs" / "methods.md").read_text(), re.MULTILINE)
+    assert [name for name in recipes.METHODS if name not in found] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "members"),
+    [
+        (Backbone, {*Backbone.__abstractmethods__, "depth", "width", "heads", "kv_heads"}),
+        (TaskEnv, {*TaskEnv.__annotations__, *(n for n in vars(TaskEnv) if n.islower())}),
+    ],
+)
+def test_contributors_are_told_all_that_a_new_one_needs(kind: type, members: set[str]) -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    own = {name for name in members if not name.startswith("_")}
+    assert len(own) >= 6, kind
+    assert [name for name in sorted(own) if f"`{name}`" not in text] == []

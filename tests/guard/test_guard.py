@@ -420,10 +420,11 @@ def test_layers_that_run_without_a_graph_are_refused(anchor: Path) -> None:
         torch.no_grad()(layer)(*inputs) if layer is upper else layer(*inputs)
     )
     with (
-        pytest.raises(AegisError, match="'text.layers.1' runs without a graph"),
+        pytest.raises(AegisError, match="'text.layers.1' runs without a graph") as caught,
         Guard(model, anchor, LAYERS).watch(None),
     ):
         task_loss(model, 0)
+    assert "layer.requires_grad_(False)" in caught.value.fix  # frozen layers are fine
 
 
 def through_reentrant(forward: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:

@@ -1,13 +1,18 @@
-"""What a new method takes: its file and its name, and nothing else in the package."""
+"""What a new method takes: its file, its name and its options, and nothing else in the package."""
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from pathlib import Path
 
 import pytest
 from samples import package_copy
+from samples.command_blocks import ROOT
 
 from aegis_cli import methods, recipes
+from aegis_cli.common import artifacts
+from aegis_cli.methods.base import Method, Parts, Pass, Setting
 
 HALF = '''
 """Plain fine-tuning with half the gradient in the backbone."""
@@ -28,25 +33,81 @@ def start(setting: Setting) -> Parts:
 
 METHOD = Method("half-gradient", "half the gradient", train_all, start=start)
 '''
+AWAY = '''
+"""Project the task gradient off that of the activations' squares, for which no anchor is read."""
+
+import torch
+
+from aegis_cli.core import projection
+from aegis_cli.methods.base import Method, Parts, Setting, train_all
+
+
+def start(setting: Setting) -> Parts:
+    def penalty(seen):
+        each = torch.stack([hidden.square().mean() for hidden in seen.hidden])
+        return each.mean(), each.detach()
+
+    return Parts(penalty=penalty, combine=projection.aegis)
+
+
+METHOD = Method("away", "a penalty of its own", train_all, start=start)
+'''
+PAGE = (ROOT / "docs" / "add-a-method.md").read_text(encoding="utf-8")
+OPTIONS = """
+@section
+class Leash:
+    \"\"\"Options of the method leash.\"\"\"
+
+    weight: float = key(NOT_NEGATIVE, 0.1, doc="Share of the gradient's norm that pulls.")
+"""
 RECIPE = """
 name: new
 backbone: {backbone}
 expert: {{width: 16}}
-train: {{method: half-gradient, steps: 2, batch_size: 2, warmup: 0}}
+train: {{method: {method}, steps: 2, batch_size: 2, warmup: 0}}
 """
 
 
-def test_a_file_and_a_name_train(tmp_path: Path, tiny_folder: Path, demos_file: Path) -> None:
-    package = package_copy.copied(tmp_path)
-    (package / "methods" / "half_gradient.py").write_text(HALF)
-    package_copy.declare(package, "METHODS", "half-gradient")
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(RECIPE.format(backbone=tiny_folder))
-    command = ["-m", "aegis_cli", "train", recipe, "--demos", demos_file, "--out", tmp_path / "run"]
+def trained(package: Path, method: str, backbone: Path, demos: Path, more: str = "") -> Path:
+    """The run of a copy of the package that knows the method."""
+    recipe, run = package.parent / "recipe.yaml", package.parent / "run"
+    recipe.write_text(RECIPE.format(method=method, backbone=backbone) + more)
+    command = ["-m", "aegis_cli", "train", recipe, "--demos", demos, "--out", run]
     done = package_copy.run(package, *command)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "half-gradient" in done.stdout
-    assert (tmp_path / "run" / "checkpoints" / "last" / "expert.safetensors").is_file()
+    assert method in done.stdout
+    return run
+
+
+def test_the_pages_method_trains(tmp_path: Path, tiny_folder: Path, demos_file: Path) -> None:
+    """A reader does what the page says, and no more than that."""
+    package = package_copy.copied(tmp_path)
+    source = re.search(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    assert source is not None
+    (package / "methods" / "leash.py").write_text(source[1], encoding="utf-8")
+    package_copy.declare(package, "METHODS", "leash")
+    package_copy.declare_options(package, OPTIONS, "Leash", "leash")
+    run = trained(package, "leash", tiny_folder, demos_file, "leash: {weight: 0.5}\n")
+    assert (run / "checkpoints" / "last" / "expert.safetensors").is_file()
+
+
+def test_a_penalty_needs_no_anchor(tmp_path: Path, tiny_folder: Path, demos_file: Path) -> None:
+    """Any penalty has a second backward pass, and so its inner products in the ledger."""
+    package = package_copy.copied(tmp_path)
+    (package / "methods" / "away.py").write_text(AWAY)
+    package_copy.declare(package, "METHODS", "away")
+    run = trained(package, "away", tiny_folder, demos_file)
+    kept = artifacts.load(run / "ledger.safetensors", "ledger").tensors
+    assert kept["step"].tolist() == [1, 2]
+    assert bool((kept["aa"] > 0).any()) and bool((kept["w2"] > 0).all())
+
+
+@pytest.mark.parametrize("described", [Method, Parts, Setting, Pass])
+def test_the_page_names_every_field(described: type) -> None:
+    """What a method may say or use, its author finds on one page."""
+    fields = [field.name for field in dataclasses.fields(described)]
+    assert fields
+    assert [name for name in fields if not re.search(rf"`{name}[`=]", PAGE)] == []
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
 
 def test_linear_maps_and_convolutions_learn() -> None:
     """A tied head is a table, and does not."""
-    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.dual
+    assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.compares_layers
     toy = Toy().requires_grad_(False)
     toy.stem = nn.Conv2d(2, 2, 2)
     kfac.METHOD.adapt(toy, {}, {})

@@ -120,7 +120,7 @@ def test_needs_and_ceiling_are_declared() -> None:
     asking = [m.name for m in RIVALS if m.trains_on_questions({"weight": 0.1})]
     assert asking == ["cotrain"]
     assert not cotrain.METHOD.trains_on_questions({"weight": 0.0})
-    assert not any(method.dual or method.stop_gradient for method in RIVALS)
+    assert not any(method.compares_layers or method.stop_gradient for method in RIVALS)
 
 
 @pytest.mark.parametrize(

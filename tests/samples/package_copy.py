@@ -31,6 +31,16 @@ def declare(package: Path, tuple_name: str, name: str) -> None:
     raise AssertionError(f"no tuple {tuple_name} in {package / 'recipes'}")
 
 
+def declare_options(package: Path, source: str, kind: str, name: str) -> None:
+    """Add a section of options to the copy's recipes of one policy, as a class and as its key."""
+    path = package / "recipes" / "policy.py"
+    text = path.read_text(encoding="utf-8")
+    recipe, last = "\n@section\nclass Recipe:", "\n    merge: Merge = Merge()"
+    assert recipe in text and last in text
+    text = text.replace(recipe, f"{source}\n{recipe}")
+    path.write_text(text.replace(last, f"\n    {name}: {kind} = {kind}(){last}"), encoding="utf-8")
+
+
 def run(package: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Python with these arguments, where `aegis_cli` is the copy."""
     return subprocess.run(

@@ -357,19 +357,23 @@ def test_action_is_a_displacement_in_image_axes(env: TaskEnv, action: tuple[floa
 
 def test_left_and_up_in_the_picture(env: TaskEnv) -> None:
     """The effector's dot is the only near-black spot."""
-    start(env, 0)
-    env.physics.data.qpos[:] = {"reach": (0.3, 1.5), "point": (-0.05, -0.05)}[env.spec.name]
-    env.physics.forward()
 
     def dot() -> np.ndarray:
         rows, columns = np.nonzero(env.observe().image.max(-1) < 20)
         return np.array([columns.mean(), rows.mean()])
 
-    before = dot()
-    for _ in range(2):
-        env.step(np.array([-1.0, 1.0]))
-    right, down = dot() - before
-    assert right < -2 and down < -2
+    seen = 0
+    for i in range(10):
+        start(env, i)
+        if np.linalg.norm(env.tip()) > 0.18:
+            continue  # a stretched arm or a wall would be in the way
+        before = dot()
+        for _ in range(2):
+            env.step(np.array([-1.0, 1.0]))
+        right, down = dot() - before
+        assert right < -2 and down < -2, i
+        seen += 1
+    assert seen >= 3
 
 
 def test_actions_are_clipped(any_env: TaskEnv) -> None:

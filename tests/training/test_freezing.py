@@ -104,7 +104,7 @@ def test_a_ledger_has_the_groups_that_learn_and_every_layer(
     frozen_run: tuple[str, Path],
 ) -> None:
     method, out = frozen_run
-    if not METHODS[method].dual:
+    if not METHODS[method].compares_layers:
         return
     kept = artifacts.load(out / "ledger.safetensors", "ledger")
     assert kept.header.meta["groups"] == ["layers.1", "embeddings", "final_norm"]

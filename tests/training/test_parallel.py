@@ -172,7 +172,7 @@ def test_processes_train_in_bf16_what_one_trains(
     assert here[0]["loss"] == pytest.approx(there[0]["loss"], rel=1e-5)
     for one, other in zip(here, there, strict=True):
         assert one["loss"] == pytest.approx(other["loss"], rel=2e-3)
-    if job.anchor is not None and METHODS[job.method].dual:
+    if job.anchor is not None and METHODS[job.method].compares_layers:
         rows, its = (artifacts.load(run / LEDGER, "ledger").tensors for run in (job.out, alone.out))
         for name in ("tt", "aa", "w2"):
             assert (rows[name].sum(1) > 0).all()

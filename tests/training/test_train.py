@@ -79,7 +79,7 @@ def test_a_graph_that_outlives_its_step_is_found() -> None:
 def test_every_figure_is_logged(finished: tuple[str, Path]) -> None:
     method, out = finished
     own = set() if method == "stop-gradient" else {"lr_backbone"}
-    own |= {"energy_shed", "conflict"} if METHODS[method].dual else set()
+    own |= {"energy_shed", "conflict"} if METHODS[method].compares_layers else set()
     lines = metrics(out)
     assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
     for line in lines:
@@ -94,7 +94,7 @@ def test_the_ledger_has_a_row_a_step(finished: tuple[str, Path]) -> None:
     method, out = finished
     ledger = artifacts.load(out / "ledger.safetensors", "ledger")
     groups, layers = ledger.header.meta["groups"], ledger.header.meta["layers"]
-    if not METHODS[method].dual:
+    if not METHODS[method].compares_layers:
         assert groups == layers == [] and len(ledger.tensors["step"]) == 0
         return
     assert groups == list(make_tiny().parameter_groups()) and layers == ["layers.0", "layers.1"]

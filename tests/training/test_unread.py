@@ -93,7 +93,7 @@ def test_steps_between_two_lines_read_no_number(
     assert not found and len(run.unread) == 5
     train.read(run, window)
     assert len(run.unread) == 0 and window.loss > 0
-    assert len(run.ledger) == (5 if METHODS[method].dual else 0)
+    assert len(run.ledger) == (5 if METHODS[method].compares_layers else 0)
 
 
 @pytest.mark.parametrize("refresh", [1, 2])

@@ -119,6 +119,7 @@ class EmbeddedVLM(Backbone):
     _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
+        """Draw the weights, in float32 whatever `torch.set_default_dtype` says."""
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
         self.depth, self.width = shape.depth, shape.width
@@ -137,6 +138,7 @@ class EmbeddedVLM(Backbone):
         for layer in self.layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
+        self.float()
 
     # --- forward -------------------------------------------------------------------------------
 
