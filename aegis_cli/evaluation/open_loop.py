@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, devices
+from aegis_cli.common import artifacts, commands, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data import demonstrations, joints, mixture, renaming
@@ -31,7 +31,7 @@ from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, inputs
 
 TRACED = 3  # episodes that a plot shows
 _BY_PART = ("dimensions", "horizon")  # of the report
@@ -229,12 +229,14 @@ class _Source:
 
     Attributes:
         name: what the checkpoint is called in an error.
+        places: where the run found its demonstrations, as far as it says so.
     """
 
     name: str
     checkpoint: Path
     recipe: recipes.Recipe | None
     digests: frozenset[str]
+    places: frozenset[Path] = frozenset()
 
     @classmethod
     def find(cls, run: Path) -> _Source:
@@ -251,7 +253,9 @@ class _Source:
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
-        return cls(name, chosen, recipe, mixture.digests(header.inputs))
+        kept = None if folder is None else inputs.of(folder)
+        places = frozenset(Path(place).resolve() for place in kept.demos) if kept else frozenset()
+        return cls(name, chosen, recipe, mixture.digests(header.inputs), places)
 
     def selection(self, meta: Mapping[str, Any], data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -301,6 +305,8 @@ class _Source:
         """
         count = demonstrations.count_episodes(data)
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
+            if asked is None and data.resolve() in self.places:
+                raise _has_changed(self.name, data, count)
             everything = OTHER if self.digests else UNKNOWN
             split = everything if asked is None else CHOSEN
             return _Chosen(split, _existing(asked, count, data), [])
@@ -321,6 +327,18 @@ class _Source:
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
         return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
+
+
+def _has_changed(run: str, data: Path, count: int) -> AegisError:
+    """The place is the training's, so most of its episodes may be those of the training."""
+    return AegisError(
+        f"'{data}' is not as it was when '{run}' learned from it: episodes were added, removed or "
+        f"changed, and now there are {count}",
+        "the demonstrations as they were, whose held-out episodes are known, or episodes of your "
+        "choice",
+        f"choose those that are new: {commands.aegis('evaluate', run, '--demos', data)} "
+        f"--episodes {count - 1}",
+    )
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
