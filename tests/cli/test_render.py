@@ -473,6 +473,12 @@ def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() 
     assert "nothing is measured" not in shown
 
 
+def test_a_run_that_has_gone_on_says_which_steps_were_measured() -> None:
+    shown = text_of(render.inspect(InspectReport("run", "x", {"measured_before": [200, 220]})))
+    assert "what is measured is of steps 200, 220, and not of the last checkpoint" in shown
+    assert "nothing is measured" not in shown and "measured before" not in shown
+
+
 def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:
     rows = LayerEnergy("layers.3", 0.1, 0.2, 0.5)
     frozen = tuple(f"layers.{i}" for i in (0, 1, 2, 4, 10, 11))
