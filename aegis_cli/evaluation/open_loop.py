@@ -19,6 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
@@ -280,10 +281,12 @@ class _Source:
         self, meta: Mapping[str, Any], data: Path, rename: Renaming
     ) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
-        if self.recipe is not None and self.recipe.demos.camera is not None:
-            return self.recipe.demos.camera
         own = layout.read_info(data).cameras
-        named, known = meta.get("cameras", ()), [renaming.feature(rename, name) for name in own]
+        known = [renaming.feature(rename, name) for name in own]
+        if self.recipe is not None and self.recipe.demos.camera is not None:
+            _check_cameras(self.recipe.demos.camera, known, data)
+            return self.recipe.demos.camera
+        named = meta.get("cameras", ())
         by_name = {layout.short(camera): camera for camera in known}
         found = tuple(by_name.get(layout.short(camera)) for camera in named)
         if found and None not in found:
@@ -327,6 +330,26 @@ class _Source:
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
         return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
+
+
+def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: Path) -> None:
+    """Raise AegisError unless the cameras of the training are among those of the data."""
+    named = (learned,) if isinstance(learned, str) else learned
+    # A recipe names a camera with or without LeRobot's prefix, and the policy has it with it.
+    of_name = {name: camera for camera in known for name in (camera, layout.short(camera))}
+    missing = [name for name in named if name not in of_name]
+    if not missing:
+        return
+    used = [of_name.get(name) for name in named]
+    others = [layout.short(camera) for camera in known if camera not in used]
+    fix = "give demonstrations with the cameras that the policy was trained on"
+    if others:
+        fix = f"say which camera is which, e.g. --rename {others[0]}={missing[0]}, or {fix}"
+    raise AegisError(
+        f"no camera {quoted(missing)} in '{data}', which has {', '.join(known) or 'none'}",
+        f"{', '.join(named)}, as the policy was trained",
+        fix,
+    )
 
 
 def _has_changed(run: str, data: Path, count: int) -> AegisError:

@@ -319,6 +319,26 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
     assert exported.relative_error == pytest.approx(found.relative_error)
 
 
+def test_data_whose_cameras_are_called_otherwise_wants_them_renamed(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """By the option of this command, which chooses no camera."""
+
+    def recorded_by(*cameras: str) -> Path:
+        made = lerobot.episodes(6, cameras=cameras)
+        known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+        return lerobot.save(tmp_path / "-".join(cameras), known)
+
+    seen = dataclasses.replace(recipe, demos=Demos(camera="side"))
+    train.run(seen, "naive", recorded_by("top", "side"), None, tmp_path / "run")
+    data = recorded_by("overhead", "hand")
+    said = refusal(tmp_path / "run", data)
+    assert "no camera 'side'" in said and "--rename overhead=side" in said
+    assert "--set" not in said and "--camera" not in said
+    found = open_loop.run(tmp_path / "run", data, rename=(("overhead", "side"),))
+    assert found.split == open_loop.OTHER
+
+
 def test_only_the_episodes_that_are_asked_for_have_to_be_there(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
