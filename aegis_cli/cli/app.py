@@ -645,9 +645,20 @@ def probe(
     ] = None,
     anchor: AnchorIn = None,
     questions: Annotated[
-        int, Option(help="Number of held-out questions; of files, at most.", callback=positive)
-    ] = 5000,
-    seed: Annotated[int, Option(help="Seed of the choice of questions.", callback=seed_number)] = 0,
+        int | None,
+        Option(
+            help="Number of held-out questions; of files, at most; default: a run's own "
+            "probe.questions, else 5000.",
+            callback=positive,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        Option(
+            help="Seed of the choice of questions; default: a run's own probe.seed, else 0.",
+            callback=seed_number,
+        ),
+    ] = None,
     ask: OwnAsk = None,
     skip_bad: SkipBad = False,
     predictions: Annotated[
@@ -687,7 +698,7 @@ def probe(
         stages.refuse_options(options, f"in '{target}'")
         stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
-    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
+    asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size, questions, seed)
     limit = "--max-drop"
     if max_drop is None and asks.max_drop is not None:
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
@@ -707,7 +718,7 @@ def probe(
         report = stages.PROBE.run(
             target,
             asks.vqa,
-            questions,
+            asks.questions,
             baseline,
             anchor,
             max_drop,
@@ -716,7 +727,7 @@ def probe(
             predictions=predictions,
             skip_bad=asks.skip_bad,
             ask=asks.ask,
-            seed=seed,
+            seed=asks.seed,
             keep=True,
             device=device,
             as_json=as_json,

@@ -78,10 +78,10 @@ def above_zero(param: typer.CallbackParam, value: float) -> float:
     return value
 
 
-def seed_number(param: typer.CallbackParam, value: int) -> int:
-    """A seed that NumPy takes."""
-    if not SEED.accepts(value):
-        raise _refused(param, f"{value}", f"a whole number {SEED.expected}", param.default)
+def seed_number(param: typer.CallbackParam, value: int | None) -> int | None:
+    """A seed that NumPy takes; None where the option was not given."""
+    if value is not None and not SEED.accepts(value):
+        raise _refused(param, f"{value}", f"a whole number {SEED.expected}", param.default or 0)
     return value
 
 

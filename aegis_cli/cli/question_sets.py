@@ -11,7 +11,13 @@ from aegis_cli.recipes import Probe
 
 
 def chosen(
-    model: str, vqa: str | None, ask: str | None, skip_bad: bool, batch_size: int | None
+    model: str,
+    vqa: str | None,
+    ask: str | None,
+    skip_bad: bool,
+    batch_size: int | None,
+    questions: int | None = None,
+    seed: int | None = None,
 ) -> Probe:
     """Which questions are asked, and how; a run's own recipe decides what is None here.
 
@@ -30,6 +36,8 @@ def chosen(
         ask=own.ask if ask is None else ask,
         skip_bad=skip_bad or (vqa is None and own.skip_bad),
         batch_size=own.batch_size if batch_size is None else batch_size,
+        questions=own.questions if questions is None else questions,
+        seed=own.seed if seed is None else seed,
     )
 
 

@@ -382,12 +382,14 @@ def _warn_of_other_sizes(
 ) -> None:
     """Warn of pictures that are shown in the size of the first set's."""
     first, *others = found
+    texts = list[str]()
     for path, other in zip(paths[1:], others, strict=True):
         for own, known in zip(other.frames, first.frames, strict=True):
             if own.shape[1:3] == known.shape[1:3]:
                 continue
-            text = (
+            texts.append(
                 f"the pictures in '{path}' are {own.shape[1]} x {own.shape[2]}, and those in "
                 f"'{paths[0]}' {known.shape[1]} x {known.shape[2]}: they are fitted into that size"
             )
-            on_event(Warned("train", text))
+    for text in dict.fromkeys(texts):  # several cameras may have the same sizes
+        on_event(Warned("train", text))

@@ -16,9 +16,10 @@ import numpy as np
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, devices, hub
+from aegis_cli.common import artifacts, commands, devices, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
@@ -31,7 +32,7 @@ from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
-from aegis_cli.training import checkpoint
+from aegis_cli.training import checkpoint, inputs
 
 TRACED = 3  # episodes that a plot shows
 _BY_PART = ("dimensions", "horizon")  # of the report
@@ -245,12 +246,14 @@ class _Source:
 
     Attributes:
         name: what the checkpoint is called in an error.
+        places: where the run found its demonstrations, as far as it says so.
     """
 
     name: str
     checkpoint: Path
     recipe: recipes.Recipe | None
     digests: frozenset[str]
+    places: frozenset[Path] = frozenset()
 
     @classmethod
     def find(cls, run: Path) -> _Source:
@@ -262,7 +265,9 @@ class _Source:
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
-        return cls(name, chosen, recipe, mixture.digests(header.inputs))
+        kept = None if folder is None else inputs.of(folder)
+        places = frozenset(Path(place).resolve() for place in kept.demos) if kept else frozenset()
+        return cls(name, chosen, recipe, mixture.digests(header.inputs), places)
 
     def selection(self, meta: Mapping[str, Any], data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -287,10 +292,12 @@ class _Source:
         self, meta: Mapping[str, Any], data: Path, rename: Renaming
     ) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
-        if self.recipe is not None and self.recipe.demos.camera is not None:
-            return self.recipe.demos.camera
         own = layout.read_info(data).cameras
-        named, known = meta.get("cameras", ()), [renaming.feature(rename, name) for name in own]
+        known = [renaming.feature(rename, name) for name in own]
+        if self.recipe is not None and self.recipe.demos.camera is not None:
+            _check_cameras(self.recipe.demos.camera, known, data)
+            return self.recipe.demos.camera
+        named = meta.get("cameras", ())
         by_name = {layout.short(camera): camera for camera in known}
         found = tuple(by_name.get(layout.short(camera)) for camera in named)
         if found and None not in found:
@@ -312,6 +319,8 @@ class _Source:
         """
         count = demonstrations.count_episodes(data)
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
+            if asked is None and data.resolve() in self.places:
+                raise _has_changed(self.name, data, count)
             everything = OTHER if self.digests else UNKNOWN
             split = everything if asked is None else CHOSEN
             return _Chosen(split, _existing(asked, count, data), [])
@@ -332,6 +341,38 @@ class _Source:
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
         return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
+
+
+def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: Path) -> None:
+    """Raise AegisError unless the cameras of the training are among those of the data."""
+    named = (learned,) if isinstance(learned, str) else learned
+    # A recipe names a camera with or without LeRobot's prefix, and the policy has it with it.
+    of_name = {name: camera for camera in known for name in (camera, layout.short(camera))}
+    missing = [name for name in named if name not in of_name]
+    if not missing:
+        return
+    used = [of_name.get(name) for name in named]
+    others = [layout.short(camera) for camera in known if camera not in used]
+    fix = "give demonstrations with the cameras that the policy was trained on"
+    if others:
+        fix = f"say which camera is which, e.g. --rename {others[0]}={missing[0]}, or {fix}"
+    raise AegisError(
+        f"no camera {quoted(missing)} in '{data}', which has {', '.join(known) or 'none'}",
+        f"{', '.join(named)}, as the policy was trained",
+        fix,
+    )
+
+
+def _has_changed(run: str, data: Path, count: int) -> AegisError:
+    """The place is the training's, so most of its episodes may be those of the training."""
+    return AegisError(
+        f"'{data}' is not as it was when '{run}' learned from it: episodes were added, removed or "
+        f"changed, and now there are {count}",
+        "the demonstrations as they were, whose held-out episodes are known, or episodes of your "
+        "choice",
+        f"choose those that are new: {commands.aegis('evaluate', run, '--demos', data)} "
+        f"--episodes {count - 1}",
+    )
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:

@@ -287,23 +287,37 @@ def _read(
     run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
 ) -> list[tuple[Path, Result]]:
     """What was measured of a run's last checkpoint, each with its file."""
+    last = _last_step(run)
+    # A run that was trained further has forgotten what was measured of it before. Earlier versions
+    # wrote no step for a run.
+    return [
+        (path, found) for path, found, step in _each(run, kind, figures) if step in (None, last)
+    ]
+
+
+def steps_measured_before(run: Path) -> list[int]:
+    """The steps of a run that something was measured at, but for its last checkpoint's."""
+    kinds = (("probe", ProbeFigures), ("rollout", RolloutFigures), (OPEN_LOOP, OpenLoopFigures))
+    steps = {step for kind, figures in kinds for *_, step in _each(run, kind, figures)}
+    return sorted(step for step in steps - {None, _last_step(run)} if step is not None)
+
+
+def _each(
+    run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
+) -> Iterator[tuple[Path, Result, int | None]]:
+    """What was measured of a run's checkpoints: the file, what it says, and of which step."""
     by_recipe, own = [], folder.measured_in(run)
     listed = [] if own is None else [own.glob(f"{kind}.json"), own.glob(f"{kind}-*.json")]
     for path in [path for found in listed for path in sorted(found)]:
         # What a study measures on validation data chooses its knobs, and is no result.
         if not re.match(rf"{kind}-validation(-|$)", path.stem):
             by_recipe.append(path)
-    found, last = [], _last_step(run)
     # A probe that tells less than another of the same questions comes after it.
     apart = sorted((run / FOLDER).glob(f"{kind}-*.json"), key=lambda path: path.stem)
     for path in [*by_recipe, *apart]:
         raw = kept_figures.read(path, figures)
         settings, step = raw.pop("settings", None) or {}, raw.pop("step", None)
-        # A run that was trained further has forgotten what was measured of it before. Earlier
-        # versions wrote no step for a run.
-        if step is None or step == last:
-            found.append((path, Result(path.stem, raw, settings)))
-    return found
+        yield path, Result(path.stem, raw, settings), step
 
 
 def evaluated_on(figures: Mapping[str, Any]) -> str:

@@ -137,6 +137,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     if at is not None:
         return InspectReport("checkpoint", str(at), facts, **losses, **energies)
     probed = tuple(_without_pictures(found) for found in results.probes(path))
+    if before := results.steps_measured_before(path):
+        facts["measured_before"] = before
     return InspectReport(
         "run",
         str(path),

@@ -161,7 +161,12 @@ def _use(
 def _probe_command(repo: str, recipe: Recipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
-    words = map(without_folders, (recipe.backbone, *probe.asking))
+    words = [*map(without_folders, (recipe.backbone, *probe.asking))]
+    usual = recipes.Probe()
+    if probe.questions != usual.questions:
+        words += ["--questions", str(probe.questions)]
+    if probe.seed != usual.seed:
+        words += ["--seed", str(probe.seed)]
     return shlex.join(["aegis", "probe", repo, "--baseline", *words])
 
 

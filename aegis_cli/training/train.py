@@ -9,13 +9,23 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods, recipes
-from aegis_cli.common import artifacts, devices, files, interrupts, locks, machine, prefetch
+from aegis_cli.common import (
+    artifacts,
+    commands,
+    devices,
+    files,
+    interrupts,
+    locks,
+    machine,
+    prefetch,
+)
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.headers import rewrite
@@ -116,7 +126,7 @@ def run(
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
-            restored = _restore(training)
+            restored = _restore(training, places)
             if restored[0] >= recipe.train.steps:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             if ranks.first:
@@ -144,7 +154,7 @@ def _says_otherwise(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
     return dataclasses.replace(kept, demos=demos) != recipe or inputs.of(out) not in (None, places)
 
 
-def _restore(run: TrainingRun) -> tuple[int, Window]:
+def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
     """State, ledger and metrics as they were after the last checkpoint.
 
     Returns:
@@ -154,11 +164,7 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     with _reading_state(run.out):
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
-        raise AegisError(
-            f"{mixture.differing(saved.inputs, run.inputs)} than the run in '{run.out}' began with",
-            "the same inputs",
-            "give the files the run began with, or start anew in another --out",
-        )
+        raise _other_inputs(run, saved.inputs, places)
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, *_LOGGED)
     with _reading_state(run.out):
@@ -176,6 +182,35 @@ def _restore(run: TrainingRun) -> tuple[int, Window]:
     if run.ranks.first:
         folder.truncate_metrics(run.out, done)
     return done, window
+
+
+def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inputs) -> AegisError:
+    """Why a run cannot go on: other cameras, demonstrations that have changed, or other files."""
+    begun, out = recipes.load(run.out / "recipe.yaml", kind=Recipe), run.out
+    if mixture.digests(there) != mixture.digests(run.inputs):
+        if begun.demos.camera != run.recipe.demos.camera:
+            seen = [{"demos.camera": each.demos.camera} for each in (begun, run.recipe)]
+            return AegisError(
+                f"the run in '{out}' was started with other settings: {folder.differences(*seen)}",
+                "the cameras that it began with",
+                f"go on with its own: {commands.aegis('train', out)}, or start anew in another "
+                "--out",
+            )
+        kept = inputs.of(out)
+        if kept is not None and kept.demos == places.demos:
+            learned = f"--set {quote(f'backbone={out}')} --set {quote(f'expert.start={out}')}"
+            return AegisError(
+                f"the demonstrations in {', '.join(map(repr, places.demos))} have changed since "
+                f"the run in '{out}' began",
+                "the same episodes, with the same frames and numbers",
+                "bring them back as they were, or begin another run with what this one has "
+                f"learned: {learned}, in another --out",
+            )
+    return AegisError(
+        f"{mixture.differing(there, run.inputs)} than the run in '{out}' began with",
+        "the same inputs",
+        "give the files the run began with, or start anew in another --out",
+    )
 
 
 @contextmanager

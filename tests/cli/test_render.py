@@ -235,6 +235,28 @@ def test_large_numbers_are_whole_as_long_as_they_can_be_read(value, text):
     assert number(value) == text
 
 
+def job(rows: list[SimpleNamespace]) -> SimpleNamespace:
+    return SimpleNamespace(
+        name="n",
+        rows=rows,
+        baseline_accuracy=0.95,
+        majority_accuracy=0.3,
+        verdict="",
+        merge=None,
+        out="runs/n",
+    )
+
+
+def test_the_summary_of_methods_that_cannot_be_rolled_out_has_no_column_of_dashes():
+    unknown = ("success_seen", "success_held_out", "wrong_target", "return_share", "energy_shed")
+    row = dict.fromkeys((*unknown, "step_time_ratio")) | {"others": {}, "accuracy": 0.9}
+    row |= {"drop_points": 1.0, "cross_entropy": 0.2, "w2": 0.1, "validation_loss": 0.4}
+    text = text_of(pipeline(job([SimpleNamespace(method="naive", **row)])))
+    header = "Method VQA % Drop (points) Cross-entropy (nats) W2² Validation loss".split()
+    assert header in [line.split() for line in text.splitlines()]
+    assert "nothing was rolled out" in text and "aegis evaluate" in text
+
+
 def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
     row = dict(
         accuracy=0.932,
@@ -250,20 +272,12 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         validation_loss=0.4,
         others={},
     )
-    rows = [SimpleNamespace(method=m, **row) for m in ("naive", "aegis")]
-    text = text_of(
-        pipeline(
-            SimpleNamespace(
-                name="n",
-                rows=rows,
-                baseline_accuracy=0.95,
-                majority_accuracy=0.3,
-                verdict="",
-                merge=None,
-                out="runs/n",
-            )
-        )
-    )
+    held_out = {"naive": 0.5, "aegis": None}
+    rows = [
+        SimpleNamespace(**row | {"method": m, "success_held_out": x}) for m, x in held_out.items()
+    ]
+    text = text_of(pipeline(job(rows)))
+    assert "nothing was rolled out" not in text
     cells = [line.split() for line in text.splitlines()]
     assert [
         "aegis",
@@ -471,6 +485,20 @@ def test_what_a_run_knows_of_open_loop_errors_says_which_episodes_they_are_of() 
     shown = text_of(render.inspect(InspectReport("run", "x", {}, open_loops=(evaluated,))))
     assert re.search(r"2 held-out episodes of arm +0\.250 +- +- +1,000", shown)
     assert "nothing is measured" not in shown
+
+
+def test_a_long_instruction_is_cut_in_the_table_and_whole_in_json() -> None:
+    long = InstructionError("put the cube " * 99, 2, 30, 1.0, (0.5, 1.5), 0.25)
+    report = open_loop_report(instructions=[long, *instruction_errors(1)])
+    shown = text_of(render.open_loop(report))
+    assert "put the cube put" in shown and "…" in shown and shown.count("put the cube") < 9
+    assert report.to_json()["instructions"][0]["instruction"] == long.instruction
+
+
+def test_a_run_that_has_gone_on_says_which_steps_were_measured() -> None:
+    shown = text_of(render.inspect(InspectReport("run", "x", {"measured_before": [200, 220]})))
+    assert "what is measured is of steps 200, 220, and not of the last checkpoint" in shown
+    assert "nothing is measured" not in shown and "measured before" not in shown
 
 
 def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:

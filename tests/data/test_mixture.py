@@ -113,12 +113,13 @@ def test_a_file_and_a_folder_go_together(demos_file: Path, tmp_path: Path) -> No
 
 
 def test_pictures_of_another_size_are_fitted_into_the_first_sets(tmp_path: Path) -> None:
-    small = save(tmp_path / "small", episodes(3))
-    large = save(tmp_path / "large", episodes(3, size=(32, 40), seed=1))
+    cameras = ("top", "side")  # which have the same sizes, so one warning tells all
+    small = save(tmp_path / "small", episodes(3, cameras))
+    large = save(tmp_path / "large", episodes(3, cameras, size=(32, 40), seed=1))
     said = list[Event]()
-    both = mixture.load((small, large), 0.3, 0, on_event=said.append)
+    both = mixture.load((small, large), 0.3, 0, Selection(cameras), on_event=said.append)
     assert both.frames[0].shape[1:] == (16, 24, 3)
-    fitted = demonstrations.load(large, 0.3, 0).fitted([(16, 24)])
+    fitted = demonstrations.load(large, 0.3, 0, Selection("top")).fitted([(16, 24)])
     frames = torch.arange(len(fitted.episode_of))
     begins = len(both.episode_of) - len(frames)
     assert torch.equal(both.frames[0][frames + begins], fitted.frames[0][frames])

@@ -249,6 +249,24 @@ def test_of_other_data_all_episodes_are_taken(naive_run: Path, tmp_path: Path) -
     assert found.relative_interval is None  # one episode says nothing of others
 
 
+def test_of_the_runs_own_data_that_has_grown_the_new_episodes_have_to_be_chosen(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """Most of all its episodes were trained on, and would flatter the policy."""
+    made = [dataclasses.replace(e, instruction=lerobot.TEXTS[0]) for e in lerobot.episodes(8)]
+    data = lerobot.save(tmp_path / "arm", made[:6])
+    train.run(recipe, "naive", data, None, tmp_path / "run")
+    shutil.rmtree(data)
+    lerobot.save(data, made)
+    for run in (tmp_path / "run", checkpoint.last(tmp_path / "run")):
+        said = refusal(run, data)
+        assert "is not as it was" in said and "now there are 8" in said and "--episodes 7" in said
+    found = open_loop.run(tmp_path / "run", data, episodes=[6, 7])
+    assert (found.split, found.episodes) == (open_loop.CHOSEN, [6, 7])
+    elsewhere = shutil.copytree(data, tmp_path / "copy")
+    assert open_loop.run(tmp_path / "run", elsewhere).split == open_loop.OTHER
+
+
 def test_the_frames_are_spread_and_at_most_as_many_as_asked(
     naive_run: Path, demos_file: Path
 ) -> None:
@@ -299,6 +317,26 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
     exported = open_loop.run(tmp_path / "policy", data, episodes=found.episodes)
     assert exported.split == open_loop.CHOSEN
     assert exported.relative_error == pytest.approx(found.relative_error)
+
+
+def test_data_whose_cameras_are_called_otherwise_wants_them_renamed(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """By the option of this command, which chooses no camera."""
+
+    def recorded_by(*cameras: str) -> Path:
+        made = lerobot.episodes(6, cameras=cameras)
+        known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
+        return lerobot.save(tmp_path / "-".join(cameras), known)
+
+    seen = dataclasses.replace(recipe, demos=Demos(camera="side"))
+    train.run(seen, "naive", recorded_by("top", "side"), None, tmp_path / "run")
+    data = recorded_by("overhead", "hand")
+    said = refusal(tmp_path / "run", data)
+    assert "no camera 'side'" in said and "--rename overhead=side" in said
+    assert "--set" not in said and "--camera" not in said
+    found = open_loop.run(tmp_path / "run", data, rename=(("overhead", "side"),))
+    assert found.split == open_loop.OTHER
 
 
 def test_only_the_episodes_that_are_asked_for_have_to_be_there(

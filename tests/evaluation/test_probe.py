@@ -484,6 +484,25 @@ def test_a_run_is_held_to_the_gate_of_its_recipe_on_the_questions_that_it_names(
     assert code == 0 and json.loads(text)["passed"] is None
 
 
+def test_a_run_is_asked_as_many_questions_as_its_recipe_says_and_the_same_ones(
+    aegis, taught: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = recipe(taught)
+    settings = replace(settings, probe=replace(settings.probe, questions=9, seed=7))
+    run, out = tmp_path / "run", tmp_path / "said.jsonl"
+    train.run(settings, "naive", demos_file, None, run)
+
+    def asked(model: Path, *options: object) -> list[str]:
+        code, _, err = aegis("probe", model, "--predictions", out, *options)
+        assert code == 0, err
+        return [json.loads(line)["question"] for line in out.read_text().splitlines()]
+
+    own = asked(run)
+    assert own == asked(taught, "--questions", 9, "--seed", 7) and len(own) == 9
+    assert asked(run, "--seed", 0) == asked(taught, "--questions", 9) != own
+    assert len(asked(run, "--questions", 5)) == 5
+
+
 def test_predictions_do_not_replace_a_runs_own_files(
     aegis, taught: Path, demos_file: Path, tmp_path: Path
 ) -> None:

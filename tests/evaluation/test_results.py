@@ -141,6 +141,7 @@ def test_a_run_that_was_trained_further_has_not_what_was_measured_before(run: Pa
     link.unlink()
     link.symlink_to(checkpoint_at(run, 9).name)
     assert (len(results.probes(run)), len(results.rollouts(run))) == (before[0] - 1, before[1] - 1)
+    assert results.steps_measured_before(run) == [6]
     results.keep(run, "probe-scenes", probe("shape"), {})
     assert len(results.probes(run)) == before[0]
 

@@ -297,14 +297,15 @@ def test_a_card_says_what_a_policy_of_its_kind_can_be_used_for(
     for form in (card.AEGIS, card.LEROBOT):
         said = card._use(form, "somebody/x", recipe, task)
         assert line in said and ("aegis rollout" in said) == (task is not None)
-        assert "--vqa scenes\n" in said
+        assert re.search("--vqa scenes( --questions [0-9]+)?\n", said)
 
 
 def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
     recipe = recipes.load(run_folder / "recipe.yaml")
     ask = "{} Answer 'yes' or \"no\", in $1 word."
     asked = dataclasses.replace(
-        recipe, probe=dataclasses.replace(recipe.probe, ask=ask, skip_bad=True)
+        recipe,
+        probe=dataclasses.replace(recipe.probe, ask=ask, skip_bad=True, questions=70, seed=3),
     )
     for form in FORMS:
         assert "--ask" not in card._use(form, "somebody/x", recipe, "reach")
@@ -314,7 +315,7 @@ def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
         words = shlex.split(line)
         assert words[words.index("--ask") + 1] == ask
         assert words[words.index("--vqa") + 1] == "scenes"
-        assert words[-1] == "--skip-bad"
+        assert words[-5:] == ["--skip-bad", "--questions", "70", "--seed", "3"]
 
 
 @pytest.mark.parametrize(

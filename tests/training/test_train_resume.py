@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 from samples import artifacts as artifact_samples
+from samples import lerobot
 from samples.tiny import make_tiny
 from samples.training_runs import (
     SETTINGS,
@@ -68,6 +69,34 @@ def test_resuming_a_finished_run_changes_nothing(start: Start, tmp_path: Path) -
     before = contents(tmp_path)
     assert start("aegis", tmp_path, resume=True) == first
     assert contents(tmp_path) == before
+
+
+def test_a_run_on_demonstrations_that_have_grown_says_so_and_how_another_begins_with_its_policy(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    """More episodes in the same folder are other demonstrations, though their place is the same."""
+    made = [replace(e, instruction=lerobot.TEXTS[0]) for e in lerobot.episodes(8)]
+    data, run = lerobot.save(tmp_path / "arm", made[:6]), tmp_path / "run"
+    train.run(recipe, "naive", data, None, run)
+    shutil.rmtree(data)
+    lerobot.save(data, made)
+    with pytest.raises(AegisError) as caught:
+        train.run(recipe, "naive", data, None, run, resume=True)
+    assert "arm' have changed since the run" in caught.value.found
+    assert f"--set backbone={run} --set expert.start={run}" in caught.value.fix
+    begun = replace(recipe, backbone=str(run), expert=replace(recipe.expert, start=str(run)))
+    train.run(begun, "naive", data, None, tmp_path / "next")
+
+
+def test_a_run_that_is_given_another_camera_says_which_it_began_with(
+    recipe: Recipe, frame_cache: Path, tmp_path: Path
+) -> None:
+    made = lerobot.episodes(6, cameras=("top", "side"))
+    data = lerobot.save(tmp_path / "arm", [replace(e, instruction=lerobot.TEXTS[0]) for e in made])
+    top, side = (replace(recipe, demos=replace(recipe.demos, camera=c)) for c in ("top", "side"))
+    train.run(top, "naive", data, None, tmp_path / "run")
+    with pytest.raises(AegisError, match="demos.camera: top there, side here"):
+        train.run(side, "naive", data, None, tmp_path / "run", resume=True)
 
 
 def test_resume_without_a_run_begins_one(naive_run: Path, start: Start, tmp_path: Path) -> None:

@@ -62,7 +62,8 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
 def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts with one line on a run's steps, of how many where some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
-    left = {name: value for name, value in facts.items() if name != "planned_steps"}
+    apart = ("planned_steps", "measured_before")
+    left = {name: value for name, value in facts.items() if name not in apart}
     if merged := facts.get("merge"):
         # A merge whose sweep measured no validation loss has none.
         told = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
@@ -91,6 +92,10 @@ def _measured(report: Any) -> list[RenderableType]:
         return [Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")]
     if not parts:
         does = "aegis probe, aegis rollout and aegis evaluate do that"
+        if before := report.facts.get("measured_before"):
+            steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
+            of = f"what is measured is of {steps}, and not of the last checkpoint"
+            return [Text(f"{of}: measure again ({does})\n")]
         return [Text(f"nothing is measured yet: {does}")]
     verdict = {True: "passed", False: "failed", None: "none: no drop was held to a limit"}
     return [*parts, Text(f"gate: {verdict[report.gate]}\n")]

@@ -18,6 +18,7 @@ from aegis_cli.cli.render.tables import pairs
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
 _TITLE_CHARACTERS = 44  # of a line of the title, for each episode beside another
 _ROWS = 8  # of the table by steps ahead
+_WIDEST = 100  # characters of an instruction
 _INSTRUCTIONS = 10  # rows of the table by instruction
 _SPLITS = {
     "validation": "the run's validation episodes",
@@ -99,11 +100,17 @@ def _by_instruction(report: Any) -> Iterator[RenderableType]:
         if one.relative_interval is not None:
             ends = " to ".join(fixed(end, 3) for end in one.relative_interval)
         error = fixed(one.relative_error, 3)
-        line = (one.instruction or "(none)", f"{one.episodes:,}", f"{one.frames:,}", error, ends)
+        line = (_short(one.instruction), f"{one.episodes:,}", f"{one.frames:,}", error, ends)
         lines.append(line if report.hold_error is None else (*line, fixed(one.hold_error, 3)))
     yield plain_table(header, lines)
     if len(every) > _INSTRUCTIONS:
         yield Text(f"the worst {_INSTRUCTIONS} of {len(every):,} instructions; --json has all")
+
+
+def _short(instruction: str) -> str:
+    """An instruction as a table shows it; a long one would push the errors out of sight."""
+    said = " ".join(instruction.split())
+    return (said if len(said) <= _WIDEST else f"{said[: _WIDEST - 1]}…") or "(none)"
 
 
 def open_loop_plot(report: Any, path: Path) -> None:

@@ -24,6 +24,10 @@ from aegis_cli.cli.render.layout import (
 )
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
+_OPEN_LOOP_INSTEAD = (
+    "nothing was rolled out, for the demonstrations are of no simulated task: aegis evaluate "
+    "measures each run's error on held-out episodes, and aegis compare puts them side by side"
+)
 _INSTRUCTIONS = 10  # lines of a rollout's table by instruction
 _SHARES = {
     "accuracy",
@@ -166,7 +170,10 @@ def pipeline(report: Any) -> RenderableType:
         ("step_time_ratio", partial(fixed, digits=2), False),
         ("validation_loss", partial(fixed, digits=4), False),
     ]
-    drawn = [_marked_column(report.rows, *column) for column in columns]
+    # What no method has, such as a success where nothing can be rolled out, is left out.
+    there = [any(getattr(row, field) is not None for row in report.rows) for field, *_ in columns]
+    drawn = [_marked_column(report.rows, *column) for column in itertools.compress(columns, there)]
+    header = (header[0], *itertools.compress(header[1:], there))
     named = [r.method if report.merge is None else f"{r.method}, merged" for r in report.rows]
     rows = zip(named, *drawn, strict=True)
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
@@ -179,8 +186,14 @@ def pipeline(report: Any) -> RenderableType:
         *([Text(MARKS)] if len(report.rows) > 1 else []),
         *([Text(report.verdict)] if report.verdict else []),
         *([] if report.merge is None else [Text(_merged(report.merge))]),
+        *([] if _acted(report.rows, acts) else [Text(_OPEN_LOOP_INSTEAD)]),
         Text(f"files: {report.out}"),
     )
+
+
+def _acted(rows: Sequence[Any], acts: Mapping[str, str]) -> bool:
+    """Whether any policy was rolled out."""
+    return any(getattr(row, field) is not None for row in rows for field in acts.values())
 
 
 def _merged(merge: Mapping[str, Any]) -> str:
