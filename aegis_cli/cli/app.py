@@ -394,7 +394,9 @@ def train(
         raise AegisError("no --out", "a folder for the run", fix)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
-    as_they_are = [] if device is None else ["--device", device]
+    source = ctx.get_parameter_source("device")  # a class of typer's own click, or of click
+    given_here = source is not None and source.name == "COMMANDLINE"
+    as_they_are = ["--device", str(device)] if given_here else []
     as_they_are += ["--json"] if as_json else []
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
