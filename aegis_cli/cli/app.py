@@ -475,7 +475,11 @@ def merge(
         Option(help="How far back; 0 changes nothing.", callback=not_negative),
     ] = None,
     out: Annotated[
-        Path | None, Option(metavar="FOLDER", help="New folder, shaped as the merged one.")
+        Path | None,
+        Option(
+            metavar="FOLDER",
+            help="New folder for the merged run or model; needed with --strength or --max-drop.",
+        ),
     ] = None,
     sweep: Annotated[
         str | None,
@@ -526,7 +530,7 @@ def merge(
         ),
     ] = 1.0,
     frames: Annotated[
-        int, Option(help="Robot frames to measure on; at most.", callback=positive)
+        int, Option(help="Robot frames to measure on, at most.", callback=positive)
     ] = 1000,
     questions: Annotated[
         int, Option(help="Validation questions of a sweep; of files, at most.", callback=positive)
