@@ -363,6 +363,8 @@ def test_verifying_reads_every_artifact_of_a_run(aegis, tmp_path: Path) -> None:
     code, out, err = aegis("inspect", run, "--verify", "--json")
     assert code == 0 and "2 files agree with their digests" in err
     assert json.loads(out)["kind"] == "run"
+    code, _, err = aegis("inspect", run / "ledger.safetensors", "--verify")
+    assert code == 0 and "1 file agrees with its digest" in err
     data = bytearray((run / "ledger.safetensors").read_bytes())
     data[-1] ^= 0x40
     (run / "ledger.safetensors").write_bytes(data)

@@ -394,7 +394,9 @@ def train(
         raise AegisError("no --out", "a folder for the run", fix)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
-    as_they_are = [] if device is None else ["--device", device]
+    source = ctx.get_parameter_source("device")  # a class of typer's own click, or of click
+    given_here = source is not None and source.name == "COMMANDLINE"
+    as_they_are = ["--device", str(device)] if given_here else []
     as_they_are += ["--json"] if as_json else []
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
@@ -473,7 +475,11 @@ def merge(
         Option(help="How far back; 0 changes nothing.", callback=not_negative),
     ] = None,
     out: Annotated[
-        Path | None, Option(metavar="FOLDER", help="New folder, shaped as the merged one.")
+        Path | None,
+        Option(
+            metavar="FOLDER",
+            help="New folder for the merged run or model; needed with --strength or --max-drop.",
+        ),
     ] = None,
     sweep: Annotated[
         str | None,
@@ -524,7 +530,7 @@ def merge(
         ),
     ] = 1.0,
     frames: Annotated[
-        int, Option(help="Robot frames to measure on; at most.", callback=positive)
+        int, Option(help="Robot frames to measure on, at most.", callback=positive)
     ] = 1000,
     questions: Annotated[
         int, Option(help="Validation questions of a sweep; of files, at most.", callback=positive)

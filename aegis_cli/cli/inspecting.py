@@ -73,7 +73,11 @@ def verify(path: Path) -> VerifiedReport:
 
     found = inspection.verify(path)
     bare = [str(file) for file, has_digest in found.items() if not has_digest]
-    render.note(f"{len(found) - len(bare)} files agree with their digests")
+    agreeing = len(found) - len(bare)
+    one = agreeing == 1
+    render.note(
+        f"{agreeing} {'file agrees with its digest' if one else 'files agree with their digests'}"
+    )
     if bare:
         listed = ", ".join(bare[:_LISTED]) + (" ..." if len(bare) > _LISTED else "")
         render.note(f"{len(bare)} without a digest, written by an earlier Aegis: {listed}")

@@ -313,6 +313,8 @@ Device = Annotated[
     Option(
         "--device",
         metavar="DEVICE",
+        envvar="AEGIS_DEVICE",  # so that a device that is not there is refused before any work
+        show_envvar=False,
         help="Where to compute: cpu, cuda, cuda:N or auto; default: AEGIS_DEVICE, else a GPU if "
         "there is one.",
     ),

@@ -108,4 +108,5 @@ def test_commands_compute_where_they_are_told(
     if not torch.cuda.is_available():
         assert "no GPU" in refused(aegis(*given, "--device", "cuda"))
     monkeypatch.setenv(devices.VARIABLE, "abacus")
-    assert devices.VARIABLE in refused(aegis(*given))
+    said = refused(aegis(*given))
+    assert devices.VARIABLE in said and "render" not in said, "it is refused before any work"
