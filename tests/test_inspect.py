@@ -207,11 +207,25 @@ def test_other_kinds_need_no_more_than_their_header(tmp_path):
     assert report.tensors == (inspection.TensorInfo("w", (3, 2), "float32", "rad"),)
 
 
-def test_a_checkpoints_folder_is_its_backbone(tmp_path):
+def test_a_checkpoint_without_its_run_is_a_policy_with_its_backbone(tmp_path, capsys):
+    """As `aegis export --format aegis` writes it."""
     (tmp_path / "backbone").mkdir()
-    (tmp_path / "expert.safetensors").touch()
+    joints = {"action_names": ["pan", "lift"]}
+    artifacts.save(tmp_path / "expert.safetensors", "expert", {"w": torch.zeros(2)}, meta=joints)
     artifacts.save(tmp_path / "backbone" / "model.safetensors", "backbone", {"w": torch.zeros(2)})
-    assert inspection.run(tmp_path / "backbone").kind == inspection.run(tmp_path).kind == "backbone"
+    assert inspection.run(tmp_path / "backbone").kind == "backbone"
+    found = inspection.run(tmp_path)
+    assert (found.kind, found.path) == ("policy", str(tmp_path))
+    assert found.facts["action_names"] == ["pan", "lift"]
+    assert found.facts["backbone"] == {"kind": "embedded"}
+
+
+def test_questions_are_sent_to_the_probe(tmp_path):
+    asked = tmp_path / "set.jsonl"
+    asked.write_text("{}\n")
+    with pytest.raises(AegisError) as caught:
+        inspection.run(asked)
+    assert f"aegis probe MODEL --vqa '{asked}'" in caught.value.fix
 
 
 def test_a_checkpoint_of_a_run_is_the_run_up_to_it(tmp_path, capsys):

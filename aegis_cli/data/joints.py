@@ -46,3 +46,17 @@ def differences(known: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[
         one, other = known.get(key), found.get(key)
         if one is not None and other is not None and list(one) != list(other):
             yield Difference(what, one, other)
+
+
+def told_apart(known: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    """Which joints are missing and which are more, for an error of how many there are.
+
+    It reads as ", without the actions pan"; '' where a name is not known, or none differs.
+    """
+    said = []
+    for other in differences(known, found):
+        missing = [name for name in other.known if name not in other.found]
+        more = [name for name in other.found if name not in other.known]
+        said += [f"without the {other.what} {', '.join(missing)}"] if missing else []
+        said += [f"with the {other.what} {', '.join(more)} besides"] if more else []
+    return f", {', '.join(said)}" if said else ""

@@ -333,7 +333,8 @@ def _check_robot(path: Path, robot: Robot, known_path: Path, known: Robot) -> No
     """Raise AegisError unless two sets are of one robot, as far as both say it."""
     if robot.sizes != known.sizes:
         raise AegisError(
-            f"{robot.sizes[0]} positions and {robot.sizes[1]} actions in '{path}'",
+            f"{robot.sizes[0]} positions and {robot.sizes[1]} actions in '{path}'"
+            f"{joints.told_apart(known.names, robot.names)}",
             f"{known.sizes[0]} and {known.sizes[1]}, as in '{known_path}'",
             "give demonstrations of the same robot",
         )

@@ -407,7 +407,8 @@ def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path
     own, found = (len(policy.proprio_scale.mean), len(policy.action_scale.mean)), robot.sizes
     if own != found:
         raise AegisError(
-            f"{found[0]} positions and {found[1]} actions in '{data}'",
+            f"{found[0]} positions and {found[1]} actions in '{data}'"
+            f"{joints.told_apart(meta, robot.names)}",
             f"{own[0]} and {own[1]}, as the run was trained on",
             "give demonstrations of the same robot",
         )

@@ -10,6 +10,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.inspection.report import InspectReport, TensorInfo
 
 _WITH_FIGURES = ("anchor", "ledger")
+_OF_QUESTIONS = (".jsonl", ".json", ".parquet")  # how files of questions end
 
 
 def inspect(path: Path) -> InspectReport:
@@ -23,6 +24,8 @@ def inspect(path: Path) -> InspectReport:
             f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
         )
         fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
+        if path.suffix in _OF_QUESTIONS:
+            fix += f"; questions are asked by aegis probe MODEL --vqa '{path}'"
         raise AegisError(
             found, "a .safetensors file, or the folder of a run, study, dataset or model", fix
         )

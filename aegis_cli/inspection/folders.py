@@ -48,8 +48,9 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
         return StreamInspection(report.kind, str(path), report)
     if (path / "recipe.yaml").is_file():
         return _run_folder(path)
-    if checkpoint.is_one(path) and (run := checkpoint.run_of(path)) is not None:
-        return _run_folder(run, path)
+    if checkpoint.is_one(path):
+        run = checkpoint.run_of(path)
+        return _policy_folder(path) if run is None else _run_folder(run, path)
     if (path / "meta").is_dir():
         found = dataset.load(path)
         return InspectReport(
@@ -68,6 +69,17 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     raise UnknownFolder(
         f"{path} is neither a run nor an artifact", expected, commands.aegis("inspect", example)
     )
+
+
+def _policy_folder(path: Path) -> InspectReport:
+    """A policy without its run, as `aegis export` writes it: its expert's header, its backbone."""
+    found, inside = file.inspect(path / checkpoint.EXPERT), path / "backbone"
+    own = _hub_model(inside) if model_folder.is_model(inside) else None
+    backbone: dict[str, Any] = {"kind": "embedded"}
+    if own is not None:
+        backbone = {"kind": own.kind} | {k: own.facts[k] for k in ("family", "parameters")}
+    facts = found.facts | {"backbone": backbone}
+    return dataclasses.replace(found, kind="policy", path=str(path), facts=facts)
 
 
 def _hub_model(path: Path) -> InspectReport:

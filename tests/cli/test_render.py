@@ -501,6 +501,12 @@ def test_a_run_that_has_gone_on_says_which_steps_were_measured() -> None:
     assert "nothing is measured" not in shown and "measured before" not in shown
 
 
+def test_maps_that_share_a_spectrum_are_rows_of_the_table_alone() -> None:
+    facts = {"samples": 3, "shared": {"inputs.k_proj": "inputs.q_proj"}}
+    shown = text_of(render.inspect(InspectReport("anchor", "x", facts)))
+    assert "samples" in shown and "shared" not in shown and "k_proj" not in shown
+
+
 def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:
     rows = LayerEnergy("layers.3", 0.1, 0.2, 0.5)
     frozen = tuple(f"layers.{i}" for i in (0, 1, 2, 4, 10, 11))

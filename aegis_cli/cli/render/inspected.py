@@ -62,7 +62,8 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
 def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts with one line on a run's steps, of how many where some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
-    apart = ("planned_steps", "measured_before")
+    # An anchor's maps that share a spectrum are rows of its table, with the same figures.
+    apart = ("planned_steps", "measured_before", "shared")
     left = {name: value for name, value in facts.items() if name not in apart}
     if merged := facts.get("merge"):
         # A merge whose sweep measured no validation loss has none.
