@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -215,7 +214,7 @@ def test_what_a_set_does_not_say_is_not_compared(tmp_path: Path) -> None:
 def test_joints_that_a_set_lacks_or_has_besides_are_named(tmp_path: Path) -> None:
     made = episodes(3)
     known = save(tmp_path / "known", made)
-    less = [dataclasses.replace(e, actions=e.actions[:, :1]) for e in made]
+    less = [replace(e, actions=e.actions[:, :1]) for e in made]
     other = save(tmp_path / "other", less, action_names=("dx",))
     assert "1 actions in" in refused((known, other)).found
     assert refused((known, other)).found.endswith(", without the actions dy")
