@@ -162,7 +162,8 @@ class PolicyResult:
 
     Shares are in [0, 1], `_points` in percentage points, cross-entropy in nats. On a task measured
     by its return, `return_share` (1: the highest there is) takes the place of successes and
-    `return_gain_points` of their gains.
+    `return_gain_points` of their gains. Where nothing can be rolled out there is an
+    `open_loop_error` instead.
 
     Attributes:
         diverged: the seeds whose training did, which no mean counts and which cost the bar.
@@ -242,6 +243,7 @@ class PolicyResult:
             sure=_stands_still,
         ),
     ] = None
+    open_loop_error: Annotated[Mean, Metric("Open-loop error", 3, more_is_better=False)] = None
 
     @property
     def questions(self) -> float:

@@ -45,6 +45,9 @@ class PolicyFigures:
         images: a digest of each image's name, where other seeds may have been asked about the same
             ones; None of scenes.
         outcomes_seen, outcomes_held_out: one character per episode, 1 for a success, else 0.
+        open_loop_error: of a policy that cannot be rolled out: the squared error of its actions on
+            held-out episodes over their variance in training; 1 is that of always the mean action.
+            Of several data sets, the mean of theirs.
         code: version and digest of the package that measured the cell.
     """
 
@@ -65,6 +68,7 @@ class PolicyFigures:
     baseline_cross_entropy: float
     majority_accuracy: float
     return_share: float | None = None
+    open_loop_error: float | None = None
     lost_per_image: tuple[int, ...] | None = None
     questions_per_image: tuple[int, ...] | None = None
     images: tuple[str, ...] | None = None

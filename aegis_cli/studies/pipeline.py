@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,6 +113,7 @@ def _shown(row: PolicyFigures) -> dict[str, float]:
         "success seen %": _percent(row.success_seen),
         "held-out %": _percent(row.success_held_out),
         "return %": _percent(row.return_share),
+        "open-loop error": row.open_loop_error,
     }
     return {name: value for name, value in figures.items() if value is not None}
 
@@ -121,12 +123,13 @@ def _percent(share: float | None) -> float | None:
 
 
 def verdict(rows: Sequence[PolicyFigures]) -> str:
-    """A sentence on the method that succeeds most often among those that keep VQA.
+    """A sentence on the method that acts best among those that keep VQA.
 
-    To keep it means to lose at most half of what naive loses.
+    To keep it means to lose at most half of what naive loses. Who acts best succeeds most often,
+    or, where nothing can be rolled out, has the least open-loop error.
     """
     naive = next((row for row in rows if row.method == "naive"), None)
-    if naive is None or naive.success_seen is None or len(rows) == 1:
+    if naive is None or _acts(naive) is None or len(rows) == 1:
         return ""
     lost = f"{naive.drop_points:.1f} points of VQA"
     if naive.drop_points < _LEAST_DROP:
@@ -140,12 +143,24 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
         return (
             f"No method here kept VQA: naive lost {lost}, and each of the others over half of it."
         )
-    best = max(kept, key=lambda row: row.success_seen or 0.0)
-    success = f"{_percent(best.success_seen):.1f} % success where naive has"
+    best = max(kept, key=lambda row: -math.inf if (acts := _acts(row)) is None else acts)
+    if naive.success_seen is None:
+        at = f"an open-loop error of {best.open_loop_error:.3f} where naive has "
+        at += f"{naive.open_loop_error:.3f}"
+    else:
+        at = f"{_percent(best.success_seen):.1f} % success where naive has "
+        at += f"{_percent(naive.success_seen):.1f} %"
     return (
         f"{best.method} lost {best.drop_points:.1f} points of VQA where naive lost "
-        f"{naive.drop_points:.1f}, at {success} {_percent(naive.success_seen):.1f} % (one seed)."
+        f"{naive.drop_points:.1f}, at {at} (one seed)."
     )
+
+
+def _acts(row: PolicyFigures) -> float | None:
+    """How well a policy acts, more being better; None where that is not measured."""
+    if row.success_seen is not None:
+        return row.success_seen
+    return None if row.open_loop_error is None else -row.open_loop_error
 
 
 def _past(row: PolicyFigures, limit: float) -> bool:

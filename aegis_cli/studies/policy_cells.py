@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import statistics
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -22,7 +23,7 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import bench, probe, rollout, wrong_answers
+from aegis_cli.evaluation import bench, open_loop, probe, results, rollout, wrong_answers
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
@@ -442,7 +443,9 @@ class PolicyRunner:
         With `validation` this is done on the scenes and episodes for tuning.
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
-        rolled out: its figures have neither success nor return.
+        rolled out: its figures have neither success nor return, but its open-loop error on the
+        episodes that training has held out. No value is chosen by that, so none is measured for
+        tuning.
         """
         trained = self.train(label, recipe)
         _remove_misplaced(self.folder / label)
@@ -461,6 +464,7 @@ class PolicyRunner:
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
+        measured = None if playable or validation else self.open_loop_error(label, recipe)
         return PolicyFigures(
             method=recipe.train.method,
             **vars(asked[first]),
@@ -468,6 +472,7 @@ class PolicyRunner:
             success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
+            open_loop_error=measured,
             energy_shed=trained["energy_shed_mean"],
             step_s=trained["step_s"],
             step_time_ratio=None,
@@ -663,6 +668,38 @@ class PolicyRunner:
             track.tell(recipe, path.parent, path.stem, report.to_json(), recipe.train.steps)
 
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
+        return files.load_json(path)
+
+    def open_loop_error(self, label: str, recipe: Recipe) -> float | None:
+        """The cell's open-loop error on the held-out episodes of its demonstrations.
+
+        Of several sets of demonstrations it is the mean of theirs; None where no action varies.
+        """
+        given = self.demos(recipe)
+        sets = [given.path] if isinstance(given.path, Path) else list(given.path)
+        found = []
+        for number, data in enumerate(sets, start=1):
+            report = self._evaluated(label, recipe, data, given.sha256, number)
+            if report["relative_error"] is not None:
+                found.append(report["relative_error"])
+        return statistics.fmean(found) if found else None
+
+    def _evaluated(
+        self, label: str, recipe: Recipe, data: Path, demos_sha256: str, number: int
+    ) -> dict[str, Any]:
+        """The open-loop report on one set of demonstrations, of that number from 1."""
+        run = self._policy(label, recipe)
+        name = results.OPEN_LOOP if number == 1 else f"{results.OPEN_LOOP}-{number}"
+        path = run / f"{name}.json"
+        key = {"policy": _sha256(run), "demos": demos_sha256, "number": number}
+        key |= recipes.selected(recipe)
+
+        def make(on_event: OnEvent) -> None:
+            report = open_loop.run(run, data, on_event=on_event).kept()
+            files.save_json(path, report)
+            track.tell(recipe, run, name, report, recipe.train.steps)
+
+        self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
 
 

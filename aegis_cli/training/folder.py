@@ -29,7 +29,7 @@ _FILES = (
     "recipe.yaml",
     METRICS,
     "*.safetensors",
-    *(JOBS_REPORT, MERGE_REPORT, "probe*.json", "rollout*.json"),
+    *(JOBS_REPORT, MERGE_REPORT, "probe*.json", "rollout*.json", "evaluate*.json"),
     *(machine.NAME, inputs.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
 )

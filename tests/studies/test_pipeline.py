@@ -642,9 +642,21 @@ def figured(**of: tuple[float, float | None]) -> list[Any]:
     ]
 
 
+def opened(**of: tuple[float, float]) -> list[Any]:
+    """Rows of methods that cannot be rolled out, with their drops and open-loop errors."""
+    drops = figured(**{name: (drop, None) for name, (drop, _) in of.items()})
+    errors = [error for _, error in of.values()]
+    return [replace(row, open_loop_error=e) for row, e in zip(drops, errors, strict=True)]
+
+
 @pytest.mark.parametrize(
     ("rows", "says"),
     [
+        (
+            opened(naive=(14, 0.2), lora=(1, 0.3), kfac=(0.5, 0.25), aegis=(15, 0.1)),
+            "kfac lost 0.5 points of VQA where naive lost 14.0, at an open-loop error of 0.250 "
+            "where naive has 0.200",
+        ),
         (
             figured(naive=(14, 0.95), stop_gradient=(0, 0.6), kfac=(0.5, 0.9)),
             "kfac lost 0.5 points",

@@ -221,6 +221,7 @@ _COLUMNS = (
     ("success_held_out", "Success held-out %", share),
     ("wrong_target", "Wrong target %", share),
     ("return_share", "Return % of highest", share),
+    ("open_loop_error", "Open-loop error", lambda at: decimal(at, 3)),
     ("w2", "W2²", plain),
     ("energy_shed", "Energy shed %", lambda at: share(at, 2)),
     ("validation_loss", "Validation loss", lambda at: decimal(at, 4)),

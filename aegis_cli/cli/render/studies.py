@@ -44,7 +44,7 @@ def study(report: Any) -> RenderableType:
             Text(f"{report.name}: {task.task}{f', asked {task.vqa}' if task.vqa else ''}", "bold"),
             _table(
                 task.results,
-                (*_KEPT, *acting(task.results).values()),
+                (*_KEPT, *_acting(task.results)),
                 knob=any(r.knob for r in task.results),
             ),
             _table(task.results, _COSTS),
@@ -90,6 +90,14 @@ def robot_stream_study(report: Any) -> RenderableType:
             *(_matrix(result, report.tasks) for result in report.results),
         ]
     return Group(*parts, Text("\n".join(_robot_notes(report))))
+
+
+def _acting(results: Sequence[Any]) -> tuple[str, ...]:
+    """The fields that say how well policies act: in closed loop, or by their open-loop error."""
+    closed = tuple(acting(results).values())
+    acted = any(getattr(r, field) is not None for r in results for field in closed)
+    opened = any(r.open_loop_error is not None for r in results)
+    return ("open_loop_error",) if opened and not acted else closed
 
 
 # --- columns that results declare -----------------------------------------------------------------

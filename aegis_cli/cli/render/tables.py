@@ -25,8 +25,9 @@ from aegis_cli.cli.render.layout import (
 
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _OPEN_LOOP_INSTEAD = (
-    "nothing was rolled out, for the demonstrations are of no simulated task: aegis evaluate "
-    "measures each run's error on held-out episodes, and aegis compare puts them side by side"
+    "nothing could be rolled out. The open-loop error is the squared error of the actions on "
+    "held-out episodes over their variance in training: 1 is that of always the mean action; "
+    "aegis compare has its intervals"
 )
 _INSTRUCTIONS = 10  # lines of a rollout's table by instruction
 _SHARES = {
@@ -155,6 +156,7 @@ def pipeline(report: Any) -> RenderableType:
         "Drop (points)",
         "Cross-entropy (nats)",
         *acts,
+        "Open-loop error",
         "W2²",
         "Energy shed %",
         "Step time (x naive)",
@@ -165,6 +167,7 @@ def pipeline(report: Any) -> RenderableType:
         ("drop_points", partial(fixed, digits=2), False),
         ("cross_entropy", partial(fixed, digits=3), False),
         *((field, percent, field != "wrong_target") for field in acts.values()),
+        ("open_loop_error", partial(fixed, digits=3), False),
         ("w2", number, False),
         ("energy_shed", partial(percent, digits=2), None),
         ("step_time_ratio", partial(fixed, digits=2), False),

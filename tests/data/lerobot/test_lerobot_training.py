@@ -44,6 +44,7 @@ from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import video
 from aegis_cli.data.lerobot.write import Limits
 from aegis_cli.data.selection import Selection
+from aegis_cli.evaluation import open_loop, results
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import checkpoint, train
@@ -545,9 +546,9 @@ def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
 
 
 def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) -> None:
-    """A robot that Aegis does not simulate: its policy is trained and probed, never rolled out.
+    """A robot that Aegis does not simulate: its policy is trained, probed and evaluated open-loop.
 
-    Its stages are up to date until the data change.
+    It is never rolled out. Its stages are up to date until the data change.
     """
     folder = save(
         tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)]
@@ -563,6 +564,11 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
         None,
     ) and row.accuracy >= 0
     assert not any(e.stage == "demos" or "rollout" in e.stage for e in events)
+    run = tmp_path / "runs" / "small" / "naive"
+    alone = open_loop.run(run, folder)
+    assert (row.open_loop_error, alone.split) == (alone.relative_error, "validation")
+    (kept,) = results.open_loops(run)
+    assert kept.figures["relative_interval"] == alone.relative_interval
     events.clear()
     pipeline.run(given, tmp_path / "runs", events.append)
     work = {e.stage for e in events if e.unit not in ("method", "methods")}
@@ -572,6 +578,26 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
         replace(base, demos=Demos(path=str(folder), camera="top")), tmp_path / "runs", events.append
     )
     assert "naive/train" in {e.stage for e in events}
+
+
+def test_the_open_loop_error_on_several_sets_is_the_mean_of_theirs(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    sets = [
+        save(
+            tmp_path / name,
+            [replace(e, instruction="go to the red pad") for e in episodes(4, seed=seed)],
+        )
+        for seed, name in enumerate(("a", "b"))
+    ]
+    base = small_recipe(tiny_folder, ("naive",))
+    given = replace(base, demos=Demos(path=tuple(map(str, sets))))
+    (row,) = pipeline.run(given, tmp_path / "runs").rows
+    run = tmp_path / "runs" / "small" / "naive"
+    alone = [open_loop.run(run, data).relative_error for data in sets]
+    assert None not in alone and len(set(alone)) == 2
+    assert row.open_loop_error == pytest.approx(sum(alone) / 2)
+    assert len(results.open_loops(run)) == 2
 
 
 def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
