@@ -121,7 +121,7 @@ def test_a_locale_that_cannot_read_a_name_is_told_from_a_name_that_is_no_text(
     done = subprocess.run(
         [sys.executable, "-m", "aegis_cli", "demos", "point", "--out", "caf\u00e9"],
         cwd=place,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **ascii_names},
+        env=finding(ROOT) | ascii_names,
         capture_output=True,
     )
     assert done.returncode == 2
