@@ -212,10 +212,8 @@ class Policy:
         total = 0.0
         for start in range(0, len(held.texts), 32):
             ids, mask = self.read(held.texts[start : start + 32])
-            hidden, actions = (
-                self.hidden(ids, mask),
-                held.actions[start : start + 32].to(ids.device),
-            )
+            hidden = self.hidden(ids, mask)
+            actions = held.actions[start : start + 32].to(ids.device)
             generator = torch.Generator().manual_seed(start)
             noise = torch.randn(len(actions), SAMPLES, 1, 2, generator=generator).to(ids.device)
 
@@ -451,10 +449,9 @@ def main() -> None:
     chosen.out.mkdir(parents=True, exist_ok=True)
     cells = chosen.out / "cells.json"
     done = json.loads(cells.read_text()) if cells.exists() else {}
-    others = [
-        name for name, cell in done.items() if cell.get("steps", chosen.steps) != chosen.steps
-    ]
-    if others:
+    # Cells of an earlier version do not say how many steps they took.
+    taken = {cell.get("steps", STEPS) for name, cell in done.items() if name != "pretrained"}
+    if taken - {chosen.steps}:
         raise SystemExit(f"{cells} has runs of another number of steps: give another --out")
     if "pretrained" not in done:
         model, tokenizer = load_model(chosen.device)

@@ -278,9 +278,16 @@ def _said(name: str, value: float | None) -> str:
 
 
 def open_loops(run: Path) -> list[Result]:
-    """The open-loop evaluations of a run's last checkpoint; on its validation episodes first."""
-    found = [found for _, found in _read(run, OPEN_LOOP, OpenLoopFigures)]
-    return sorted(found, key=lambda one: one.figures["split"] != VALIDATION)
+    """The open-loop evaluations of a run's last checkpoint; on its validation episodes first.
+
+    Of those that found the same, as `aegis run` and `aegis evaluate` do, the first stands for all.
+    """
+    found = dict[str, Result]()
+    for _, one in _read(run, OPEN_LOOP, OpenLoopFigures):
+        # The path of the data may be written in several ways.
+        told = {name: value for name, value in one.figures.items() if name != "data"}
+        found.setdefault(files.canonical(told), one)
+    return sorted(found.values(), key=lambda one: one.figures["split"] != VALIDATION)
 
 
 def _read(

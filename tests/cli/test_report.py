@@ -108,6 +108,23 @@ def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path
     assert said in reported(aegis, job / "naive")[0].said
 
 
+def test_the_table_of_a_job_has_the_open_loop_error_of_what_cannot_be_rolled_out(
+    aegis, job: Path
+) -> None:
+    table = files.load_json(job / "table.json")
+    for row, error in zip(table["rows"], (0.125, 0.375), strict=True):
+        row |= dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
+        row["open_loop_error"] = error
+    files.save_json(job / "table.json", table)
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    shown = {path: text for path, _, text in page.figures}
+    assert shown["/table/rows/0/open_loop_error"] == "0.125"
+    assert shown["/table/rows/1/open_loop_error"] == "0.375"
+    assert "/table/rows/0/success_seen" not in shown
+    assert "Open-loop error" in page.said
+
+
 def test_the_worst_instructions_of_an_open_loop_error_are_on_the_page(aegis, job: Path) -> None:
     entry = {"episodes": 2, "frames": 30, "relative_interval": [0.5, 1.5], "hold_error": 0.25}
     many = [

@@ -31,6 +31,19 @@ def test_the_pages_table_is_that_of_the_cells(name: str) -> None:
     assert table in (RESULTS / "published.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("cell", [{"steps": 1200}, {}])
+def test_runs_of_another_number_of_steps_are_no_runs_of_the_folder(
+    cell: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Earlier cells, which do not say it, took the usual number."""
+    cells = tmp_path / "cells.json"
+    cells.write_text(json.dumps({"pretrained": {}, "naive_0.0001_1": cell}))
+    steps = "300" if cell else "1200"
+    monkeypatch.setattr(sys, "argv", ["published", "--steps", steps, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match="another number of steps"):
+        script().main()
+
+
 def test_every_run_of_the_cells_is_in_the_picture(tmp_path: Path) -> None:
     pictures = script("docs/pictures/published.py")
     drawn = tmp_path / "published.png"

@@ -787,5 +787,37 @@ def test_each_set_of_questions_has_a_table_and_a_bar_of_its_own(
     assert "small: reach, asked easy-vqa" in shown.getvalue()
 
 
+def test_policies_that_cannot_be_rolled_out_are_compared_by_their_open_loop_error(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = raw(tiny_folder, tuning=None)
+    keys["variants"] = {"naive": {"method": "naive"}, "kept": {"method": "stop-gradient"}}
+    errors = {"naive": 0.25, "kept": 0.5}
+    invent(monkeypatch)
+    acted = dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
+    monkeypatch.setattr(
+        PolicyRunner,
+        "figures",
+        lambda self, label, recipe, validation=False: row(
+            recipe, **acted, open_loop_error=errors[label.split("/")[1]]
+        ),
+    )
+    monkeypatch.setattr(PolicyStudy, "prepare", lambda *_: None)
+    report = stage.run(study_cells.load(write(tmp_path, keys)), tmp_path / "runs")
+    (task,) = report.tasks
+    assert {r.variant: r.open_loop_error.mean for r in task.results} == errors
+    place = tmp_path / "runs" / "small"
+    assert table.load(place).tasks == report.tasks
+    shown = io.StringIO()
+    Console(file=shown, width=160).print(render.study(report))
+    header = next(line for line in shown.getvalue().splitlines() if "Drop (points)" in line)
+    assert "Open-loop error" in header and "Success" not in header
+    older = files.load_json(place / "table.json")
+    for result in older["tasks"][0]["results"]:
+        del result["open_loop_error"]
+    files.save_json(place / "table.json", older)  # as it was written before there was the figure
+    assert {r.open_loop_error for r in table.load(place).tasks[0].results} == {None}
+
+
 def test_one_set_of_questions_has_no_name(finished: tuple[Path, StudyReport]) -> None:
     assert [task.vqa for task in finished[1].tasks] == [None]

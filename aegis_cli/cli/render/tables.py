@@ -26,8 +26,8 @@ from aegis_cli.cli.render.layout import (
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _OPEN_LOOP_INSTEAD = (
     "nothing could be rolled out. The open-loop error is the squared error of the actions on "
-    "held-out episodes over their variance in training: 1 is that of always the mean action; "
-    "aegis compare has its intervals"
+    "held-out episodes over their variance in training: 1 is that of always the mean action. "
+    "aegis inspect of a run has its interval"
 )
 _INSTRUCTIONS = 10  # lines of a rollout's table by instruction
 _SHARES = {

@@ -555,7 +555,7 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     )
     base = small_recipe(tiny_folder, ("naive",))
     given = replace(base, demos=Demos(path=str(folder), camera="wrist"))
-    events: list[Progress] = []
+    events: list[Event] = []
     report = pipeline.run(given, tmp_path / "runs", events.append)
     (row,) = report.rows
     assert (row.success_seen, row.success_held_out, row.wrong_target) == (
@@ -569,6 +569,11 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     assert (row.open_loop_error, alone.split) == (alone.relative_error, "validation")
     (kept,) = results.open_loops(run)
     assert kept.figures["relative_interval"] == alone.relative_interval
+    progress = [e for e in events if isinstance(e, Progress)]
+    ended = [e.metrics for e in progress if e.unit == "method" and e.done]
+    assert [figures["open-loop error"] for figures in ended] == [row.open_loop_error]
+    open_loop.run(run, folder, keep=True)
+    assert results.open_loops(run) == [kept]  # the same measurement once more
     events.clear()
     pipeline.run(given, tmp_path / "runs", events.append)
     work = {e.stage for e in events if e.unit not in ("method", "methods")}
@@ -577,7 +582,8 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     pipeline.run(
         replace(base, demos=Demos(path=str(folder), camera="top")), tmp_path / "runs", events.append
     )
-    assert "naive/train" in {e.stage for e in events}
+    assert {"naive/train", "naive/evaluate"} <= {e.stage for e in events}
+    assert run.exists() and not list(run.parent.glob("naive.*"))  # all in the old run was ours
 
 
 def test_the_open_loop_error_on_several_sets_is_the_mean_of_theirs(
