@@ -7,16 +7,21 @@ from aegis_cli.common.version import __version__
 if TYPE_CHECKING:
     from aegis_cli.deploy import load_policy
     from aegis_cli.guard import Guard
+    from aegis_cli.serving.real_time import RealTime
 
-__all__ = ["Guard", "__version__", "load_policy"]
+__all__ = ["Guard", "RealTime", "__version__", "load_policy"]
 
 
 def __getattr__(name: str) -> object:
-    """The two, loaded when they are asked for: `aegis --help` must not load torch."""
+    """The others, loaded when they are asked for: `aegis --help` must not load torch."""
     if name == "Guard":
         from aegis_cli.guard import Guard
 
         return Guard
+    if name == "RealTime":
+        from aegis_cli.serving.real_time import RealTime
+
+        return RealTime
     if name == "load_policy":
         from aegis_cli.deploy import load_policy
 
@@ -25,5 +30,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """What there is, so that a notebook offers the two before they are loaded."""
+    """What there is, so that a notebook offers them before they are loaded."""
     return sorted({*globals(), *__all__})

@@ -30,6 +30,7 @@ from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
 from aegis_cli.continual import robots
 from aegis_cli.core import ensemble as temporal
+from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.evaluation.rollout import Acting, load_run
@@ -43,12 +44,17 @@ Positions = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """What a policy acts on: pictures in the backbone's order, text, and positions [P] float32."""
 
     pictures: list[np.ndarray]
     instruction: str
     positions: np.ndarray
+
+    def copy(self) -> Seen:
+        """The same in memory of its own."""
+        pictures = [picture.copy() for picture in self.pictures]
+        return Seen(pictures, self.instruction, self.positions.copy())
 
 
 class DeployedPolicy:
@@ -147,17 +153,17 @@ class DeployedPolicy:
             AegisError: what `predict_action_chunk` finds wrong, at each call: a robot whose sensor
                 fails does not move on by an older prediction.
         """
-        seen = self._checked(pictures, instruction, positions)
+        seen = self.read(pictures, instruction, positions)
         if seen.instruction != self._follows:
             self._ahead.clear()
             if self._averaged is not None:
                 self._averaged.reset()
         if self._averaged is not None:
-            action = self._averaged.next(torch.from_numpy(self._predicted(seen)))
+            action = self._averaged.next(torch.from_numpy(self.predict(seen)))
             self._follows = seen.instruction
             return action.numpy()
         if not self._ahead:
-            self._ahead.extend(self._predicted(seen)[: self.replan])
+            self._ahead.extend(self.predict(seen)[: self.replan])
             self._follows = seen.instruction
         return self._ahead.popleft()
 
@@ -166,8 +172,15 @@ class DeployedPolicy:
         pictures: Pictures | Mapping[str, Any],
         instruction: str | None = None,
         positions: Positions | None = None,
+        previous: np.ndarray | None = None,
+        delay: int = 0,
     ) -> np.ndarray:
         """The next actions [H, A] float32.
+
+        A robot that moves while it waits for them tells what it does meanwhile (`previous`), and
+        gets a chunk that continues it: real-time chunking, see `core.continuation`. It executes its
+        own actions until the chunk is there, `delay` of them, and then the chunk's from that number
+        on. `RealTime` does all of this.
 
         Args:
             pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the size that the
@@ -176,12 +189,16 @@ class DeployedPolicy:
                 whole observation as `data.lerobot.observation` reads it.
             instruction: a text in words that the backbone knows; None: the observation's `task`.
             positions: proprioception [P], in the demonstrations' order; None: the observation's.
+            previous: what is left of the last chunk at this observation [n, A], n <= H; None:
+                nothing.
+            delay: how many of these actions are executed before the new chunk is there.
 
         Raises:
             AegisError: other pictures or numbers than it was trained on, words that the backbone
                 does not know, or predicted actions that are not finite.
         """
-        return self._predicted(self._checked(pictures, instruction, positions))
+        seen = self.read(pictures, instruction, positions)
+        return self.predict(seen, self._continued(previous, delay))
 
     def named(self, action: np.ndarray) -> dict[str, float]:
         """The numbers of an action [A] by their names, as a robot's `send_action` takes them.
@@ -203,20 +220,59 @@ class DeployedPolicy:
             )
         return {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
 
-    def _predicted(self, seen: _Seen) -> np.ndarray:
-        """The next actions [H, A] float32."""
-        frames = [torch.from_numpy(self._fitted(p, i)) for i, p in enumerate(seen.pictures)]
-        images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
-        proprio = torch.from_numpy(seen.positions)[None]
-        acted = self._policy.act(images, [seen.instruction], proprio, self._generator)[0]
-        return check_actions(acted.cpu()).numpy()
+    def predict(self, seen: Seen, continued: Continued | None = None) -> np.ndarray:
+        """The next actions [H, A] float32 for what `read` returned.
 
-    def _checked(
+        Raises:
+            AegisError: they are not finite.
+        """
+        # Within a program's own inference mode nothing could be differentiated.
+        with torch.inference_mode(mode=False):
+            frames = [torch.from_numpy(self._fitted(p, i)) for i, p in enumerate(seen.pictures)]
+            images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
+            proprio, texts = torch.from_numpy(seen.positions)[None], [seen.instruction]
+            acted = self._policy.act(images, texts, proprio, self._generator, continued)
+        return check_actions(acted[0].cpu()).numpy()
+
+    def _continued(self, previous: np.ndarray | None, delay: int) -> Continued | None:
+        """What a chunk is to continue; None where nothing is left.
+
+        Raises:
+            AegisError: it is no end of a chunk, or the delay is longer.
+        """
+        nothing = np.zeros((0, self.actions), np.float32)
+        left = nothing if previous is None else _numbers(previous, "actions")
+        if left.ndim != 2 or left.shape[1] != self.actions or len(left) > self.chunk:
+            raise AegisError(
+                f"previous actions of shape {left.shape}",
+                f"(n, {self.actions}), with n at most {self.chunk}",
+                "give what is left of the last chunk",
+            )
+        if not np.isfinite(left).all():
+            raise AegisError(
+                "previous actions that are not finite",
+                "finite numbers",
+                "give the actions as the policy predicted them",
+            )
+        if not isinstance(delay, int | np.integer) or not 0 <= delay <= len(left):
+            raise AegisError(
+                f"a delay of {delay} actions, where {len(left)} are left of the last chunk",
+                f"a whole number from 0 to {len(left)}",
+                "ask for the next chunk earlier, so that more are left",
+            )
+        return Continued(torch.from_numpy(left)[None], int(delay)) if len(left) else None
+
+    def read(
         self,
         pictures: Pictures | Mapping[str, Any],
-        instruction: str | None,
-        positions: Positions | None,
-    ) -> _Seen:
+        instruction: str | None = None,
+        positions: Positions | None = None,
+    ) -> Seen:
+        """What `predict` takes, of the same observation as `predict_action_chunk` takes.
+
+        Raises:
+            AegisError: other pictures or numbers than the policy was trained on.
+        """
         if positions is None:
             if not isinstance(pictures, Mapping):
                 raise AegisError("no positions", f"numbers [{self.positions}]", _ORDER)
@@ -246,7 +302,7 @@ class DeployedPolicy:
         if not isinstance(instruction, str):
             found = f"an instruction of type {type(instruction).__name__}"
             raise AegisError(found, "a text", f"give one str; {_ORDER}")
-        return _Seen([_picture(shown) for shown in self._in_order(pictures)], instruction, given)
+        return Seen([_picture(shown) for shown in self._in_order(pictures)], instruction, given)
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
         """The pictures in the order in which the backbone takes them."""
@@ -282,8 +338,8 @@ class DeployedPolicy:
         return np.require(picture, requirements=["C_CONTIGUOUS", "WRITEABLE"])
 
 
-def _numbers(given: Positions) -> np.ndarray:
-    """The positions as float32.
+def _numbers(given: Positions, what: str = "positions") -> np.ndarray:
+    """Positions or actions as float32.
 
     Raises:
         AegisError: they are no numbers.
@@ -291,8 +347,8 @@ def _numbers(given: Positions) -> np.ndarray:
     try:
         return np.asarray(given, dtype=np.float32)
     except (TypeError, ValueError) as error:  # a text, or lists of several lengths
-        found = f"positions of type {type(given).__name__}: {in_short(error)}"
-        raise AegisError(found, "numbers, one for each position", _ORDER) from error
+        found = f"{what} of type {type(given).__name__}: {in_short(error)}"
+        raise AegisError(found, f"numbers, one for each of the {what}", _ORDER) from error
 
 
 def _picture(given: np.ndarray) -> np.ndarray:
@@ -316,6 +372,7 @@ def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:
     return None if given is None else tuple(given)
 
 
+@torch.inference_mode(mode=False)  # weights that are made within one cannot be differentiated by
 def load_policy(
     run: str | Path,
     task: str | None = None,

@@ -133,6 +133,46 @@ def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_pictur
     )
 
 
+def test_a_chunk_continues_what_the_robot_executes_meanwhile(run_folder: Path) -> None:
+    """What is held to it is near to it, all the more where it is executed; and nothing else is."""
+    own = load_policy(run_folder, seed=3)
+    free = own.predict_action_chunk(frame(), TEXT, [0.1] * own.positions)
+    own.reset()
+    nothing = own.predict_action_chunk(
+        frame(), TEXT, [0.1] * own.positions, np.zeros((0, own.actions))
+    )
+    np.testing.assert_array_equal(nothing, free)
+    scale = own._policy.action_scale.std.numpy()
+    previous = free[2:] + 2 * scale * np.random.default_rng(0).normal(size=free[2:].shape)
+    own.reset()
+    with torch.inference_mode():  # nor does a program's own mode stand in the way
+        held = own.predict_action_chunk(
+            frame(), TEXT, [0.1] * own.positions, previous=previous, delay=2
+        )
+    off = np.abs(held[: len(previous)] - previous) / scale
+    before = np.abs(free[: len(previous)] - previous) / scale
+    assert off[:2].mean() < 0.2 * before[:2].mean() and off[:2].mean() < off[-1].mean()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"previous": np.zeros((2, 3))}, r"\(2, 3\)"),
+        ({"previous": np.zeros(2)}, r"\(2,\)"),
+        ({"previous": np.zeros((5, 2))}, r"\(5, 2\)"),
+        ({"previous": np.full((2, 2), np.nan)}, "not finite"),
+        ({"previous": "two"}, "actions of type str"),
+        ({"previous": np.zeros((2, 2)), "delay": 3}, "a delay of 3 actions, where 2 are left"),
+        ({"previous": np.zeros((2, 2)), "delay": -1}, "a delay of -1"),
+        ({"previous": np.zeros((2, 2)), "delay": 0.5}, "a delay of 0.5"),
+        ({"delay": 1}, "where 0 are left"),
+    ],
+)
+def test_what_no_chunk_can_continue_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(AegisError, match=said):
+        deployed().predict_action_chunk(frame(), TEXT, POSITIONS, **changes)
+
+
 def test_another_instruction_drops_the_chunk_of_the_one_before() -> None:
     """What is left of a chunk is not played on, nor taken up again."""
     own, other = deployed(), deployed()
@@ -182,9 +222,7 @@ class Cameras:
         )
         self.seen: list[Any] = []
 
-    def act(
-        self, shown: Any, texts: list[str], proprio: torch.Tensor, _: torch.Generator
-    ) -> torch.Tensor:
+    def act(self, shown: Any, texts: list[str], proprio: torch.Tensor, *_: Any) -> torch.Tensor:
         self.seen.append(shown)
         return torch.zeros(1, 4, 2)
 

@@ -85,12 +85,13 @@ def test_imports_go_down_only(room: str) -> None:
 def test_the_package_itself_imports_nothing_before_it_is_asked_for() -> None:
     found = set(imports(MODULES["__init__"].read_text(encoding="utf-8"), "__init__"))
     lazy = {"aegis_cli.guard.Guard", "aegis_cli.deploy.load_policy"}
+    lazy.add("aegis_cli.serving.real_time.RealTime")
     assert found == lazy | {"aegis_cli.common.version.__version__", "typing.TYPE_CHECKING"}
     assert (ROOT / "py.typed").is_file()  # so that a type checker reads what they are
     program = """
 import sys, aegis_cli
 assert not {'torch', 'aegis_cli.guard', 'aegis_cli.deploy'} & sys.modules.keys()
-assert {'Guard', 'load_policy'} <= set(dir(aegis_cli))  # a notebook offers them
+assert {'Guard', 'RealTime', 'load_policy'} <= set(dir(aegis_cli))  # a notebook offers them
 assert not hasattr(aegis_cli, 'Gaurd') and 'torch' not in sys.modules
 from aegis_cli import Guard
 assert Guard.__module__ == 'aegis_cli.guard.guard'
@@ -98,6 +99,8 @@ heavy = {'mujoco', 'OpenGL', 'typer', 'rich'} & sys.modules.keys()
 assert not heavy, heavy
 from aegis_cli import load_policy
 assert load_policy.__module__ == 'aegis_cli.deploy'
+from aegis_cli import RealTime
+assert RealTime.__module__ == 'aegis_cli.serving.real_time'
 screens = {'typer', 'rich'} & sys.modules.keys()
 assert not screens, screens
 """

@@ -740,9 +740,9 @@ def probe(
         )
         failed = None
         if report.passed is False:
-            dropped = f"dropped {report.drop_points:.2f} points"
+            dropped = f"a drop of {report.drop_points:.2f} points"
             if gate is Gate.upper:
-                dropped += f" or up to {report.drop_interval[1]:.2f}"
+                dropped += f", which may be as large as {report.drop_interval[1]:.2f}"
             failed = f"{dropped}, more than {limit} {max_drop:g}"
         _say_gate(failed)
     _end_at_gate(failed)
@@ -859,6 +859,18 @@ def rollout(
         ),
     ] = 0,
     ensemble: Ensemble = None,
+    delay: Annotated[
+        int | None,
+        Option(
+            metavar="STEPS",
+            help="Steps that a prediction takes, in which the robot goes on with the chunk before; "
+            "the next chunk continues it. Default: the robot waits.",
+        ),
+    ] = None,
+    unguided: Annotated[
+        bool,
+        Option("--unguided", help="With --delay: chunks that do not continue the one before."),
+    ] = False,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     device: Device = None,
     as_json: Json = False,
@@ -873,8 +885,13 @@ def rollout(
 
     \b
     Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
+    Example: aegis rollout runs/x --delay 2
     """
     from aegis_cli.deploy import load_acting
+
+    if unguided and delay is None:
+        expected = "a delay, after which a chunk can continue the one before or not"
+        raise AegisError("--unguided without --delay", expected, "add --delay STEPS")
 
     stages.ROLLOUT.run(
         run,
@@ -886,6 +903,8 @@ def rollout(
         seed=seed,
         keep=True,
         ensemble=ensemble,
+        delay=delay,
+        guided=not unguided,
         device=device,
         as_json=as_json,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
@@ -26,6 +26,17 @@ def listed(text: str) -> list[int]:
             raise ValueError(part)
         found += range(ends[0], ends[1] + 1)
     return found
+
+
+def as_text(numbers: Sequence[int]) -> str:
+    """The list that `listed` reads as these rising numbers: `0,4,7-9`."""
+    parts = list[list[int]]()
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1] = [parts[-1][0], number]
+        else:
+            parts.append([number])
+    return ",".join("-".join(map(str, ends)) for ends in parts)
 
 
 def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list[int]:

@@ -5,6 +5,7 @@ The ratios are those of this machine.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -169,12 +170,27 @@ def _step_seconds(
 ) -> dict[str, float]:
     """Seconds of one training step by each recipe.
 
-    This is a function so that its models are gone when memory is measured.
+    Each takes at least as many steps in a turn as any has to, for single steps vary more than the
+    mean of many. This is a function so that its models are gone when memory is measured.
     """
     steppers = {name: bench_runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    turns = {name: turn for name, (turn, _) in steppers.items()}
+    most = max(steps for _, steps in steppers.values())
+    turns, taken = dict[str, Callable[[], None]](), dict[str, int]()
+    for name, (turn, steps) in steppers.items():
+        times = math.ceil(most / steps)
+        turns[name], taken[name] = _repeated(turn, times), times * steps
     seconds = bench_runs.take_turns("bench steps", turns, repeats, on_event)
-    return {name: seconds[name] / steps for name, (_, steps) in steppers.items()}
+    return {name: seconds[name] / taken[name] for name in steppers}
+
+
+def _repeated(turn: Callable[[], None], times: int) -> Callable[[], None]:
+    """So many turns in one."""
+
+    def turns() -> None:
+        for _ in range(times):
+            turn()
+
+    return turns
 
 
 @torch.inference_mode()

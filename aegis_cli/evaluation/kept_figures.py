@@ -93,6 +93,8 @@ class RolloutSettings:
     seed: int | None = None
     replan: int | None = None
     ensemble: Number | None = None
+    delay: int | None = None
+    unguided: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ class RolloutFigures:
     mean_return: Number | None = None
     return_interval: Interval = None
     return_share: Number | None = None
+    action_change: Number | None = None
     episodes_per_s: Number | None = None
     video: str | None = None
     settings: RolloutSettings | None = None

@@ -219,11 +219,16 @@ class Played:
     """How a rollout was played: the seed of its episodes, and how the policy's chunks were used.
 
     Where it was by the run's recipe, that says it.
+
+    Attributes:
+        delay, unguided: as `aegis rollout` was asked; None without a delay.
     """
 
     seed: int
     replan: int
     ensemble: float | None
+    delay: int | None = None
+    unguided: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,17 +268,21 @@ def _played(found: Result, recipe: recipes.Recipe) -> Played:
     if not said:
         return Played(own.seed, own.replan, own.ensemble)
     seed, replan = said.get("seed", recipes.Rollout().seed), said.get("replan", own.replan)
-    return Played(seed, replan, said.get("ensemble"))
+    delayed = said.get("delay"), said.get("unguided")
+    return Played(seed, replan, said.get("ensemble"), *delayed)
 
 
 def told_apart(played: Sequence[Played]) -> list[str]:
     """In words how each rollout was played, as far as others beside it were played otherwise."""
     names = [field.name for field in dataclasses.fields(Played)]
     differ = [name for name in names if len({getattr(one, name) for one in played}) > 1]
-    return [", ".join(_said(name, getattr(one, name)) for name in differ) for one in played]
+    told = [[_said(name, getattr(one, name)) for name in differ] for one in played]
+    return [", ".join(filter(None, words)) for words in told]
 
 
 def _said(name: str, value: float | None) -> str:
+    if name == "unguided":
+        return "unguided" if value else ""
     return f"no {name}" if value is None else f"{name} {value}"
 
 

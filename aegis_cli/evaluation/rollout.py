@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.core import ensemble as temporal
+from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.metrics import wilson_interval
@@ -55,6 +57,9 @@ class RolloutReport:
 
     A task measured by its return has none of these. It has the mean return, its 95 % interval
     (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
+
+    `action_change` is the root mean square of the difference between one executed action and the
+    next, as a share of a full action: how much the robot jerks. Episodes of one step have none.
     """
 
     task: str
@@ -70,6 +75,7 @@ class RolloutReport:
     mean_return: float | None = None
     return_interval: tuple[float, float] | None = None
     return_share: float | None = None
+    action_change: float | None = None
     episodes: int
     episodes_per_s: float
     video: str | None = None
@@ -91,6 +97,9 @@ class _PlayedEpisode:
     observation: Observation
     moments: list[media.Moment] | None
     ensemble: TemporalEnsemble | None = None
+    left: np.ndarray | None = None  # what is left of its last chunk [n, A]
+    executed: np.ndarray | None = None  # the last action [A]
+    changes: list[float] = field(default_factory=list)  # mean squares over the dimensions
     last: Step | None = None
     total_reward: float = 0.0
     steps: int = 0
@@ -98,6 +107,22 @@ class _PlayedEpisode:
     @property
     def done(self) -> bool:
         return self.last is not None and self.last.done
+
+
+@dataclass(frozen=True)
+class _Pace:
+    """How many actions of each chunk are executed, and which.
+
+    Attributes:
+        replan: actions between two predictions.
+        delay: actions that a prediction takes, in which the chunk before is executed; None: the
+            robot stands still meanwhile.
+        guided: whether a delayed chunk continues the one before (see `core.continuation`).
+    """
+
+    replan: int
+    delay: int | None = None
+    guided: bool = True
 
 
 class Acting(NamedTuple):
@@ -141,6 +166,8 @@ def run(
     seed: int = EVALUATION_SEED,
     keep: bool = False,
     ensemble: float | None = None,
+    delay: int | None = None,
+    guided: bool = True,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
@@ -152,10 +179,13 @@ def run(
         load: how the folder is read; default: `load_run`, which knows runs of one policy.
         keep: write the report into the run's folder.
         ensemble: decay of a temporal ensemble; None: the policy's own, unless `replan` is given.
+        delay: steps that a prediction takes, in which the robot goes on with the chunk before;
+            None: it waits.
+        guided: whether a delayed chunk continues the one before.
 
     Raises:
         AegisError: no trained run, another task than the run's, colours it does not have, zero
-            episodes, or a decay that is not finite.
+            episodes, a decay that is not finite, or a delay for which a chunk is too short.
     """
     if ensemble is not None:
         temporal.check(ensemble)
@@ -172,6 +202,8 @@ def run(
         raise AegisError(
             f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
         )
+    if delay is not None:
+        _check_delay(delay, replan or planned, policy.expert.shape.chunk, decay)
     report = play(
         policy.to(devices.pick()),
         task,
@@ -184,14 +216,34 @@ def run(
         seed=seed,
         cameras=cameras,
         ensemble=decay,
+        delay=delay,
+        guided=guided,
     )
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
         settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
         settings |= {"replan": replan or planned}
         settings |= {} if decay is None else {"ensemble": decay}
+        settings |= {} if delay is None else {"delay": delay, "unguided": not guided}
         results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
     return report
+
+
+def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) -> None:
+    """Raise AegisError for a delay that such chunks cannot bridge."""
+    if ensemble is not None:
+        raise AegisError(
+            f"a delay of {delay} steps with the temporal ensemble {ensemble:g}",
+            "one of them",
+            "a delay is for a policy that executes several actions of each chunk",
+        )
+    longest = min(replan, chunk - replan)
+    if not 0 <= delay <= longest:
+        raise AegisError(
+            f"a delay of {delay} steps, of chunks of {chunk} actions of which {replan} are executed",
+            f"0 to {longest}: as many are left of a chunk, and no more are executed of the next",
+            "train with a longer train.chunk" if delay > 0 else "use --delay 1",
+        )
 
 
 def play(
@@ -206,11 +258,14 @@ def play(
     seed: int = EVALUATION_SEED,
     cameras: tuple[str, ...] = (),
     ensemble: float | None = None,
+    delay: int | None = None,
+    guided: bool = True,
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does.
 
     With the decay of a temporal `ensemble` it predicts at every step, whatever `replan` is.
     """
+    pace = _Pace(replan, delay, guided)
     started = time.perf_counter()
     finished: list[_PlayedEpisode] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
@@ -221,7 +276,7 @@ def play(
         group = [
             _begin(task, seed, stream, i, colored, i < clips, cameras, ensemble) for i in numbers
         ]
-        for _ in _play(policy, group, replan, first, seed):
+        for _ in _play(policy, group, pace, first, seed):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
             in_group = sum(longest if e.done else e.steps for e in group)
@@ -236,8 +291,15 @@ def play(
         episodes=episodes,
         episodes_per_s=episodes / seconds,
         video=None if video_out is None else str(video_out),
+        action_change=_action_change(finished),
         **_measured(task, colors, finished),
     )
+
+
+def _action_change(finished: Sequence[_PlayedEpisode]) -> float | None:
+    """The root mean square over the steps of all episodes; None where all had one."""
+    changes = [change for episode in finished for change in episode.changes]
+    return math.sqrt(sum(changes) / len(changes)) if changes else None
 
 
 def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
@@ -332,33 +394,48 @@ def _begin(
 
 
 def _play(
-    policy: Policy, group: list[_PlayedEpisode], replan: int, first: int, seed: int
+    policy: Policy, group: list[_PlayedEpisode], pace: _Pace, first: int, seed: int
 ) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     # Seeded by the group, so that the noise does not depend on how the groups before it ended.
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
-        chunks = _decide(policy, [e.observation for e in active], generator)
+        continued = _continued(active, pace)
+        chunks = _decide(policy, [e.observation for e in active], generator, continued)
         for episode, chunk in zip(active, chunks, strict=True):
-            _execute(episode, _to_execute(episode.ensemble, chunk, replan))
+            _execute(episode, _to_execute(episode, chunk, pace))
         yield
 
 
-def _to_execute(ensemble: TemporalEnsemble | None, chunk: np.ndarray, replan: int) -> np.ndarray:
+def _continued(active: Sequence[_PlayedEpisode], pace: _Pace) -> Continued | None:
+    """What the next chunks continue; None where they need not, as the first ones of episodes."""
+    left = [e.left for e in active if e.left is not None and len(e.left)]
+    if pace.delay is None or not pace.guided or not left:
+        return None
+    return Continued(torch.from_numpy(np.stack(left)), pace.delay)
+
+
+def _to_execute(episode: _PlayedEpisode, chunk: np.ndarray, pace: _Pace) -> np.ndarray:
     """The actions [*, A] until the next prediction: of a chunk [H, A], or of the ensemble's."""
-    if ensemble is None:
-        return chunk[:replan]
-    return ensemble.next(torch.from_numpy(chunk))[None].numpy()
+    if episode.ensemble is not None:
+        return episode.ensemble.next(torch.from_numpy(chunk))[None].numpy()
+    if pace.delay and episode.left is not None:
+        chunk = np.concatenate([episode.left[: pace.delay], chunk[pace.delay :]])
+    episode.left = chunk[pace.replan :]
+    return chunk[: pace.replan]
 
 
 def _decide(
-    policy: Policy, observations: list[Observation], generator: torch.Generator
+    policy: Policy,
+    observations: list[Observation],
+    generator: torch.Generator,
+    continued: Continued | None,
 ) -> np.ndarray:
     """Action chunks [B, H, A] in the task's units."""
     images = _images(observations)
     proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))  # [B, P]
     instructions = [o.instruction for o in observations]
-    return policy.act(images, instructions, proprio, generator).cpu().numpy()
+    return policy.act(images, instructions, proprio, generator, continued).cpu().numpy()
 
 
 def _images(observations: list[Observation]) -> Images:
@@ -377,7 +454,11 @@ def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
     for number, action in enumerate(actions, 1):
         look = number == len(actions) or episode.moments is not None
         # Actions are defined in [-1, 1]; a flow may end a little outside.
-        episode.last = step = episode.env.step(np.clip(action, -1, 1), look)
+        given = np.clip(action, -1, 1)
+        if episode.executed is not None:
+            episode.changes.append(float(np.square(given - episode.executed).mean()))
+        episode.executed = given
+        episode.last = step = episode.env.step(given, look)
         episode.steps += 1
         episode.observation = step.observation or episode.observation
         episode.total_reward += step.reward or 0.0

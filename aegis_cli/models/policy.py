@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from aegis_cli.common.devices import autocast, send
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core import continuation
 from aegis_cli.core.attention import KeyValue
+from aegis_cli.core.continuation import Continued
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
 from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
@@ -129,6 +131,7 @@ class Policy(nn.Module):
         instructions: Sequence[str],
         proprio: Tensor,
         generator: torch.Generator,
+        continued: Continued | None = None,
     ) -> Tensor:
         """One action chunk per frame, [B, H, A] in raw units.
 
@@ -137,9 +140,10 @@ class Policy(nn.Module):
             instructions: B texts.
             proprio: [B, P] in raw units.
             generator: draws the noise that the flow begins with, on the CPU.
+            continued: what the chunks continue, in raw units; None: nothing.
         """
         noise = self.draw_noise(len(images), generator)
-        return self.act_from(images, instructions, proprio, noise)
+        return self.act_from(images, instructions, proprio, noise, continued)
 
     def draw_noise(self, frames: int, generator: torch.Generator) -> Tensor:
         """The noise [frames, H, A] that the flow begins with, on the CPU."""
@@ -148,14 +152,24 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def act_from(
-        self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
+        self,
+        images: Images,
+        instructions: Sequence[str],
+        proprio: Tensor,
+        noise: Tensor,
+        continued: Continued | None = None,
     ) -> Tensor:
         """What `act` returns for that noise [B, H, A]."""
         with autocast(self.backbone.device, self.acts_in):
-            return self._acted(images, instructions, proprio, noise)
+            return self._acted(images, instructions, proprio, noise, continued)
 
     def _acted(
-        self, images: Images, instructions: Sequence[str], proprio: Tensor, noise: Tensor
+        self,
+        images: Images,
+        instructions: Sequence[str],
+        proprio: Tensor,
+        noise: Tensor,
+        continued: Continued | None,
     ) -> Tensor:
         encoding = self.encode(images, instructions)
         proprio = proprio.to(self.backbone.device)
@@ -167,8 +181,13 @@ class Policy(nn.Module):
             found = self._velocity(one_sample, time, state, encoding.keys_values, suffix)
             return found[:, 0]
 
-        predicted = flow.integrate(velocity, noise.to(state.device))
-        return self.action_scale.invert(predicted) + self.origins(proprio)
+        field: continuation.Velocity = velocity
+        origins = self.origins(proprio)
+        if continued is not None:
+            old = self.action_scale(continued.actions.to(state.device) - origins)
+            field = continuation.guided(velocity, Continued(old, continued.delay), noise.shape[1])
+        predicted = flow.integrate(field, noise.to(state.device))
+        return self.action_scale.invert(predicted) + origins
 
     def _velocity(
         self, x: Tensor, times: Tensor, proprio: Tensor, prefix: Sequence[KeyValue], suffix: Suffix

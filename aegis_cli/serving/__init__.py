@@ -1,4 +1,4 @@
-"""A trained policy for other programs, over a network."""
+"""A trained policy for other programs: over a network, or while its robot moves."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ read as well.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,15 +18,22 @@ from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.deploy import DeployedPolicy, Pictures
 
 STATE, PROMPT, IMAGE = "observation/state", "prompt", "observation/image"
+PREVIOUS, DELAY = "previous_actions", "delay"  # of a client that moves while it waits
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy is given: its pictures, the instruction, and positions [P] float32."""
+    """What a policy is given: its pictures, the instruction, and positions [P] float32.
+
+    Attributes:
+        previous, delay: as `DeployedPolicy.predict_action_chunk` takes them.
+    """
 
     pictures: Pictures
     prompt: str
     state: np.ndarray
+    previous: np.ndarray | None = None
+    delay: int = 0
 
 
 class Reader:
@@ -56,6 +63,8 @@ class Reader:
             "chunk": policy.chunk if policy.ensemble is None else 1,
             "replan": policy.replan,
             "ensemble": policy.ensemble,
+            "previous": PREVIOUS if policy.ensemble is None else None,
+            "delay": DELAY if policy.ensemble is None else None,
             "action_names": _listed(policy.action_names),
             "state_names": _listed(policy.state_names),
             "fps": policy.fps,
@@ -69,6 +78,14 @@ class Reader:
         """
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
+        seen = self._seen(message)
+        if message.get(PREVIOUS) is None:
+            return seen
+        previous = self._finite(f"'{PREVIOUS}'", self._array(PREVIOUS, message[PREVIOUS]))
+        return replace(seen, previous=previous, delay=message.get(DELAY, 0))
+
+    def _seen(self, message: Mapping[Any, Any]) -> Observation:
+        """The pictures, the instruction and the positions of a message."""
         if STATE not in message and observation.is_one(message, self._policy.state_names):
             return self._lerobots(message)
         if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called

@@ -25,7 +25,7 @@ from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.deploy import DeployedPolicy, load_policy
 from aegis_cli.serving import wire
-from aegis_cli.serving.observations import Observation, Reader
+from aegis_cli.serving.observations import PREVIOUS, Observation, Reader
 
 HEALTH = "/healthz"
 LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed pictures of a camera are a tenth of it
@@ -186,5 +186,11 @@ def _actions(policy: DeployedPolicy, seen: Observation) -> np.ndarray:
     """The policy's chunk [H, A]; with a temporal ensemble the one action [1, A] of this step."""
     given = (seen.pictures, seen.prompt, seen.state)
     if policy.ensemble is None:
-        return policy.predict_action_chunk(*given)
+        return policy.predict_action_chunk(*given, seen.previous, seen.delay)
+    if seen.previous is not None:
+        raise AegisError(
+            f"'{PREVIOUS}' for a temporal ensemble, which executes one action of each chunk",
+            "observations without it",
+            "serve the policy without --ensemble",
+        )
     return policy.select_action(*given)[None]

@@ -327,7 +327,14 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     assert calls == [
         (
             (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
-            {"load": load_acting, "seed": 4, "keep": True, "ensemble": None},
+            {
+                "load": load_acting,
+                "seed": 4,
+                "keep": True,
+                "ensemble": None,
+                "delay": None,
+                "guided": True,
+            },
         )
     ]
     calls, drawn = stage("evaluate", Evaluated()), []
@@ -382,7 +389,7 @@ def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
         "probe", "runs/x", "--baseline", "embedded", "--max-drop", "0.5", "--json"
     )
     assert got == code and json.loads(out)["passed"] is passed
-    assert ("gate failed: dropped 2.00 points, more" in err) == (code == 1)
+    assert ("gate failed: a drop of 2.00 points, more" in err) == (code == 1)
 
 
 def test_a_gate_on_the_upper_end_says_it(aegis, stage):
@@ -390,7 +397,7 @@ def test_a_gate_on_the_upper_end_says_it(aegis, stage):
     limits = ("--max-drop", "2.5", "--gate", "upper")
     code, _, err = aegis("probe", "runs/x", "--baseline", "embedded", *limits)
     assert code == 1 and calls[0][1]["gate"] == "upper"
-    assert "dropped 2.00 points or up to 3.00, more than --max-drop 2.5" in err
+    assert "a drop of 2.00 points, which may be as large as 3.00, more than --max-drop 2.5" in err
     assert aegis("probe", "runs/x", "--baseline", "embedded", "--gate", "worst")[0] == 2
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -50,6 +52,16 @@ def test_others_are_refused(text: str, said: str) -> None:
     with pytest.raises(AegisError) as caught:
         episodes.chosen(text, 5, SPLITS, Path("x"))
     assert said in caught.value.expected and text.split("-")[-1] in caught.value.found
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_numbers_are_written_as_they_are_read(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    numbers = np.flatnonzero(rng.random(40) < rng.random()).tolist() or [3]
+    text = episodes.as_text(numbers)
+    assert episodes.listed(text) == numbers
+    runs = 1 + sum(b != a + 1 for a, b in itertools.pairwise(numbers))
+    assert text.count(",") == runs - 1  # each run of numbers is one range
 
 
 def test_a_split_of_more_than_a_million_episodes_is_no_list_of_them() -> None:

@@ -363,7 +363,7 @@ def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path
     code, out, _ = aegis("probe", taught, *given)
     assert code == 0
     code, out, err = aegis("probe", broken, *given)
-    assert code == 1 and "gate failed: dropped" in err and "Traceback" not in err
+    assert code == 1 and "gate failed: a drop of" in err and "Traceback" not in err
     report = json.loads(out)
     assert {"accuracy", "cross_entropy", "drop_points", "families", "layers", "questions"} <= set(
         report

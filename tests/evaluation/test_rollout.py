@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -21,6 +23,7 @@ from aegis_cli import sim
 from aegis_cli.common import artifacts, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import HELD_OUT, RGB, SEEN
+from aegis_cli.core.continuation import Continued
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import rollout
 from aegis_cli.sim.contract import Observation, Step
@@ -80,8 +83,14 @@ class Puppet:
         return self
 
     def act(
-        self, images: torch.Tensor, texts: list[str], proprio: torch.Tensor, _: torch.Generator
+        self,
+        images: torch.Tensor,
+        texts: list[str],
+        proprio: torch.Tensor,
+        _: torch.Generator,
+        continued: Continued | None = None,
     ) -> torch.Tensor:
+        assert continued is None
         self.calls += 1
         by_picture = {env.shown[-1].image.tobytes(): env for env in self.envs}
         seen = [by_picture[image.numpy().tobytes()] for image in images]
@@ -236,6 +245,18 @@ def test_an_ensemble_executes_the_mean_of_what_was_predicted(
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize(("far", "change"), [(0.2, 0.4), (3.0, 2.0)])
+def test_the_change_of_the_actions_is_that_of_what_is_executed(
+    far: float, change: float, puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a policy that turns back at every step, in one of two dimensions; 1 is a full action."""
+    policy = puppet(rest, chunk=2)
+    turns = np.array([[far, 0.1], [-far, 0.1]], np.float32)
+    monkeypatch.setattr(policy, "act", lambda images, *_: torch.from_numpy(turns)[None])
+    report = rollout.run(Path("any"), None, 1, "seen")
+    assert report.action_change == pytest.approx(change / math.sqrt(2))
+
+
 def test_a_replan_that_is_asked_for_executes_chunks_as_they_are(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,6 +267,76 @@ def test_a_replan_that_is_asked_for_executes_chunks_as_they_are(
     assert policy.calls == 2
     with pytest.raises(AegisError, match="decay inf"):
         rollout.run(Path("any"), None, 2, "seen", ensemble=float("inf"))
+
+
+@pytest.mark.parametrize("guided", [True, False])
+@pytest.mark.parametrize(("replan", "delay"), [(4, 3), (5, 0), (3, 3), (6, 1)])
+def test_while_a_delayed_chunk_is_predicted_the_one_before_is_executed(
+    replan: int,
+    delay: int,
+    guided: bool,
+    puppet: Callable[..., Puppet],
+    envs: list[Seen],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of several episodes, one of which ends before the others."""
+    horizon, predicted = 9, list[np.ndarray]()
+    told, executed = list[Continued | None](), dict[int, list[np.ndarray]]()
+    draws = np.random.default_rng(0)
+    policy = puppet(rest, chunk=horizon)
+    policy.expert = SimpleNamespace(shape=SimpleNamespace(chunk=horizon))
+
+    def act(images: torch.Tensor, *given: Any) -> torch.Tensor:
+        predicted.append(draws.uniform(-0.2, 0.2, (len(images), horizon, 2)).astype(np.float32))
+        told.append(given[-1])
+        return torch.from_numpy(predicted[-1])
+
+    def step(self: Seen, action: np.ndarray, look: bool) -> Step:
+        number = envs.index(self)
+        executed.setdefault(number, []).append(action)
+        done = number == 1 and len(executed[number]) == 20
+        found = self.env.step(action)
+        return dataclasses.replace(found, done=True) if done else found
+
+    monkeypatch.setattr(policy, "act", act)
+    monkeypatch.setattr(Seen, "step", step)
+    meta = {"task": "point", "replan": replan}
+    monkeypatch.setattr(checkpoint, "load_policy", lambda _: (policy, meta))
+    rollout.run(Path("any"), None, 3, "seen", delay=delay, guided=guided)
+    assert [len(executed[number]) for number in range(3)] == [40, 20, 40]
+    for number, actions in executed.items():
+        for at, found in enumerate(actions):
+            asked, into = divmod(at, replan)
+            late = asked > 0 and into < delay  # the chunk before goes on
+            rows = [3 if turn * replan < 20 else 2 for turn in range(len(predicted))]
+            chunk = predicted[asked - late]
+            row = number if rows[asked - late] == 3 or number == 0 else 1
+            expected = chunk[row, into + replan * late]
+            np.testing.assert_array_equal(found, expected)
+    assert told[0] is None and all((one is not None) == guided for one in told[1:])
+    for one, before in zip(told[1:], predicted, strict=False):
+        if one is not None and len(one.actions) == len(before):
+            # What is left of the chunk before, and nothing of what was executed.
+            assert one.delay == delay
+            np.testing.assert_array_equal(one.actions, before[:, replan:])
+
+
+@pytest.mark.parametrize(
+    ("replan", "delay", "longest"), [(2, 3, 2), (7, 3, 2), (9, 1, 0), (2, -1, 2)]
+)
+def test_a_delay_that_a_chunk_cannot_bridge_is_refused(
+    replan: int, delay: int, longest: int, puppet: Callable[..., Puppet]
+) -> None:
+    policy = puppet(rest, chunk=9)
+    policy.expert = SimpleNamespace(shape=SimpleNamespace(chunk=9))
+    with pytest.raises(AegisError, match=f"a delay of {delay} steps") as caught:
+        rollout.run(Path("any"), None, 1, "seen", replan=replan, delay=delay)
+    assert f"0 to {longest}:" in caught.value.expected and policy.calls == 0
+
+
+def test_a_delay_is_not_for_a_temporal_ensemble(run_folder: Path) -> None:
+    with pytest.raises(AegisError, match="with the temporal ensemble 0.1"):
+        rollout.run(run_folder, None, 1, "seen", delay=1, ensemble=0.1)
 
 
 def test_progress_and_more_episodes_than_one_group(

@@ -99,6 +99,25 @@ def test_an_observation_without_a_prompt_has_the_servers() -> None:
         np.testing.assert_array_equal(client.infer(without)["actions"], chunk(deployed(), seen))
 
 
+def test_a_robot_that_moves_meanwhile_gets_a_chunk_that_continues_its_own() -> None:
+    own, seen = deployed(), observation()
+    given = (seen["observation/image"], seen["prompt"], seen["observation/state"])
+    previous = np.linspace(-1, 1, 6, dtype=np.float32).reshape(3, 2)
+    with served(deployed()) as serving, Client(serving.url) as client:
+        names = client.metadata["previous"], client.metadata["delay"]
+        for left, delay in ((previous, 2), (previous, 0), (previous[:0], 0)):
+            answer = client.infer({**seen, **dict(zip(names, (left, delay), strict=True))})
+            expected = own.predict_action_chunk(*given, left, delay)
+            np.testing.assert_array_equal(answer["actions"], expected)
+        for wrong, said in (
+            ((previous, 4), "a delay of 4 actions"),
+            ((previous[:, :1], 0), "previous actions of shape (3, 1)"),
+            (("none", 0), "'previous_actions' of type"),
+        ):
+            refused = client.infer({**seen, **dict(zip(names, wrong, strict=True))})
+            assert isinstance(refused, str) and said in refused
+
+
 # --- what goes wrong ------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.episodes import as_text
 from aegis_cli.data.lerobot import layout
-from aegis_cli.data.lerobot.source import LEFT_OUT, WITHOUT, DataFile, Source, column, numbers
+from aegis_cli.data.lerobot.source import CHOOSING, WITHOUT, DataFile, Source, column, numbers
 
 _RATE_TOLERANCE = 0.1  # share of a step by which the usual one may differ from 1 / fps
 
@@ -63,19 +65,40 @@ def read_vectors(source: Source, feature: str) -> np.ndarray:
     """
     size, feature = source.dataset.size(feature), source.dataset.own(feature)
     vectors = np.zeros((source.dataset.info.frames, size), np.float32)
+    bad = list[tuple[DataFile, np.ndarray]]()
     for file in source.data:
         rows = _matrix(_read(file, feature), size, feature, file.path)
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if len(bad):
-            row = int(_rows_of(file)[bad[0]])
-            raise AegisError(
-                f"'{feature}' in '{file.path}' has NaN or infinite values in {len(bad)} rows, the "
-                f"first in row {row}, of episode {_episode_at(source, file, int(bad[0]))}",
-                "finite numbers",
-                f"{LEFT_OUT}, or record them again",
-            )
+        places = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if len(places):
+            bad.append((file, places))
         _put(vectors, file, rows)
+    if bad:
+        raise _not_finite(source, feature, bad)
     return vectors
+
+
+def _not_finite(
+    source: Source, feature: str, bad: Sequence[tuple[DataFile, np.ndarray]]
+) -> AegisError:
+    """The error for values that are not finite, with all episodes that have such, not the first.
+
+    Args:
+        bad: files, each with the places of such rows among those that are read of it.
+    """
+    episodes = set[int]()
+    for file, places in bad:
+        episodes |= {_episode_at(source, file, int(place)) for place in places}
+    file, places = bad[0]
+    count = sum(len(places) for _, places in bad)
+    where = f"row {int(_rows_of(file)[places[0]])} of '{file.path}'"
+    sound = [number for number in source.episodes if number not in episodes]
+    alone = f"take episodes {as_text(sound)} alone" if sound else "take other episodes"
+    return AegisError(
+        f"'{feature}' of '{source.dataset.folder}' has NaN or infinite values in {count} rows of "
+        f"episodes {as_text(sorted(episodes))}, the first in {where}",
+        "finite numbers",
+        f"{alone} ({CHOOSING}), or record these again",
+    )
 
 
 def _put(target: np.ndarray, file: DataFile, values: np.ndarray) -> None:

@@ -22,10 +22,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.dataset import Dataset
 
-LEFT_OUT = (
-    "leave those episodes out (demos.only, --only of aegis anchor, or --episodes of aegis evaluate)"
-)
-WITHOUT = f"get the dataset again, or {LEFT_OUT}"
+CHOOSING = "demos.only, --only of aegis anchor, or --episodes of aegis evaluate"
+WITHOUT = f"get the dataset again, or leave those episodes out ({CHOOSING})"
 
 
 @dataclass(frozen=True)

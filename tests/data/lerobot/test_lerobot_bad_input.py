@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +16,10 @@ from pyarrow import parquet
 from samples.lerobot import data_files, edit_info, edit_table, episodes, replaced, save
 from samples.user_folder import LFS_POINTER, TRAIN, training
 
+from aegis_cli.data import demonstrations
 from aegis_cli.data.lerobot import layout, write
 from aegis_cli.data.lerobot.write import Limits
+from aegis_cli.data.selection import Selection
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -279,7 +282,27 @@ def test_numbers_that_are_none(value: float, feature: str, bad: Bad, folder: Pat
         return replaced(table, feature, pa.array(rows, table.schema.field(feature).type))
 
     edit_table(folder / IMAGE, spoil)
-    bad(*FROM_FOLDER, says=(f"'{feature}'", IMAGE, "1 rows", "row 3", "finite"))
+    bad(*FROM_FOLDER, says=(f"'{feature}'", IMAGE, "1 rows of episodes 0,", "row 3", "finite"))
+
+
+def test_all_episodes_with_numbers_that_are_none_are_named_and_the_others_can_be_taken(
+    bad: Bad, place: Path
+) -> None:
+    folder = save(place / "d", episodes(7), Limits(data_mb=0))
+    for number in (2, 5):
+
+        def spoil(table: pa.Table, number: int = number) -> pa.Table:
+            rows = table.column("action").to_pylist()
+            rows[table.column("episode_index").to_pylist().index(number)][0] = float("nan")
+            kind = table.schema.field("action").type
+            return replaced(table, "action", pa.array(rows, kind))
+
+        edit_table(data_files(folder)[number], spoil)
+    said = bad(*FROM_FOLDER, says=("2 rows of episodes 2,5,", "take episodes 0-1,3-4,6 alone"))
+    (alone,) = re.findall("take episodes (.*) alone", said)
+    found = demonstrations.load(folder, 0.3, 0, selection=Selection(only=alone))
+    assert set(found.episode_of[found.read].tolist()) == {0, 1, 3, 4, 6}
+    bad(*FROM_FOLDER, "--set", "demos.only=2,5", says=("of episodes 2,5", "take other episodes"))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -1,0 +1,87 @@
+"""Real-time chunking: a chunk of actions that continues the one which the robot still executes.
+
+Black, Galliker, Levine: Real-Time Execution of Action Chunking Flow Policies (arXiv 2506.07339).
+While a chunk is predicted, the robot goes on with the chunk before. By the time the new one is
+there, it has moved; a chunk that plans another way would then jerk it over. So each step of the
+flow is pulled towards what is left of the old chunk: fully over the actions that will have been
+executed by then, less and less over the others that it has, and not beyond.
+
+With t = 1 at the noise and t = 0 at the action, as in `models.flow`, a velocity v(x, t) expects the
+action a(x) = x - t v(x, t). Guidance by pseudo-inverse (the paper's equations 2 to 5, whose time
+runs the other way) replaces the velocity by
+
+    v - g(t) J^T W (y - a(x)),    g(t) = min(b, (t^2 + (1 - t)^2) / (t (1 - t))),
+
+where y is the old chunk, W has a weight for each of its steps, J is the derivative of a(x), and
+b = 5 bounds the pull where the noise is nearly all there is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+STRONGEST = 5.0  # the paper's bound b
+
+Velocity = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Continued:
+    """What a chunk continues.
+
+    Attributes:
+        actions: what is left of the old chunk [B, n, A] when the policy looks, n <= H.
+        delay: how many of them are executed before the new chunk is there, at most n.
+    """
+
+    actions: Tensor
+    delay: int
+
+
+def weights(left: int, delay: int, horizon: int) -> Tensor:
+    """How strongly each step of a new chunk is held to the old one [horizon] float32, in [0, 1].
+
+    Args:
+        left: n, the steps that the old chunk still has.
+        delay: d <= n; the steps that are executed before the new chunk is there.
+        horizon: H >= n.
+    """
+    step = torch.arange(horizon, dtype=torch.float64)
+    share = ((left - step) / (left - delay + 1)).clamp(0, 1)
+    fading = share * torch.expm1(share) / (math.e - 1)
+    return torch.where(step < delay, 1.0, fading).float()
+
+
+def strength(time: Tensor) -> Tensor:
+    """g(t) of flow times [B] in (0, 1]."""
+    rest = 1 - time
+    exact = (time.square() + rest.square()) / (time * rest)  # infinite at t = 1
+    return exact.clamp(max=STRONGEST)
+
+
+def guided(velocity: Velocity, continued: Continued, horizon: int) -> Velocity:
+    """The velocity that leads to a chunk [B, H, A] which continues the old one.
+
+    Args:
+        velocity: v(x, t) of chunks [B, H, A] and times [B]; PyTorch differentiates it.
+        continued: in the units of the flow.
+    """
+    left = continued.actions.shape[1]
+    held = weights(left, continued.delay, horizon).to(continued.actions.device)[:, None]
+    target = torch.nn.functional.pad(continued.actions, (0, 0, 0, horizon - left))
+
+    def pulled(x: Tensor, time: Tensor) -> Tensor:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            moves = velocity(x, time)
+            expected = x - time[:, None, None] * moves
+            missing = held * (target - expected.detach())
+            (pull,) = torch.autograd.grad(expected, x, missing.to(expected.dtype))
+        return moves.detach() - strength(time)[:, None, None] * pull
+
+    return pulled
