@@ -240,9 +240,9 @@ def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) ->
     longest = min(replan, chunk - replan)
     if not 0 <= delay <= longest:
         raise AegisError(
-            f"a delay of {delay} steps, of chunks of {chunk} actions of which {replan} are executed",
+            f"a delay of {delay} steps, with chunks of {chunk} actions, {replan} of them executed",
             f"0 to {longest}: as many are left of a chunk, and no more are executed of the next",
-            "train with a longer train.chunk" if delay > 0 else "use --delay 1",
+            f"use --delay {longest}, or a policy of longer chunks (train.chunk)",
         )
 
 
