@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from samples.training import make_policy, policy_over
@@ -243,6 +244,40 @@ def test_another_task_drops_the_chunk_of_the_one_before(plugin: Any) -> None:
     taken = [policy.select_action(seen(text, shade=0.2 * i)) for i, text in enumerate(texts)]
     expected = [chunks[0][:, :1], chunks[1][:, :2], chunks[2][:, :2]]
     torch.testing.assert_close(torch.stack(taken, 1), torch.cat(expected, 1), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("delay", "filled"), [(2, 0), (1, 3), (5, 1), (None, 0)])
+def test_lerobots_real_time_chunking_gets_the_chunks_of_load_policy(
+    delay: int | None, filled: int, plugin: Any
+) -> None:
+    """LeRobot fills up what is left of a chunk with zeros, and its delay may be longer."""
+    own, policy = DeployedPolicy(make_policy().eval(), None, (), 2), acting(plugin)
+    left = torch.linspace(-1, 1, 6).reshape(3, 2)
+    given = torch.cat([left, torch.zeros(filled, 2)])
+    assert policy.supports_rtc()
+    found = policy.predict_action_chunk(seen(), inference_delay=delay, prev_chunk_left_over=given)
+    picture = np.zeros((30, 40, 3), np.uint8)
+    expected = own.predict_action_chunk(
+        picture, TEXT, [0.3, -0.1, 0.2], left.numpy(), min(delay or 0, 3)
+    )
+    np.testing.assert_array_equal(found[0].numpy(), expected)
+
+
+@pytest.mark.parametrize("left", [None, torch.zeros(0, 2), torch.zeros(4, 2)])
+def test_where_nothing_is_left_a_chunk_begins_anew(left: Any, plugin: Any) -> None:
+    expected = acting(plugin).predict_action_chunk(seen())
+    found = acting(plugin).predict_action_chunk(
+        seen(), inference_delay=0, prev_chunk_left_over=left
+    )
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (2, 3, 2), (2,)])
+def test_what_is_left_of_another_robots_chunk_is_refused(
+    shape: tuple[int, ...], plugin: Any
+) -> None:
+    with pytest.raises(AegisError, match=r"of shape \(.*\n.*\(1, n, 2\)"):
+        acting(plugin).predict_action_chunk(seen(), prev_chunk_left_over=torch.ones(shape))
 
 
 def test_actions_that_are_not_finite_are_refused(plugin: Any) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 from aegis_cli import methods
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
+from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch
 from aegis_cli.models import backbones, lerobot_folder
@@ -120,24 +121,60 @@ class AegisPolicy(PreTrainedPolicy):
             self._follow = texts
         return self._ahead.popleft()
 
+    def supports_rtc(self) -> bool:
+        """LeRobot's real-time chunking (`--inference.type=rtc`) asks for chunks that continue."""
+        return True
+
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Any], noise: Tensor | None = None) -> Tensor:
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Any],
+        noise: Tensor | None = None,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+    ) -> Tensor:
         """The next actions of each row, [B, H, A] in raw units.
 
         Args:
             batch: pictures [B, 3, H, W] in [0, 1], `observation.state` [B, P] and B texts `task`.
             noise: must be None; the policy draws its own, from `noise_seed`.
+            inference_delay: how many of the actions that are left are executed before these are
+                there; None: none.
+            prev_chunk_left_over: what is left of the chunk before [n, A] or [B, n, A], which these
+                continue (`aegis_cli.core.continuation`); None: they begin anew.
 
         Raises:
-            AegisError: pictures, texts or a state that the policy cannot act on, or predicted
-                actions that are not finite.
+            AegisError: pictures, texts or a state that the policy cannot act on, actions of other
+                sizes, or predicted ones that are not finite.
         """
         if noise is not None:
             raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
         self.eval()
         images, texts = self._images(batch), _texts(batch)
         state = self._state(batch, len(texts))
-        return check_actions(self.model.act(images, texts, state, self._generator))
+        continued = self._continued(prev_chunk_left_over, inference_delay or 0, len(texts))
+        return check_actions(self.model.act(images, texts, state, self._generator, continued))
+
+    def _continued(self, left: Tensor | None, delay: int, rows: int) -> Continued | None:
+        """What chunks are to continue, as LeRobot gives it; None where nothing is left."""
+        if left is None:
+            return None
+        actions = left.float() if left.ndim == 3 else left.float()[None]
+        if actions.ndim != 3 or actions.shape[0] != rows or actions.shape[2] != self._actions:
+            raise AegisError(
+                f"what is left of a chunk of shape {tuple(left.shape)}",
+                f"({rows}, n, {self._actions})",
+                "give the actions as the policy predicted them",
+            )
+        # LeRobot 0.6 fills up what is shorter than --inference.rtc.execution_horizon with zeros.
+        given = actions.abs().amax((0, 2)).nonzero()
+        count = int(given[-1]) + 1 if len(given) else 0
+        actions = actions[:, : min(count, self.config.chunk_size)]
+        return Continued(actions, min(delay, actions.shape[1])) if actions.shape[1] else None
+
+    @property
+    def _actions(self) -> int:
+        return len(self.model.action_scale.mean)
 
     @torch.no_grad()
     def generate_text(
