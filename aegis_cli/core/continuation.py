@@ -52,9 +52,9 @@ def weights(left: int, delay: int, horizon: int) -> Tensor:
         horizon: H >= n.
     """
     step = torch.arange(horizon, dtype=torch.float64)
+    # Of a step that is executed the share is 1 or more, and so its weight is 1.
     share = ((left - step) / (left - delay + 1)).clamp(0, 1)
-    fading = share * torch.expm1(share) / (math.e - 1)
-    return torch.where(step < delay, 1.0, fading).float()
+    return (share * torch.expm1(share) / (math.e - 1)).float()
 
 
 def strength(time: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from samples.training import make_policy, robot_batch
 from samples.training_runs import Start
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.core.continuation import Continued
 from aegis_cli.data import demonstrations, relative
 from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.relative import Origins
@@ -121,6 +122,12 @@ def test_a_policy_learns_actions_less_their_positions_and_adds_these_again(
     noise = plain.draw_noise(len(batch), torch.Generator().manual_seed(1))
     absolute = plain.act_from(*seen, noise)
     assert torch.equal(policy.act_from(*seen, noise), absolute + origins)
+    # So is what a chunk continues, of which the robot has executed some since.
+    left = absolute[:, 1:] + 0.3
+    held = plain.act_from(*seen, noise, Continued(left, 1))
+    found = policy.act_from(*seen, noise, Continued(left + origins, 1))
+    torch.testing.assert_close(found, held + origins)
+    assert not torch.allclose(held, absolute)
 
 
 def test_places_are_no_part_of_the_weights() -> None:

@@ -23,7 +23,7 @@ from aegis_cli import Guard
 from aegis_cli.cli import render
 from aegis_cli.common import memory
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Progress, ignore
 from aegis_cli.evaluation import bench, bench_runs
 from aegis_cli.guard.guard import METHODS as METHODS_OF_GUARD
 from aegis_cli.methods import METHODS
@@ -145,6 +145,33 @@ def test_a_step_is_that_of_training(
     training = calls[0][1]
     assert training.parts.constrain is not None
     assert training.policy.expert.shape.width == chosen.expert.width
+
+
+def test_all_methods_take_as_many_steps_in_a_turn(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As many as those that one of them has to take, or more."""
+    needed, taken = {"naive": 1, "nullspace": 4, "kfac": 3}, dict.fromkeys(METHODS, 0)
+
+    def stepper(recipe: Any, *_: Any) -> tuple[Callable[[], None], int]:
+        method = recipe.train.method
+
+        def turn() -> None:
+            taken[method] += needed[method]
+
+        return turn, needed[method]
+
+    def take_turns(_: str, parts: Any, *rest: Any) -> dict[str, float]:
+        for turn in parts.values():
+            turn()
+        return {name: float(taken[name]) for name in parts}
+
+    monkeypatch.setattr(bench_runs, "stepper", stepper)
+    monkeypatch.setattr(bench_runs, "take_turns", take_turns)
+    recipes = {name: recipe(tiny_folder, method=name) for name in needed}
+    seconds = bench._step_seconds(recipes, tmp_path, tmp_path, 1, ignore)
+    assert {name: taken[name] for name in needed} == {"naive": 4, "nullspace": 4, "kfac": 6}
+    assert seconds == dict.fromkeys(needed, 1.0)
 
 
 def test_a_recipe_that_would_diverge_can_be_timed(

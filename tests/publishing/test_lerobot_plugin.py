@@ -263,6 +263,16 @@ def test_lerobots_real_time_chunking_gets_the_chunks_of_load_policy(
     np.testing.assert_array_equal(found[0].numpy(), expected)
 
 
+def test_more_than_a_chunk_can_continue_is_left_out(plugin: Any) -> None:
+    """Later versions of LeRobot fill up by the last action."""
+    left = torch.linspace(-1, 1, 8).reshape(4, 2)
+    longer = torch.cat([left, left[-1:].expand(6, 2)])
+    given = {"inference_delay": 1, "prev_chunk_left_over": left}
+    expected = acting(plugin).predict_action_chunk(seen(), **given)
+    found = acting(plugin).predict_action_chunk(seen(), **given | {"prev_chunk_left_over": longer})
+    assert torch.equal(found, expected)
+
+
 @pytest.mark.parametrize("left", [None, torch.zeros(0, 2), torch.zeros(4, 2)])
 def test_where_nothing_is_left_a_chunk_begins_anew(left: Any, plugin: Any) -> None:
     expected = acting(plugin).predict_action_chunk(seen())

@@ -40,12 +40,15 @@ class Planned(DeployedPolicy):
         super().__init__(make_policy().eval(), None, (), replan)
         self.asked: list[tuple[Seen, Continued | None]] = []
         self.may_end = threading.Semaphore(0)
+        self.alone = threading.Lock()
         self.fails = False
 
     def predict(self, seen: Seen, continued: Continued | None = None) -> np.ndarray:
         self.asked.append((seen, continued))
+        assert self.alone.acquire(blocking=False)  # two at once would share the noise
         if threading.current_thread() is not threading.main_thread():
             assert self.may_end.acquire(timeout=30)
+        self.alone.release()
         if self.fails:
             raise AegisError("a picture of nothing", "something", "look elsewhere")
         step = seen.positions[0] + np.arange(CHUNK, dtype=np.float32)
@@ -159,7 +162,8 @@ def test_another_instruction_begins_anew(planned: Planned) -> None:
     with RealTime(planned) as running:
         for step in range(3):
             running.select_action(picture, TEXT, at(step))
-        planned.may_end.release()  # what is under way is of the old instruction
+        # What is under way is of the old instruction.
+        threading.Timer(0.05, planned.may_end.release).start()
         assert running.select_action(picture, OTHER, at(50)).tolist() == [50, 50]
         assert [c is None for _, c in planned.asked] == [True, False, True]
         assert running.select_action(picture, OTHER, at(51)).tolist() == [51, 51]

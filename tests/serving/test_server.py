@@ -286,6 +286,10 @@ def test_a_temporal_ensemble_answers_with_the_one_action_of_a_step() -> None:
     with served(given) as serving:
         metadata = serving.metadata
         assert [metadata[key] for key in ("chunk", "replan", "ensemble")] == [1, 1, decay]
+        assert (metadata["previous"], metadata["delay"]) == (None, None)
+        with Client(serving.url) as client:
+            refused = client.infer(observation() | {"previous_actions": np.zeros((1, 2))})
+            assert "'previous_actions' for a temporal ensemble" in refused
         for _ in range(2):
             own.reset()
             with Client(serving.url) as client:
