@@ -864,12 +864,12 @@ def rollout(
         Option(
             metavar="STEPS",
             help="Steps that a prediction takes, in which the robot goes on with the chunk before; "
-            "the next chunk continues it. Default: the robot waits.",
+            "default: it waits.",
         ),
     ] = None,
-    unguided: Annotated[
+    guided: Annotated[
         bool,
-        Option("--unguided", help="With --delay: chunks that do not continue the one before."),
+        Option("--guided", help="With --delay: chunks that continue the one before."),
     ] = False,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     device: Device = None,
@@ -889,9 +889,9 @@ def rollout(
     """
     from aegis_cli.deploy import load_acting
 
-    if unguided and delay is None:
-        expected = "a delay, after which a chunk can continue the one before or not"
-        raise AegisError("--unguided without --delay", expected, "add --delay STEPS")
+    if guided and delay is None:
+        expected = "a delay, in which the chunk goes on that the next one continues"
+        raise AegisError("--guided without --delay", expected, "add --delay STEPS, such as 0")
 
     stages.ROLLOUT.run(
         run,
@@ -904,7 +904,7 @@ def rollout(
         keep=True,
         ensemble=ensemble,
         delay=delay,
-        guided=not unguided,
+        guided=guided,
         device=device,
         as_json=as_json,
     )

@@ -94,7 +94,7 @@ class RolloutSettings:
     replan: int | None = None
     ensemble: Number | None = None
     delay: int | None = None
-    unguided: bool | None = None
+    guided: bool | None = None
 
 
 @dataclass(frozen=True)

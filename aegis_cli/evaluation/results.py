@@ -221,14 +221,14 @@ class Played:
     Where it was by the run's recipe, that says it.
 
     Attributes:
-        delay, unguided: as `aegis rollout` was asked; None without a delay.
+        delay, guided: as `aegis rollout` was asked; None without a delay.
     """
 
     seed: int
     replan: int
     ensemble: float | None
     delay: int | None = None
-    unguided: bool | None = None
+    guided: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,7 +268,7 @@ def _played(found: Result, recipe: recipes.Recipe) -> Played:
     if not said:
         return Played(own.seed, own.replan, own.ensemble)
     seed, replan = said.get("seed", recipes.Rollout().seed), said.get("replan", own.replan)
-    delayed = said.get("delay"), said.get("unguided")
+    delayed = said.get("delay"), said.get("guided")
     return Played(seed, replan, said.get("ensemble"), *delayed)
 
 
@@ -281,8 +281,8 @@ def told_apart(played: Sequence[Played]) -> list[str]:
 
 
 def _said(name: str, value: float | None) -> str:
-    if name == "unguided":
-        return "unguided" if value else ""
+    if name == "guided":
+        return "guided" if value else ""
     return f"no {name}" if value is None else f"{name} {value}"
 
 

@@ -122,7 +122,7 @@ class _Pace:
 
     replan: int
     delay: int | None = None
-    guided: bool = True
+    guided: bool = False
 
 
 class Acting(NamedTuple):
@@ -167,7 +167,7 @@ def run(
     keep: bool = False,
     ensemble: float | None = None,
     delay: int | None = None,
-    guided: bool = True,
+    guided: bool = False,
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
@@ -224,7 +224,7 @@ def run(
         settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
         settings |= {"replan": replan or planned}
         settings |= {} if decay is None else {"ensemble": decay}
-        settings |= {} if delay is None else {"delay": delay, "unguided": not guided}
+        settings |= {} if delay is None else {"delay": delay, "guided": guided}
         results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
     return report
 
@@ -259,7 +259,7 @@ def play(
     cameras: tuple[str, ...] = (),
     ensemble: float | None = None,
     delay: int | None = None,
-    guided: bool = True,
+    guided: bool = False,
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does.
 

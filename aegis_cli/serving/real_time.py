@@ -3,8 +3,9 @@
     with RealTime(load_policy("runs/arm")) as running:
         action = running.select_action(robot.get_observation(), "go to the red target")
 
-This is algorithm 1 of real-time chunking (arXiv 2506.07339), called once a step of the robot; how
-a chunk continues the one before is in `core.continuation`.
+This is algorithm 1 of real-time chunking (arXiv 2506.07339), called once a step of the robot. Its
+guidance, by which a chunk continues the one before (`core.continuation`), is a choice: it makes the
+robot move more smoothly, and cost success where it was measured (docs/own-robot.md).
 """
 
 from __future__ import annotations
@@ -35,17 +36,21 @@ class RealTime:
     Attributes:
         execute: how many actions are executed at least between two observations that are
             predicted from.
+        guided: whether a chunk continues the one before.
         delay: how many actions the next prediction is expected to take, as many as the longest of
             the last ten.
         waited: how often the robot had to wait since the episode began, for a prediction took
             longer than the chunk before it lasted.
     """
 
-    def __init__(self, policy: DeployedPolicy, execute: int | None = None) -> None:
+    def __init__(
+        self, policy: DeployedPolicy, execute: int | None = None, guided: bool = False
+    ) -> None:
         """Begin the policy's next episode; nobody else may let it act meanwhile.
 
         Args:
             execute: None: as many as the policy's `replan`, and half a chunk at most.
+            guided: whether a chunk is to continue the one before.
 
         Raises:
             AegisError: a temporal ensemble, or chunks of which nothing would be left.
@@ -66,7 +71,7 @@ class RealTime:
                 "the next chunk is predicted",
                 fix if policy.chunk > 1 else "train with a longer train.chunk",
             )
-        self._policy, self.execute = policy, execute
+        self._policy, self.execute, self.guided = policy, execute, guided
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="aegis-real-time")
         self._pending: Future[np.ndarray] | None = None
         self._delays: deque[int] = deque(maxlen=_REMEMBERED)
@@ -147,7 +152,7 @@ class RealTime:
     def _start(self, seen: Seen) -> None:
         """Predict from this observation, while the robot executes what is left."""
         continued = None
-        if self._ahead:
+        if self.guided and self._ahead:
             left = torch.from_numpy(np.stack(self._ahead))[None]
             continued = Continued(left, min(self.delay, len(self._ahead)))
         # A camera may write its next picture to where this one lies.

@@ -333,14 +333,14 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
                 "keep": True,
                 "ensemble": None,
                 "delay": None,
-                "guided": True,
+                "guided": False,
             },
         )
     ]
     calls.clear()
-    aegis("rollout", "runs/x", "--delay", 2, "--unguided", "--json")
-    assert (calls[0][1]["delay"], calls[0][1]["guided"]) == (2, False)
-    code, _, err = aegis("rollout", "runs/x", "--unguided")
+    aegis("rollout", "runs/x", "--delay", 2, "--guided", "--json")
+    assert (calls[0][1]["delay"], calls[0][1]["guided"]) == (2, True)
+    code, _, err = aegis("rollout", "runs/x", "--guided")
     assert code == 2 and "add --delay STEPS" in err and len(calls) == 1
     calls, drawn = stage("evaluate", Evaluated()), []
     monkeypatch.setattr(render, "open_loop_plot", lambda report, path: drawn.append(path))

@@ -55,8 +55,8 @@ def test_a_rollout_that_was_repeated_is_told_once_as_it_was_found_last(run: Path
         ({"seed": 1, "replan": 4}, {}, ("seed 0", "seed 1")),
         ({"seed": 0, "replan": 2}, {}, ("replan 4", "replan 2")),
         ({"seed": 0, "ensemble": 0.01}, {}, ("no ensemble", "ensemble 0.01")),
-        ({"seed": 0, "delay": 2, "unguided": False}, {}, ("no delay", "delay 2")),
-        ({"seed": 0, "delay": 0, "unguided": True}, {}, ("no delay", "delay 0, unguided")),
+        ({"seed": 0, "delay": 2, "guided": False}, {}, ("no delay", "delay 2")),
+        ({"seed": 0, "delay": 0, "guided": True}, {}, ("no delay", "delay 0, guided")),
         ({"seed": 0}, {"episodes": 8}, ("", "")),  # which the tables have anyway
     ],
 )

@@ -75,7 +75,7 @@ def test_each_action_is_one_for_its_own_step_whatever_predictions_take(
     rng = np.random.default_rng(seed)
     picture = images(1)[0].numpy()
     taken, ends = list[int](), 0
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         for step in range(30):
             if running._pending is not None and step == ends:
                 finished(running)
@@ -93,9 +93,20 @@ def test_each_action_is_one_for_its_own_step_whatever_predictions_take(
         assert 1 <= continued.delay <= len(left)
 
 
-def test_the_longest_of_the_last_delays_is_expected(planned: Planned) -> None:
+def test_without_guidance_a_chunk_is_predicted_by_itself(planned: Planned) -> None:
     picture = images(1)[0].numpy()
     with RealTime(planned) as running:
+        for step in range(8):
+            if running._pending is not None:
+                finished(running)
+            assert running.select_action(picture, TEXT, at(step)).tolist() == [step, step]
+        planned.may_end.release(10)
+    assert len(planned.asked) > 2 and not any(continued for _, continued in planned.asked)
+
+
+def test_the_longest_of_the_last_delays_is_expected(planned: Planned) -> None:
+    picture = images(1)[0].numpy()
+    with RealTime(planned, guided=True) as running:
         for step in range(6):
             if step in (3, 5):  # asked for in step 2, used from step 3 on: a delay of 1
                 finished(running)
@@ -107,7 +118,7 @@ def test_the_longest_of_the_last_delays_is_expected(planned: Planned) -> None:
 
 def test_a_robot_that_has_nothing_left_to_do_waits_and_goes_on(planned: Planned) -> None:
     picture = images(1)[0].numpy()
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         for step in range(4):
             running.select_action(picture, TEXT, at(step))
         threading.Timer(0.05, planned.may_end.release).start()
@@ -119,7 +130,7 @@ def test_a_robot_that_has_nothing_left_to_do_waits_and_goes_on(planned: Planned)
 
 def test_what_went_wrong_meanwhile_is_said_by_the_next_action(planned: Planned) -> None:
     picture = images(1)[0].numpy()
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         for step in range(3):
             running.select_action(picture, TEXT, at(step))
         planned.fails = True
@@ -136,7 +147,7 @@ def test_after_a_failure_the_next_prediction_begins_where_nothing_is_left(
     planned: Planned,
 ) -> None:
     picture = images(1)[0].numpy()
-    with RealTime(planned, execute=3) as running:
+    with RealTime(planned, 3, guided=True) as running:
         for step in range(4):
             running.select_action(picture, TEXT, at(step))
         planned.fails = True
@@ -151,7 +162,7 @@ def test_after_a_failure_the_next_prediction_begins_where_nothing_is_left(
 
 def test_a_sensor_that_fails_stops_the_robot_at_once(planned: Planned) -> None:
     picture = images(1)[0].numpy()
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         running.select_action(picture, TEXT, at(0))
         with pytest.raises(AegisError, match="not finite"):
             running.select_action(picture, TEXT, [float("nan"), 0, 0])
@@ -159,7 +170,7 @@ def test_a_sensor_that_fails_stops_the_robot_at_once(planned: Planned) -> None:
 
 def test_another_instruction_begins_anew(planned: Planned) -> None:
     picture = images(1)[0].numpy()
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         for step in range(3):
             running.select_action(picture, TEXT, at(step))
         # What is under way is of the old instruction.
@@ -172,7 +183,7 @@ def test_another_instruction_begins_anew(planned: Planned) -> None:
 def test_a_camera_may_write_its_next_picture_over_the_last(planned: Planned) -> None:
     picture, positions = images(1)[0].numpy().copy(), np.array(at(0), np.float32)
     shown = picture.copy()
-    with RealTime(planned) as running:
+    with RealTime(planned, guided=True) as running:
         for step in range(3):
             positions[0] = step
             running.select_action(picture, TEXT, positions)
@@ -199,7 +210,7 @@ def test_an_episode_begins_as_that_of_the_policy_does() -> None:
 def test_chunks_of_a_real_policy_continue_each_other(run_folder: Path) -> None:
     """Its own thread differentiates it, within a program that differentiates nothing."""
     picture = images(1)[0].numpy()
-    with torch.inference_mode(), RealTime(load_policy(run_folder)) as running:
+    with torch.inference_mode(), RealTime(load_policy(run_folder), guided=True) as running:
         positions = [0.1] * running._policy.positions
         actions = [running.select_action(picture, TEXT, positions) for _ in range(12)]
     assert np.isfinite(actions).all() and len(actions) == 12
