@@ -239,7 +239,7 @@ def test_numbers_of_other_episodes_need_not_be_finite(folder: Path) -> None:
 
     edit_table(data_files(folder)[0], spoil)
     assert loaded(folder, selection=only({1, 2})).tensors["actions"].isfinite().all()
-    with pytest.raises(AegisError, match="row 0, of episode 0") as caught:
+    with pytest.raises(AegisError, match="of episodes 0, the first in row 0 ") as caught:
         loaded(folder, selection=only({0, 2}))
     assert "demos.only" in caught.value.fix
 
