@@ -143,7 +143,11 @@ class PolicyStudy:
             here = machine.name()
             old = {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
             missing = [name for name in made if name not in old or old[name].machine != here]
-            for name, cost in self._measure_costs(store, made, missing):
+            # Variants that train alike, and are merged in several ways, are measured once.
+            first = dict[str, str]()
+            for name in missing:
+                first.setdefault(keys[name], name)
+            for name, cost in self._measure_costs(store, made, first.values()):
                 store.keep(keys[name], Cost(*cost, here, version.code()))
         return {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
 

@@ -570,6 +570,23 @@ def test_costs_are_measured_once_and_of_new_variants_only(
     assert bench_calls == [] and report.tasks[0].results[0].step_time is None
 
 
+def test_variants_that_train_alike_are_timed_once(
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    bench_calls: list[list[str]],
+) -> None:
+    """Those that a merge alone tells apart; another measurement is not put in naive's place."""
+    invent(monkeypatch)
+    bench_calls.clear()
+    merged = {"method": "naive", "set": {"merge.method": "linear", "merge.strength": 0.4}}
+    variants = {"naive": {"method": "naive"}, "merged": merged, "aegis": {"method": "aegis"}}
+    report = stage.run(study(tmp_path, tiny_folder, variants=variants, tuning=None), tmp_path)
+    assert bench_calls == [["naive", "aegis"]]
+    naive, other, _ = report.tasks[0].results
+    assert naive.step_time == other.step_time is not None
+
+
 def test_costs_are_kept_with_machine_and_code_and_told_without_measuring(
     small: StudyRecipe,
     tmp_path: Path,
