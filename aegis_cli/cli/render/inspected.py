@@ -13,6 +13,7 @@ from rich.text import Text
 
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.tables import pairs
+from aegis_cli.data.episodes import as_text
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
@@ -197,13 +198,8 @@ def _features(features: Sequence[Any]) -> Table:
 
 def _as_ranges(layers: Sequence[str]) -> str:
     """Names `layers.{i}` as `train.freeze` takes them: `layers.0-11, layers.13`."""
-    ranges: list[tuple[int, int]] = []
-    for i in sorted(int(name.rpartition(".")[2]) for name in layers):
-        if ranges and ranges[-1][1] == i - 1:
-            ranges[-1] = (ranges[-1][0], i)
-        else:
-            ranges.append((i, i))
-    return ", ".join(f"layers.{a}-{b}" if b > a else f"layers.{a}" for a, b in ranges)
+    numbers = sorted(int(name.rpartition(".")[2]) for name in layers)
+    return ", ".join(f"layers.{one}" for one in as_text(numbers).split(","))
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
