@@ -78,10 +78,11 @@ class Reader:
         """
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
-        seen = self._seen(message)
-        if message.get(PREVIOUS) is None:
-            return seen
-        previous = self._finite(f"'{PREVIOUS}'", self._array(PREVIOUS, message[PREVIOUS]))
+        # A robot's own observation is read as a whole, and has no other keys.
+        seen = self._seen({key: x for key, x in message.items() if key not in (PREVIOUS, DELAY)})
+        previous = message.get(PREVIOUS)
+        if previous is not None:
+            previous = self._finite(f"'{PREVIOUS}'", self._array(PREVIOUS, previous))
         return replace(seen, previous=previous, delay=message.get(DELAY, 0))
 
     def _seen(self, message: Mapping[Any, Any]) -> Observation:

@@ -91,6 +91,25 @@ def test_where_nothing_is_left_nothing_changes() -> None:
     assert torch.equal(flow.integrate(guided, noise), flow.integrate(velocity, noise))
 
 
+@pytest.mark.parametrize("length", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("delay", [1, 2, 4])
+def test_what_is_free_follows_what_is_held_as_its_conditional_mean_does(
+    length: float, delay: int
+) -> None:
+    """From the middle of the noise; guidance by pseudo-inverse comes near it, and not more."""
+    horizon, draws = 8, torch.Generator().manual_seed(0)
+    covariance = smooth(horizon, length)
+    held = covariance[:delay, :delay]
+    standard = torch.randn(delay, 1000, generator=draws, dtype=torch.float64)
+    old = (torch.linalg.cholesky(held) @ standard).T
+    expected = old @ torch.linalg.solve(held, covariance[:delay, delay])
+    velocity = of_a_gaussian(covariance)
+    noise = torch.zeros(1000, horizon, 1, dtype=torch.float64)
+    guided = continuation.guided(velocity, Continued(old[:, :, None], delay), horizon)
+    found = flow.integrate(guided, noise)[:, delay, 0]
+    assert (found - expected).square().mean() < expected.square().mean() / 4
+
+
 def test_the_new_chunk_begins_as_the_old_one_goes_on_and_stays_smooth() -> None:
     """Of smooth chunks; without guidance the step over to the new one is a jump."""
     horizon, left, delay = 16, 12, 4

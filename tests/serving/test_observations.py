@@ -112,6 +112,10 @@ def test_lerobots_observations_and_a_robots_are_read_as_openpis(
     assert (found.prompt, found.state.tolist()) == (TEXT, [1, 2, 3])
     assert found.state.dtype == np.float32
     assert Reader(policy, "hold").read(seen).prompt == "hold"
+    # So is that of a robot that goes on meanwhile.
+    left = {"previous_actions": np.ones((3, 2)), "delay": 2}
+    moving = Reader(policy).read(seen | text | left)
+    assert (moving.delay, moving.previous.tolist()) == (2, [[1, 1]] * 3)
 
 
 @pytest.mark.parametrize("seen", [LEROBOTS, ROBOTS])

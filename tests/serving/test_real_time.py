@@ -196,7 +196,7 @@ def test_a_camera_may_write_its_next_picture_over_the_last(planned: Planned) -> 
 
 def test_an_episode_begins_as_that_of_the_policy_does() -> None:
     picture = images(1)[0].numpy()
-    expected = [deployed().select_action(picture, TEXT, at(0)) for _ in range(1)][0]
+    expected = deployed().select_action(picture, TEXT, at(0))
     with RealTime(deployed()) as running:
         first = running.select_action(picture, TEXT, at(0))
         for _ in range(5):

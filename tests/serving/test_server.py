@@ -113,6 +113,7 @@ def test_a_robot_that_moves_meanwhile_gets_a_chunk_that_continues_its_own() -> N
             ((previous, 4), "a delay of 4 actions"),
             ((previous[:, :1], 0), "previous actions of shape (3, 1)"),
             (("none", 0), "'previous_actions' of type"),
+            ((None, 1), "a delay of 1 actions, where 0 are left"),
         ):
             refused = client.infer({**seen, **dict(zip(names, wrong, strict=True))})
             assert isinstance(refused, str) and said in refused

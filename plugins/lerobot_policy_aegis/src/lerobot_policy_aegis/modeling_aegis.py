@@ -156,7 +156,11 @@ class AegisPolicy(PreTrainedPolicy):
         return check_actions(self.model.act(images, texts, state, self._generator, continued))
 
     def _continued(self, left: Tensor | None, delay: int, rows: int) -> Continued | None:
-        """What chunks are to continue, as LeRobot gives it; None where nothing is left."""
+        """What chunks are to continue, as LeRobot gives it; None where nothing is left.
+
+        Raises:
+            AegisError: actions of other sizes.
+        """
         if left is None:
             return None
         actions = left.float() if left.ndim == 3 else left.float()[None]
@@ -166,7 +170,8 @@ class AegisPolicy(PreTrainedPolicy):
                 f"({rows}, n, {self._actions})",
                 "give the actions as the policy predicted them",
             )
-        # LeRobot 0.6 fills up what is shorter than --inference.rtc.execution_horizon with zeros.
+        # LeRobot fills up what is shorter than --inference.rtc.execution_horizon, in some versions
+        # with zeros, in others with the last action, which cannot be told from one that is meant.
         given = actions.abs().amax((0, 2)).nonzero()
         count = int(given[-1]) + 1 if len(given) else 0
         actions = actions[:, : min(count, self.config.chunk_size)]
