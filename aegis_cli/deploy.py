@@ -220,6 +220,7 @@ class DeployedPolicy:
             )
         return {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
 
+    @devices.cpu_by_default()
     def predict(self, seen: Seen, continued: Continued | None = None) -> np.ndarray:
         """The next actions [H, A] float32 for what `read` returned.
 
@@ -373,6 +374,7 @@ def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 @torch.inference_mode(mode=False)  # weights that are made within one cannot be differentiated by
+@devices.cpu_by_default()
 def load_policy(
     run: str | Path,
     task: str | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,27 +53,42 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
     assert (own.task, own.cameras, own.replan) == ("reach", (), meta["replan"])
 
 
-@pytest.fixture(params=[torch.float64, torch.bfloat16], ids=str)
-def another_default(request: pytest.FixtureRequest) -> Iterator[None]:
-    """A program whose new tensors are of another type, as one that simulates in float64."""
-    torch.set_default_dtype(request.param)
-    yield
+@pytest.fixture(params=[torch.float64, torch.bfloat16, "meta"], ids=str)
+def another_default(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
+    """A program whose new tensors are of another type, as one that simulates in float64.
+
+    Or on another device, as one that has set a GPU; numbers on "meta" have no values.
+
+    Returns:
+        what sets them.
+    """
+    is_type = isinstance(request.param, torch.dtype)
+    change = torch.set_default_dtype if is_type else torch.set_default_device
+    yield lambda: change(request.param)
     torch.set_default_dtype(torch.float32)
+    torch.set_default_device(None)
 
 
-@pytest.mark.usefixtures("another_default")
-def test_the_programs_default_type_changes_no_action(run_folder: Path, tmp_path: Path) -> None:
-    """Neither loading nor acting asks for it."""
+def test_the_programs_defaults_change_no_action(
+    run_folder: Path, tmp_path: Path, another_default: Callable[[], None]
+) -> None:
+    """Neither loading nor acting asks for them, nor an ensemble, nor a chunk that continues one."""
     export.run(run_folder, tmp_path / "lerobot")
-    found = []
+    picture = frame()
+    expected = acted(run_folder, picture)
+    another_default()
     for folder in (run_folder, tmp_path / "lerobot"):
-        own = load_policy(folder)
-        found.append(own.select_action(frame(), TEXT, [0.1] * own.positions))
-    torch.set_default_dtype(torch.float32)
-    own = load_policy(run_folder)
-    expected = own.select_action(frame(), TEXT, [0.1] * own.positions)
-    for action in found:
-        np.testing.assert_array_equal(action, expected)
+        np.testing.assert_array_equal(acted(folder, picture), expected)
+
+
+def acted(folder: Path, picture: np.ndarray) -> np.ndarray:
+    """What the policy of a folder does, in each of the ways that there are to ask it."""
+    own, averaging = load_policy(folder), load_policy(folder, ensemble=0.01)
+    positions = [0.1] * own.positions
+    found = [one.select_action(picture, TEXT, positions) for one in (own, averaging, own.begin())]
+    chunk = own.predict_action_chunk(picture, TEXT, positions)
+    continued = own.predict_action_chunk(picture, TEXT, positions, previous=chunk[1:], delay=1)
+    return np.concatenate([*found, chunk.ravel(), continued.ravel()])
 
 
 def test_a_picture_that_nobody_may_write_to_is_taken_as_it_is() -> None:

@@ -66,7 +66,7 @@ def _followers(anchor: Anchor) -> dict[str, dict[str, str]]:
 def _tensors(anchor: Anchor) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     if anchor.image:
-        tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count])
+        tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count], device="cpu")
         for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
             for i, layer in enumerate(layers):
                 tensors |= {

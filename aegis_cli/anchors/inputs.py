@@ -64,7 +64,7 @@ class Drawn:
         if self.share == 1:
             return rows
         count = max(1, round(self.share * len(rows)))
-        chosen = torch.randperm(len(rows), generator=generator)[:count]
+        chosen = torch.randperm(len(rows), generator=generator, device="cpu")[:count]
         return rows[chosen.to(rows.device)]
 
 

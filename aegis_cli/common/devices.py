@@ -40,6 +40,20 @@ def chosen(name: str | None) -> Iterator[None]:
             os.environ[VARIABLE] = before
 
 
+@contextlib.contextmanager
+def cpu_by_default() -> Iterator[None]:
+    """Inside the block, or a function that it decorates, what names no device is on the CPU.
+
+    A caller of the library may have set another one by `torch.set_default_device`. Where none is
+    set, nothing is done: the mode would cost every call of PyTorch's a little.
+    """
+    if torch.get_default_device().type == "cpu":
+        yield
+        return
+    with torch.device("cpu"):
+        yield
+
+
 def pick() -> torch.device:
     """The device that was chosen, else the GPU if there is one, else the CPU.
 

@@ -51,7 +51,7 @@ def weights(left: int, delay: int, horizon: int) -> Tensor:
         delay: d <= n; the steps that are executed before the new chunk is there.
         horizon: H >= n.
     """
-    step = torch.arange(horizon, dtype=torch.float64)
+    step = torch.arange(horizon, dtype=torch.float64, device="cpu")
     # Of a step that is executed the share is 1 or more, and so its weight is 1.
     share = ((left - step) / (left - delay + 1)).clamp(0, 1)
     return (share * torch.expm1(share) / (math.e - 1)).float()

@@ -89,7 +89,7 @@ def infer(features: Tensor, tasks: Sequence[Gaussian]) -> Tensor:
     It is NONE where the log-density lies below even that task's threshold.
     """
     if not tasks:
-        return torch.full((len(features),), NONE)
+        return torch.full((len(features),), NONE, device=features.device)
     scores = torch.stack([g.log_density(features) for g in tasks], dim=1)  # [N, tasks]
     best, task = scores.max(1)
     thresholds = torch.stack([g.threshold for g in tasks])

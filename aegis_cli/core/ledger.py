@@ -41,9 +41,10 @@ class Ledger:
         self.groups = tuple(groups)
         self.layers = tuple(layers)
         self._count = 0
-        self._steps = torch.zeros(0, dtype=torch.int64)  # [capacity]
+        self._steps = torch.zeros(0, dtype=torch.int64, device="cpu")  # [capacity]
         self._rows = {
-            name: torch.zeros(0, size, dtype=torch.float64) for name, size in self._sizes().items()
+            name: torch.zeros(0, size, dtype=torch.float64, device="cpu")
+            for name, size in self._sizes().items()
         }
 
     @classmethod

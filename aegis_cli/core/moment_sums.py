@@ -188,7 +188,7 @@ class Sketch(MomentSum):
         values = (values[:resolved] - shift).cpu()
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
-        vectors = torch.empty(self._width, kept, dtype=torch.float32)
+        vectors = torch.empty(self._width, kept, dtype=torch.float32, device="cpu")
         parts = vectors.split(_WIDE_ROWS)
         for part, half in zip(parts, self._halves(root, count, shift), strict=True):
             part.copy_(half @ scaled[:, :kept])
@@ -236,7 +236,7 @@ class TraceOnly(MomentSum):
 
     def spectrum(self, count: int, energy: float) -> Spectrum:
         rest = self._trace.cpu() / count / self._width
-        none = torch.zeros(self._width, 0, dtype=torch.float32)
+        none = torch.zeros(self._width, 0, dtype=torch.float32, device="cpu")
         return with_rest(rest.new_zeros(0), none, rest)
 
 
@@ -270,6 +270,6 @@ def _probe(width: int, count: int, device: str) -> Tensor:
 
     So few of them in so many dimensions are nearly orthogonal, which is all the method asks.
     """
-    generator = torch.Generator().manual_seed(width)
-    drawn = torch.randn(width, count, generator=generator, dtype=torch.float32)
+    generator = torch.Generator("cpu").manual_seed(width)
+    drawn = torch.randn(width, count, generator=generator, dtype=torch.float32, device="cpu")
     return drawn.mul_(width**-0.5).to(device)

@@ -36,7 +36,7 @@ class Moments:
 
 def empty(width: int) -> Moments:
     """The moments of no tokens: the neutral element of `merge`."""
-    zeros = torch.zeros(width, dtype=torch.float64)
+    zeros = torch.zeros(width, dtype=torch.float64, device="cpu")
     return Moments(0, zeros, zeros)
 
 

@@ -51,7 +51,7 @@ class Spectrum:
 
 def lone_row() -> Spectrum:
     """The spectrum of a row that every question reads."""
-    return Spectrum(torch.ones(1, dtype=torch.float64), None)
+    return Spectrum(torch.ones(1, dtype=torch.float64, device="cpu"), None)
 
 
 def with_rest(found: Tensor, vectors: Tensor, rest: Tensor) -> Spectrum:

@@ -273,7 +273,9 @@ class ProtectedAdamW(torch.optim.AdamW):
             # AdamW fills an empty state by itself, so nothing may be there before.
             if state := self.state.get(parameter):
                 for name, number in numbers.items():
-                    state.setdefault(name, torch.tensor(float(number), dtype=torch.float32))
+                    state.setdefault(
+                        name, torch.tensor(float(number), dtype=torch.float32, device="cpu")
+                    )
 
 
 def _kinds(

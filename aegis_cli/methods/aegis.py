@@ -159,7 +159,7 @@ def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
 
 def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> projection.Combine:
     rule = projection.aegis if project else projection.naive
-    counts = torch.tensor(chosen)
+    counts = torch.tensor(chosen, device="cpu")
 
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal counts

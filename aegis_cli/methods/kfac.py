@@ -204,7 +204,7 @@ def shares(
 def _unread_shares(
     learning: Sequence[Sequence[Tensor]], squares: Tensor, entries: Sequence[int], balance: float
 ) -> dict[Tensor, float | Tensor]:
-    counts = devices.send(torch.tensor(entries, dtype=torch.float64), squares.device)
+    counts = devices.send(torch.tensor(entries, dtype=torch.float64, device="cpu"), squares.device)
     rms = (squares / counts).sqrt()
     whole = (squares.sum() / sum(entries)).sqrt()
     # Where no map has a gradient, so has none of them.

@@ -74,6 +74,11 @@ class Comparison:
     differs: dict[str, list[differences.Value]] = field(default_factory=dict)
 
     @property
+    def same_validation(self) -> bool:
+        """Whether all validation losses are of the same held-out frames."""
+        return differences.same_validation(self.differs)
+
+    @property
     def question_sets(self) -> list[str]:
         """Those that the figures of VQA are of."""
         return list(dict.fromkeys(row.vqa for row in self.rows if row.vqa is not None))

@@ -9,8 +9,10 @@ from aegis_cli.common import artifacts
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import Result
 
-Value = str | int | None
+Value = str | int | float | None
 _DIGITS = 12  # of a digest, which tell two files apart
+# The facts that decide which frames a validation loss is of, and of which actions.
+_OF_VALIDATION = {"demonstrations", "seed", "episodes", "share held out", "chunk"}
 
 
 def of_run(path: Path, steps: int | None, asked: tuple[str, Result] | None) -> dict[str, Value]:
@@ -24,7 +26,10 @@ def of_run(path: Path, steps: int | None, asked: tuple[str, Result] | None) -> d
     return {
         "backbone": inputs.get("backbone", "")[:_DIGITS] or None,
         "demonstrations": inputs.get("demos", "")[:_DIGITS] or None,
+        "episodes": recipe.demos.only or "all",
+        "share held out": recipe.train.validation_share,
         "seed": recipe.seed,
+        "chunk": recipe.train.chunk,
         "steps": steps,
         "batch size": recipe.train.batch_size,
         "questions": None if asked is None else _questions(path, *asked),
@@ -53,6 +58,11 @@ def between(facts: Sequence[dict[str, Value]]) -> dict[str, list[Value]]:
         if len({value for value in values if value is not None}) > 1:
             found[name] = values
     return found
+
+
+def same_validation(found: dict[str, list[Value]]) -> bool:
+    """Whether the runs' validation losses are of the same frames and actions."""
+    return not found.keys() & _OF_VALIDATION
 
 
 def said(found: dict[str, list[Value]]) -> str:

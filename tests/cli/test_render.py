@@ -103,6 +103,14 @@ def test_the_last_rate_is_that_of_the_whole_stage():
     assert last == "t: 601/601 steps (100 %), 5.01 steps/s, took 2m00s"
 
 
+def test_what_is_finished_at_once_has_no_rate():
+    for seconds, rate in [(0.004, ""), (1.0, ", 500 questions/s")]:
+        events = [(0.0, Progress("q", 1, 501, "questions"))]
+        events.append((seconds, Progress("q", 501, 501, "questions")))
+        took = f"took {seconds:.0f}s"
+        assert lines_of(events)[-1] == f"q: 501/501 questions (100 %){rate}, {took}"
+
+
 def test_a_stage_that_begins_anew_is_shown_anew():
     events = [(0.0, Progress("probe", 5, 5, "batches")), (0.1, Progress("probe", 1, 5, "batches"))]
     assert [line[:11] for line in lines_of(events)] == ["probe: 5/5 ", "probe: 1/5 "]

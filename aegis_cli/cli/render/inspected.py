@@ -221,6 +221,7 @@ def _steps(first: int, last: int) -> str:
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
 _OPEN_LOOP = "Open-loop error"
+_VALIDATION = "Validation loss"
 # The columns in which the best and the worst are marked: the figure, and whether more is better.
 _BETTER = {
     "VQA %": ("accuracy", True),
@@ -230,7 +231,7 @@ _BETTER = {
     "Return % of highest": ("return_share", True),
     _OPEN_LOOP: ("open_loop_error", False),
     "W2²": ("w2", False),
-    "Validation loss": ("validation_loss", False),
+    _VALIDATION: ("validation_loss", False),
     "Step (s)": ("step_s", False),
 }
 _VERDICTS = {True: "passed", False: "failed", None: "-"}
@@ -268,8 +269,12 @@ def _shown_columns(report: Any) -> dict[str, list[Cell]]:
 
 def _not_compared(report: Any) -> set[str]:
     """The columns whose figures were measured on other questions or frames of each run."""
-    of_questions = _OF_QUESTIONS if len(report.question_sets) > 1 else ()
-    return {*of_questions, *([] if report.same_open_loop else [_OPEN_LOOP])}
+    apart = set(_OF_QUESTIONS) if len(report.question_sets) > 1 else set[str]()
+    if not report.same_open_loop:
+        apart.add(_OPEN_LOOP)
+    if not report.same_validation:
+        apart.add(_VALIDATION)
+    return apart
 
 
 def _columns(report: Any) -> dict[str, Callable[[Any], str]]:
@@ -289,7 +294,7 @@ def _columns(report: Any) -> dict[str, Callable[[Any], str]]:
         _OPEN_LOOP: lambda r: fixed(r.open_loop_error, 3),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
-        "Validation loss": lambda r: fixed(r.validation_loss, 4),
+        _VALIDATION: lambda r: fixed(r.validation_loss, 4),
         "Step (s)": lambda r: fixed(r.step_s, 3),
         "Gate": lambda r: _VERDICTS[r.gate],
     }

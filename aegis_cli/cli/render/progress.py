@@ -20,6 +20,7 @@ from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 EVERY_S = 10.0  # a line at least this often,
 EVERY_SHARE = 0.1  # or after this share of the work,
 LEAST_S = 1.0  # but no more than one a second
+_RATED_S = 1.0  # what is finished sooner has no rate worth telling
 _WINDOW_S = 30.0  # the rate is that of the last seconds: warm-up and compilation fade from it
 
 Clock = Callable[[], float]
@@ -68,12 +69,12 @@ class Pace:
     def figures(self, event: Progress) -> str:
         """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`.
 
-        The rate of what is finished is that of the whole stage.
+        The rate of what is finished is that of the whole stage, if it took long enough for one.
         """
         parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
         elapsed_s = self.clock() - self.start_s
         if event.done >= event.total:
-            if elapsed_s > 0 and event.done > self.first and event.total > 1:
+            if elapsed_s >= _RATED_S and event.done > self.first:
                 parts.append(f"{_rate((event.done - self.first) / elapsed_s)} {event.unit}/s")
             parts.append(f"took {_duration(elapsed_s)}")
         elif self.rate:
