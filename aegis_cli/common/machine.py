@@ -37,9 +37,13 @@ def describe() -> dict[str, str | int]:
 
 
 def name() -> str:
-    """The GPU's name, else the processor's and its cores: times of two such are not comparable."""
+    """The GPU's name, else the processor's and the cores used: times of two are not comparable."""
     about = describe()
-    return str(about.get("gpu") or f"{about['processor']}, {about['cores']} cores")
+    if "gpu" in about:
+        return str(about["gpu"])
+    cores, threads = about["cores"], about["threads"]
+    used = cores if threads == cores else f"{threads} of {cores}"
+    return f"{about['processor']}, {used} cores"
 
 
 def _processor() -> str:

@@ -5,7 +5,6 @@ The ratios are those of this machine.
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -32,7 +31,7 @@ _SAMPLES = 70  # questions of the anchor: a step's cost does not depend on their
 # Co-training has so many questions that, as in a real run, other processes render them and keep
 # OpenGL's memory.
 _QUESTIONS = 2500
-_MEMORY_STEPS = 3  # the optimizer's state is there from the second step on
+_MEMORY_TURNS = 3  # the optimizer's state is there from the second step on
 T = TypeVar("T")
 
 
@@ -52,7 +51,8 @@ class Cost:
 class BenchReport:
     """Medians of `repeats` rounds.
 
-    Each round times every part once, so that a busy machine slows all alike.
+    Each round times every part, each step of a method right beside one of naive's, so that a busy
+    machine slows all alike.
 
     Attributes:
         anchor_throughput: share of a bare forward's throughput that measuring an anchor's moments
@@ -149,48 +149,33 @@ def compare(
         out = Path(folder)
         for task in {recipe.task for recipe in recipes.values()}:
             bench_runs.save_demos(out, task)
-        seconds = _step_seconds(recipes, anchor, out, repeats, on_event)
+        naive_s, ratios = _step_times(recipes, anchor, out, repeats, on_event)
         memory: dict[str, int] = {}
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
             memory[name] = in_new_process(peak_memory, recipe, anchor, out)
             on_event(Progress("bench memory", done, len(recipes), "processes"))
-    costs = {}
-    for name in recipes:
-        time_ratio = seconds[name] / seconds[NAIVE]
-        memory_ratio = memory[name] / memory[NAIVE]
-        costs[name] = Cost(time_ratio, memory_ratio, seconds[name])
-    return costs
+    return {
+        name: Cost(ratio, memory[name] / memory[NAIVE], ratio * naive_s)
+        for name, ratio in ratios.items()
+    }
 
 
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _step_seconds(
+def _step_times(
     recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent
-) -> dict[str, float]:
-    """Seconds of one training step by each recipe.
+) -> tuple[float, dict[str, float]]:
+    """Seconds of one of naive's training steps, and by recipe the ratio of its steps to them.
 
-    Each takes at least as many steps in a turn as any has to, for single steps vary more than the
-    mean of many. This is a function so that its models are gone when memory is measured.
+    This is a function so that its models are gone when memory is measured.
     """
-    steppers = {name: bench_runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
-    most = max(steps for _, steps in steppers.values())
-    turns, taken = dict[str, Callable[[], None]](), dict[str, int]()
-    for name, (turn, steps) in steppers.items():
-        times = math.ceil(most / steps)
-        turns[name], taken[name] = _repeated(turn, times), times * steps
-    seconds = bench_runs.take_turns("bench steps", turns, repeats, on_event)
-    return {name: seconds[name] / taken[name] for name in steppers}
-
-
-def _repeated(turn: Callable[[], None], times: int) -> Callable[[], None]:
-    """So many turns in one."""
-
-    def turns() -> None:
-        for _ in range(times):
-            turn()
-
-    return turns
+    steps = {name: bench_runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
+    naive = steps[NAIVE]
+    # Alone, naive is timed beside itself.
+    others = {name: one for name, one in steps.items() if name != NAIVE} or {NAIVE: naive}
+    naive_s, ratios = bench_runs.beside("bench steps", naive, others, repeats, on_event)
+    return naive_s, {name: 1.0 if name == NAIVE else ratios[name] for name in steps}
 
 
 @torch.inference_mode()
@@ -225,7 +210,7 @@ def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
 
     A maximum never falls again, so each recipe needs a new process.
     """
-    step, _ = bench_runs.stepper(recipe, anchor, out)
-    for _ in range(_MEMORY_STEPS):
-        step()
+    steps = bench_runs.stepper(recipe, anchor, out)
+    for _ in range(_MEMORY_TURNS):
+        steps.turn()
     return memory.peak(devices.pick())

@@ -48,14 +48,14 @@ def guard_cost(
     """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        count: dict[str, int] = {}
         parts: dict[str, Callable[[], object]] = {}
         before: dict[str, Callable[[], object]] = {}
         for name, recipe in recipes.items():
             bench_runs.save_demos(out, recipe.task)
-            parts[f"train {name}"], count[name] = bench_runs.stepper(recipe, anchor, out)
+            training = bench_runs.stepper(recipe, anchor, out)
             loop = _PlainLoop(recipe, anchor, out, make)
-            parts[f"guard {name}"] = partial(loop.steps, count[name])
+            parts[f"train {name}"] = training.turn
+            parts[f"guard {name}"] = partial(loop.steps, training.in_turn)
             if name == "aegis":
                 parts |= {"backward": loop.plain_backward, "guard.backward": loop.backward}
                 # A backward pass uses its graph up, so each has a forward pass, which is not timed.

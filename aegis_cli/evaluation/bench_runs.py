@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import statistics
 import time
@@ -90,39 +89,93 @@ def wait() -> None:
         torch.cuda.synchronize()
 
 
-def stepper(recipe: Recipe, anchor: Path, out: Path) -> tuple[Callable[[], None], int]:
-    """The next steps of a training run, as `aegis train` takes them.
+def beside(
+    stage: str,
+    reference: Steps,
+    others: Mapping[str, Steps],
+    rounds: int,
+    on_event: OnEvent,
+) -> tuple[float, dict[str, float]]:
+    """Seconds of one of the reference's steps, and the others' steps over it.
 
-    All steps are taken on one batch.
+    Each step of another is timed right beside one of the reference's. A machine's speed drifts by a
+    tenth within seconds, which would pass for a difference of two that are timed further apart.
+
+    Args:
+        others: by name. In a round each takes whole turns, and no fewer steps than any has to, for
+            the fewer there are, the more their ratio varies.
 
     Returns:
-        A function that takes one turn's steps, and how many these are: as many as one constraint of
-        the update covers and as share an anchor gradient, so that every turn pays for one of each.
+        Medians over `rounds` rounds, after one that warms up.
     """
-    return turn_of(*begun(recipe, anchor, out))
+    most = max(one.in_turn for one in others.values())
+    ratios: dict[str, list[float]] = {name: [] for name in others}
+    step_s: list[float] = []
+    turns = [(done, name) for done in range(rounds + 1) for name in others]
+    for number, (done, name) in enumerate(turns, 1):
+        in_turn = others[name].in_turn
+        count = math.ceil(most / in_turn) * in_turn
+        own_s, reference_s = _alternating(others[name], reference, count)
+        if done > 0:
+            ratios[name].append(own_s / reference_s)
+            step_s.append(reference_s / count)
+        on_event(Progress(stage, number, len(turns), "turns"))
+    medians = {name: statistics.median(found) for name, found in ratios.items()}
+    return statistics.median(step_s), medians
 
 
-def turn_of(run: TrainingRun, batch: RobotBatch) -> tuple[Callable[[], None], int]:
-    """What `stepper` returns, of a run that has begun."""
-    index, window = itertools.count(), train.Window()
-    steps = math.lcm(run.parts.every, run.parts.refresh)
+def _alternating(first: Steps, second: Steps, count: int) -> tuple[float, float]:
+    """Seconds of so many steps of each of two, taken in the order a b, b a, a b and so on.
 
-    def turn() -> None:
-        for _ in range(steps):
-            train.update(run, next(index), batch, window)
-        train.read(run, window)
+    So neither is always the first of a pair, and a steady drift cancels. On a GPU, whose clock is
+    steady, each takes all its steps in one go: to wait for every one is not what training does.
+    """
+    at_once = count if devices.on_gpu() else 1
+    both, taken_s = (first, second), [0.0, 0.0]
+    for pair in range(count // at_once):
+        for which in (0, 1) if pair % 2 == 0 else (1, 0):
+            start = time.perf_counter()
+            for _ in range(at_once):
+                both[which].one()
+            wait()
+            taken_s[which] += time.perf_counter() - start
+    return taken_s[0], taken_s[1]
 
-    return turn, steps
+
+class Steps:
+    """The steps of a training run, as `aegis train` takes them, all on one batch.
+
+    Attributes:
+        in_turn: how many make a turn: as many as one constraint of the update covers and as share
+            an anchor gradient, so that every turn pays for one of each.
+    """
+
+    def __init__(self, run: TrainingRun, batch: RobotBatch) -> None:
+        self._run, self._batch = run, batch
+        self._taken, self._window = 0, train.Window()
+        self.in_turn = math.lcm(run.parts.every, run.parts.refresh)
+
+    def one(self) -> None:
+        """Take a step; the last of a turn reads the turn's figures."""
+        train.update(self._run, self._taken, self._batch, self._window)
+        self._taken += 1
+        if self._taken % self.in_turn == 0:
+            train.read(self._run, self._window)
+
+    def turn(self) -> None:
+        """Take the steps of one turn."""
+        for _ in range(self.in_turn):
+            self.one()
+
+
+def stepper(recipe: Recipe, anchor: Path, out: Path) -> Steps:
+    """The steps of a run by a recipe."""
+    return Steps(*begun(recipe, anchor, out))
 
 
 def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, RobotBatch]:
-    """A run before its first step, and a batch of noise for it, whatever the recipe names.
-
-    Its learning rates are 0, which takes the same time. With those of a study, a variant that
-    diverges would have no costs.
-    """
-    still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
-    recipe = dataclasses.replace(recipe, demos=Demos(), train=still)
+    """A run before its first step, and a batch of noise for it, whatever the recipe names."""
+    recipe = dataclasses.replace(unmoved(recipe), demos=Demos())
     run = assemble.build(
         recipe,
         methods.get(recipe.train.method),
@@ -139,6 +192,15 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
         # Training has it ready on the GPU before its step begins.
         batch = train.prepared(run, batch, frames, 0).with_prepared_on(device)
     return run, batch
+
+
+def unmoved(recipe: Recipe) -> Recipe:
+    """The recipe with learning rates of 0, whose steps take the same time.
+
+    With those of a study, a variant that diverges would have no costs.
+    """
+    still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
+    return dataclasses.replace(recipe, train=still)
 
 
 def images(count: int) -> torch.Tensor:

@@ -304,17 +304,18 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
     bench_runs.save_demos(out, recipe.task)
     anchor = _anchor(out, needs) if needs else None
     run, batch = bench_runs.begun(recipe, anchor, out)
-    turn, steps = bench_runs.turn_of(run, batch)
-    turn()
-    times = [_seconds(turn)[0] / steps for _ in range(turns)]
+    steps = bench_runs.Steps(run, batch)
+    steps.turn()
+    times = [_seconds(steps.turn)[0] / steps.in_turn for _ in range(turns)]
     needed = memory.peak(devices.pick())
-    own = _own_seconds(run, turn)
+    own = _own_seconds(run, steps.turn)
     with operations.counter() as counter:
-        turn()
+        steps.turn()
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
-    flop = counter.get_total_flops() // steps
-    return _Measured(statistics.median(times), needed, own and own / steps, flop, tokens)
+    flop = counter.get_total_flops() // steps.in_turn
+    own = own and own / steps.in_turn
+    return _Measured(statistics.median(times), needed, own, flop, tokens)
 
 
 def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:

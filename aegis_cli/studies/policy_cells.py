@@ -23,7 +23,15 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import bench, open_loop, probe, results, rollout, wrong_answers
+from aegis_cli.evaluation import (
+    bench,
+    bench_runs,
+    open_loop,
+    probe,
+    results,
+    rollout,
+    wrong_answers,
+)
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
@@ -143,7 +151,8 @@ class PolicyStudy:
             here = machine.name()
             old = {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
             missing = [name for name in made if name not in old or old[name].machine != here]
-            # Variants that train alike, and are merged in several ways, are measured once.
+            # Variants whose steps take the same are measured once: those of other learning rates,
+            # and those that are merged in several ways.
             first = dict[str, str]()
             for name in missing:
                 first.setdefault(keys[name], name)
@@ -265,8 +274,9 @@ def cell_key(
 
 
 def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
-    """Digest of what shapes a cost; the seed does not."""
-    parts = [{**_shaping(r), "seed": 0, "backbone": backbone_sha256} for r in (recipe, naive)]
+    """Digest of what shapes a cost: neither the seed nor the learning rates do."""
+    timed = [bench_runs.unmoved(one) for one in (recipe, naive)]
+    parts = [{**_shaping(one), "seed": 0, "backbone": backbone_sha256} for one in timed]
     return digest({"cost": parts, "anchor": recipes.changed(recipe.anchor)})
 
 

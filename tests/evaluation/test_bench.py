@@ -23,7 +23,7 @@ from aegis_cli import Guard
 from aegis_cli.cli import render
 from aegis_cli.common import memory
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Progress, ignore
+from aegis_cli.common.events import Progress
 from aegis_cli.evaluation import bench, bench_runs
 from aegis_cli.guard.guard import METHODS as METHODS_OF_GUARD
 from aegis_cli.methods import METHODS
@@ -58,7 +58,7 @@ def test_costs_are_ratios_to_the_entry_named_naive(tiny_folder: Path, anchor_fil
     events: list[Progress] = []
     costs = bench.compare({"large": large, "naive": small}, anchor_file, events.append, repeats=2)
     assert costs["naive"].step_time == costs["naive"].peak_memory == 1
-    assert costs["large"].step_time == costs["large"].step_s / costs["naive"].step_s
+    assert costs["large"].step_time == pytest.approx(costs["large"].step_s / costs["naive"].step_s)
     assert costs["large"].step_time > 1 and costs["large"].peak_memory > 1  # 64 times the frames
     assert [(e.stage, e.done) for e in events] == [("bench steps", i) for i in (1, 2, 3)] + [
         ("bench memory", i) for i in (1, 2)
@@ -138,40 +138,61 @@ def test_a_step_is_that_of_training(
     )
     chosen = recipe(tiny_folder, method="nullspace")
     bench_runs.save_demos(tmp_path, chosen.task)
-    turn, steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
-    assert steps == chosen.nullspace.every > 1  # a turn pays for one projection
-    turn(), turn()
-    assert [index for index, _ in calls] == list(range(2 * steps))
+    steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
+    assert steps.in_turn == chosen.nullspace.every > 1  # a turn pays for one projection
+    steps.turn(), steps.turn()
+    assert [index for index, _ in calls] == list(range(2 * steps.in_turn))
     training = calls[0][1]
     assert training.parts.constrain is not None
     assert training.policy.expert.shape.width == chosen.expert.width
 
 
-def test_all_methods_take_as_many_steps_in_a_turn(
-    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class Invented:
+    """Steps of which each takes `seconds` of a clock, and the clock's machine slows down."""
+
+    def __init__(self, name: str, seconds: float, in_turn: int, shared: Shared) -> None:
+        self.name, self.seconds, self.in_turn, self.shared = name, seconds, in_turn, shared
+
+    def one(self) -> None:
+        self.shared.now_s += self.seconds * self.shared.slowness
+        self.shared.slowness *= self.shared.drift
+        self.shared.taken.append(self.name)
+
+
+@dataclasses.dataclass
+class Shared:
+    """A clock, how slow its machine has become, and whose steps were taken in which order."""
+
+    drift: float
+    now_s: float = 0.0
+    slowness: float = 1.0
+    taken: list[str] = dataclasses.field(default_factory=list)
+
+
+@pytest.mark.parametrize("drift", [1.0, 1.002, 0.998])
+def test_each_step_is_timed_beside_one_of_the_references(
+    drift: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As many as those that one of them has to take, or more."""
-    needed, taken = {"naive": 1, "nullspace": 4, "kfac": 3}, dict.fromkeys(METHODS, 0)
+    """A machine that slows down to a third meanwhile changes no ratio by a thousandth."""
+    shared = Shared(drift)
+    monkeypatch.setattr(bench_runs, "time", SimpleNamespace(perf_counter=lambda: shared.now_s))
+    naive = Invented("naive", 2.0, 1, shared)
+    others = {"kfac": Invented("kfac", 2.1, 4, shared), "odd": Invented("odd", 3.0, 3, shared)}
+    events: list[Progress] = []
+    step_s, ratios = bench_runs.beside("x", naive, others, 27, events.append)
+    assert ratios == pytest.approx({"kfac": 1.05, "odd": 1.5}, rel=1e-3)
+    assert drift != 1 or step_s == 2
+    # Whole turns, and no fewer steps than the four of kfac's.
+    pair, back = ["kfac", "naive"], ["naive", "kfac"]
+    odd, odd_back = ["odd", "naive"], ["naive", "odd"]
+    of_a_round = 2 * (pair + back) + 3 * (odd + odd_back)
+    assert shared.taken == 28 * of_a_round
+    assert [(e.stage, e.done, e.total) for e in events] == [("x", i + 1, 56) for i in range(56)]
 
-    def stepper(recipe: Any, *_: Any) -> tuple[Callable[[], None], int]:
-        method = recipe.train.method
 
-        def turn() -> None:
-            taken[method] += needed[method]
-
-        return turn, needed[method]
-
-    def take_turns(_: str, parts: Any, *rest: Any) -> dict[str, float]:
-        for turn in parts.values():
-            turn()
-        return {name: float(taken[name]) for name in parts}
-
-    monkeypatch.setattr(bench_runs, "stepper", stepper)
-    monkeypatch.setattr(bench_runs, "take_turns", take_turns)
-    recipes = {name: recipe(tiny_folder, method=name) for name in needed}
-    seconds = bench._step_seconds(recipes, tmp_path, tmp_path, 1, ignore)
-    assert {name: taken[name] for name in needed} == {"naive": 4, "nullspace": 4, "kfac": 6}
-    assert seconds == dict.fromkeys(needed, 1.0)
+def test_naive_alone_is_timed(tiny_folder: Path, anchor_file: Path) -> None:
+    costs = bench.compare({"naive": recipe(tiny_folder)}, anchor_file, repeats=1)
+    assert list(costs) == ["naive"] and costs["naive"].step_time == 1 and costs["naive"].step_s > 0
 
 
 def test_a_recipe_that_would_diverge_can_be_timed(
@@ -179,9 +200,9 @@ def test_a_recipe_that_would_diverge_can_be_timed(
 ) -> None:
     chosen = recipe(tiny_folder, backbone_lr=1e30, expert_lr=1e30, warmup=0)
     bench_runs.save_demos(tmp_path, chosen.task)
-    turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
+    steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
     for _ in range(4):
-        turn()
+        steps.turn()
     training, batch = bench_runs.begun(chosen, anchor_file, tmp_path)
     before = [p.detach().clone() for p in training.policy.parameters()]
     bench_runs.train.update(training, 3, batch, bench_runs.train.Window())
@@ -198,8 +219,7 @@ def test_whatever_a_recipe_learns_from_its_step_can_be_timed(
 ) -> None:
     chosen = dataclasses.replace(recipe(tiny_folder), **changes)
     bench_runs.save_demos(tmp_path, chosen.task)
-    turn, _ = bench_runs.stepper(chosen, anchor_file, tmp_path)
-    turn()
+    bench_runs.stepper(chosen, anchor_file, tmp_path).turn()
 
 
 # --- processes of their own -----------------------------------------------------------------------

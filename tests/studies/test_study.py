@@ -576,15 +576,20 @@ def test_variants_that_train_alike_are_timed_once(
     monkeypatch: pytest.MonkeyPatch,
     bench_calls: list[list[str]],
 ) -> None:
-    """Those that a merge alone tells apart; another measurement is not put in naive's place."""
+    """Those that a merge or a learning rate alone tells apart.
+
+    Another measurement is not put in naive's place.
+    """
     invent(monkeypatch)
     bench_calls.clear()
     merged = {"method": "naive", "set": {"merge.method": "linear", "merge.strength": 0.4}}
-    variants = {"naive": {"method": "naive"}, "merged": merged, "aegis": {"method": "aegis"}}
+    slower = {"method": "naive", "set": {"train.backbone_lr": 1e-5, "train.expert_lr": 1e-4}}
+    variants = {"naive": {"method": "naive"}, "merged": merged, "slower": slower}
+    variants["aegis"] = {"method": "aegis"}
     report = stage.run(study(tmp_path, tiny_folder, variants=variants, tuning=None), tmp_path)
     assert bench_calls == [["naive", "aegis"]]
-    naive, other, _ = report.tasks[0].results
-    assert naive.step_time == other.step_time is not None
+    naive, *others, _ = report.tasks[0].results
+    assert {one.step_time for one in others} == {naive.step_time} != {None}
 
 
 def test_costs_are_kept_with_machine_and_code_and_told_without_measuring(
