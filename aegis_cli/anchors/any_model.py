@@ -62,7 +62,7 @@ class Measurement(Removable):
             layers: as for `Guard`.
             part: as for `Guard`.
             parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or
-                several; the curvature is that of parameters with `requires_grad`.
+                several; the curvature is that of maps which the answers' gradient reaches.
             vision: dotted names of the parts that read pixels, among them the map from image to
                 text features; all they read counts, and padding of the text never reaches them.
             energy: share of each map's input energy, or curvature, up to which eigenvectors are
@@ -92,7 +92,7 @@ class Measurement(Removable):
             )
         self._model, self._energy = model, energy
         self._layers = structure.find_layers(model, layers) if "moments" in parts else {}
-        self._hooks, self._moments = LayerHooks(self._layers), MomentRecorder()
+        self._moments = MomentRecorder()
         self._inputs: InputRecorder | None = None
         self._curvature: CurvatureRecorder | None = None
         if "inputs" in parts:
@@ -100,6 +100,7 @@ class Measurement(Removable):
             self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
         if "curvature" in parts:
             self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
+        self._hooks = LayerHooks(self._layers)  # last, since what fails before would leave them
         self._samples: int | None = 0  # None: a pass has not told how many it had
         self._broken, self._unanswered = False, False
 
@@ -130,7 +131,7 @@ class Measurement(Removable):
         counts = None if mask is None else boolean(mask, "a mask")
         if counts is not None:
             refuse_empty(counts)
-        self._broken = True  # unless the block ends well
+        failed_before, self._broken = self._broken, True  # unless the block ends well
         self._unanswered = self._curvature is not None
         with contextlib.ExitStack() as stack:
             # Only the curvature goes back through the pass; a graph would take memory for nothing.
@@ -145,7 +146,8 @@ class Measurement(Removable):
         # With layers watched, `_count` knows the batch's size from what they return.
         if not self._layers:
             self._add_samples(None if mask is None else len(mask))
-        self._broken = False
+        # What an earlier pass has counted by halves stays in the sums.
+        self._broken = failed_before
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
         """See `Guard.note`."""

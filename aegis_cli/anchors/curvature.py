@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import GradientEdge, get_gradient_edge
 
 from aegis_cli.anchors import inputs, passes
 from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
@@ -37,10 +38,12 @@ class Weighed(SharedInput):
     """What linear maps have read, and how strongly the answers depend on it.
 
     Attributes:
+        version: how often x had been changed in place when it was read.
         arrived: how many of its readers a backward pass has come to.
         weight: |g|, over the outputs of all that it has come to, [n, 1].
     """
 
+    version: int = 0
     arrived: int = 0
     weight: Tensor | None = None
 
@@ -75,12 +78,25 @@ class _Graph:
     """What of the watched passes' graph a backward pass has to come to.
 
     Attributes:
-        entries: outputs of modules through which parameters enter the graph.
+        entries: where the outputs of modules are through which parameters enter the graph.
         lone: parameters that enter it otherwise.
     """
 
-    entries: list[Tensor] = field(default_factory=list)
+    entries: list[GradientEdge] = field(default_factory=list)
     lone: list[nn.Parameter] = field(default_factory=list)
+
+
+def _refuse_changed(what: str, tensor: Tensor, version: int) -> None:
+    """Raise AegisError if a tensor is not what it was any more.
+
+    Autograd does so itself where it needs the tensor, which it does not for a frozen map.
+    """
+    if tensor._version != version:
+        raise AegisError(
+            f"{what}, which the model has changed in place since",
+            "a pass that changes no such tensor in place",
+            "x = x + y in place of x += y, and inplace=False, while the curvature is measured",
+        )
 
 
 class CurvatureRecorder:
@@ -237,7 +253,8 @@ class CurvatureRecorder:
         read = [t for t in (*arguments, *named.values()) if isinstance(t, Tensor)]
         enters = not any(t.requires_grad for t in read)
         if enters and isinstance(output, Tensor) and output.requires_grad:
-            self._graph.entries.append(output)
+            # Of the tensor itself the edge would move where the model goes on in place.
+            self._graph.entries.append(get_gradient_edge(output))
 
     def _follow_call(
         self,
@@ -254,12 +271,13 @@ class CurvatureRecorder:
         if self._last is not None and self._last.serves(site, module, read):
             self._last.sites.append(site)
         else:
-            self._last = Weighed(read, module, [site])
+            self._last = Weighed(read, module, [site], read._version)
         output.register_hook(partial(self._count, self._last, site, module))
 
     @torch.no_grad()
     def _count(self, reading: Weighed, site: str, module: nn.Module, gradient: Tensor) -> None:
         """Add what one call of the module says by the gradient at its output."""
+        _refuse_changed(f"what '{site}' read", reading.x, reading.version)
         x, g = inputs.dense_rows(module, reading.x), _output_rows(module, gradient)
         g = g.to(torch.promote_types(g.dtype, torch.float32))
         # |x|^2 g g^T is the second moment of the row |x| g, and so for the other factor.

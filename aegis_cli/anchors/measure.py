@@ -77,7 +77,8 @@ def run(
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
     Files give at most as many as they hold. It runs in float32, so that neither batch size nor
-    order shows in the result.
+    order shows in moments, inputs and Fisher information. What is drawn depends on both: the words
+    of answers that the curvature goes back from, and the tokens where a share of them is read.
 
     Where torchrun has started several processes, each calls this, and they share the passes.
 

@@ -48,13 +48,9 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(cls, rows: Tensor) -> Normalizer:
-        """Mean and standard deviation of rows [N, D].
-
-        Two passes in float64: E[x^2] - E[x]^2 would cancel where the mean is large.
-        """
+        """Mean and standard deviation of rows [N, D]."""
         x = rows.double()
-        mean = x.mean(0)
-        return cls.scaled(mean, (x - mean).square().mean(0).sqrt(), _never_varies(x))
+        return cls.scaled(x.mean(0), deviations(x), _never_varies(x))
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
@@ -82,6 +78,16 @@ class Normalizer(nn.Module):
     def invert(self, x: Tensor) -> Tensor:
         """The raw values behind normalised x [..., D]."""
         return x * self.std + self.mean
+
+
+def deviations(rows: Tensor) -> Tensor:
+    """Standard deviations [D] float64 of rows [N, D]; 0 of a dimension that never varies.
+
+    Two passes in float64: E[x^2] - E[x]^2 would cancel where the mean is large.
+    """
+    x = rows.double()
+    spread = (x - x.mean(0)).square().mean(0).sqrt()
+    return torch.where(_never_varies(x), 0.0, spread)
 
 
 def _never_varies(rows: Tensor) -> Tensor:

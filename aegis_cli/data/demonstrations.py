@@ -20,7 +20,7 @@ from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
 from aegis_cli.data import relative, renaming
-from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch, deviations
 from aegis_cli.data.fitted import FittedFrames
 from aegis_cli.data.joined_frames import JoinedFrames
 from aegis_cli.data.lerobot import dataset, download, layout, rows
@@ -201,7 +201,7 @@ class Demonstrations:
     @property
     def action_std(self) -> list[float]:
         """Standard deviations of the A actions over the training frames; 0 of one that is fixed."""
-        return Normalizer.fit(self.tensors["actions"][self.train]).std.tolist()
+        return deviations(self.tensors["actions"][self.train]).tolist()
 
     def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
         """Actions [N, A] of the training frames' chunks, less their origins.

@@ -192,12 +192,12 @@ def run(
     at = _spread(shown, chosen.episodes, frames)
     policy = policy.to(devices.pick())
     predicted = _predict(policy, shown, at, seed, batch_size, on_event)
+    found = compare(shown, at, predicted, _training_std(policy, meta, on_event))
     report = dataclasses.replace(
-        compare(shown, at, predicted, _training_std(policy, meta, on_event)),
+        found,
         data=str(data),
         split=chosen.split,
-        episodes=chosen.episodes,
-        trained_on=chosen.trained_on,
+        trained_on=[one for one in chosen.trained_on if one in found.episodes],
         seed=seed,
         traces=_traces(policy, meta, shown, chosen, seed, batch_size) if traced else [],
     )

@@ -48,6 +48,7 @@ class DualBackward:
         ledger: LedgerOutsideRuns,
         owners: Ranks,
         processes: Group,
+        around: Sequence[nn.Parameter] = (),
     ) -> None:
         """Begin without a pass.
 
@@ -55,9 +56,12 @@ class DualBackward:
             groups: the parameters that learn, each once; the ledger has a column for each group.
             owners: the processes that have some rows of every weight.
             processes: those that train the model together.
+            around: the parameters of the policy that the model is a part of, which are left to the
+                task alone.
         """
         self._parts, self._groups, self._stepper = parts, groups, stepper
         self._ledger, self._owners, self._processes = ledger, owners, processes
+        self._around = around
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._looked = 0, False
@@ -134,7 +138,7 @@ class DualBackward:
         loss.backward(retain_graph=True)
         self._stepper.passed()
         if self._owners.several:
-            taken = backward.second_backward_of_rows(groups, penalty * scale)
+            taken = backward.second_backward_of_rows(groups, penalty * scale, self._around)
         else:
             taken = backward.second_backward(groups, penalty * scale)
         self._add(total, AnchorGradient(taken, w2), loss.detach(), scale, skips)

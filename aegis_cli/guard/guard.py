@@ -105,6 +105,7 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
+        around = list(model.parameters())
         model, path = structure.part_of(model, part), Path(anchor)
         dual = methods.get(method).compares_layers
         self._owners = _owners(model, accumulation.resolved(process_group))
@@ -131,10 +132,10 @@ class Guard(Removable):
         self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
-        self._hooks, self._seen = LayerHooks(found), None
         # Whoever names the kinds to protect has decided about the rest too.
         averaging = {} if dual or "protect" in options else structure.averaging(model)
         self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
+        self._hooks, self._seen = LayerHooks(found), None
         self._dual: DualBackward | None = None
         if dual:
             self._dual = DualBackward(
@@ -144,6 +145,7 @@ class Guard(Removable):
                 self.ledger,
                 self._owners,
                 process_group,
+                around,
             )
         self._model, self._removed = model, False
         self._automatic: AutomaticLoop | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -32,21 +32,42 @@ def second_backward(
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
 
-def second_backward_of_rows(groups: Groups, penalty: Tensor) -> dict[int, Tensor | None]:
+def second_backward_of_rows(
+    groups: Groups, penalty: Tensor, others: Iterable[nn.Parameter] = ()
+) -> dict[int, Tensor | None]:
     """The anchor gradient of each parameter by its id, where a process has only rows of it.
 
     Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
-    task's, which lie there, are put aside meanwhile.
+    task's, which lie there, are put aside meanwhile. So are those of whatever else the penalty
+    depends on, which is left to the task alone.
+
+    Args:
+        others: further parameters that it may depend on. Leaves of its graph are found, but the
+            graph does not know the rows that FSDP cuts a gradient to.
     """
     parameters = [p for group in groups for p in group]
-    task = [p.grad for p in parameters]
-    for parameter in parameters:
+    reached = {id(p): p for p in (*parameters, *others, *_leaves(penalty))}
+    task = {key: p.grad for key, p in reached.items()}
+    for parameter in reached.values():
         parameter.grad = None
     penalty.backward()
     found = {id(p): p.grad for p in parameters}
-    for parameter, gradient in zip(parameters, task, strict=True):
-        parameter.grad = gradient
+    for key, parameter in reached.items():
+        parameter.grad = task[key]
     return found
+
+
+def _leaves(result: Tensor) -> Iterator[Tensor]:
+    """The tensors into whose `.grad` a backward pass from `result` may add."""
+    waiting, seen = [result.grad_fn], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if (leaf := getattr(node, "variable", None)) is not None:
+            yield leaf
+        waiting += [earlier for earlier, _ in node.next_functions]
 
 
 def where_task_moves(

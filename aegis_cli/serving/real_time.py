@@ -73,6 +73,7 @@ class RealTime:
             )
         self._policy, self.execute, self.guided = policy, execute, guided
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="aegis-real-time")
+        self._closed = False
         self._pending: Future[np.ndarray] | None = None
         self._delays: deque[int] = deque(maxlen=_REMEMBERED)
         self._guess = 1  # before any is known: what the first prediction took
@@ -97,6 +98,7 @@ class RealTime:
     def close(self) -> None:
         """Wait for the prediction that is under way, and end the thread."""
         self._thread.shutdown()
+        self._closed = True
 
     def reset(self) -> None:
         """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
@@ -119,6 +121,12 @@ class RealTime:
             AegisError: what `predict_action_chunk` finds wrong with an observation, at each call,
                 or found wrong with the actions that it predicted meanwhile.
         """
+        if self._closed:
+            raise AegisError(
+                "a policy in real time that was closed",
+                "one that is open",
+                "make a new RealTime, and select actions inside `with`",
+            )
         seen = self._policy.read(pictures, instruction, positions)
         if seen.instruction != self._follows:
             self._begin(seen)

@@ -109,9 +109,9 @@ class TrainingRun:
         if it is not float32; `ensemble`, the decay of its temporal ensemble, if it has one;
         `relative`, for each action the place of the position that it is predicted relative to, or
         None, if any is; `action_names`, `proprio_names` and `fps` as far as the demonstrations say
-        them; `action_std`, the actions' standard deviations, where the policy's scale is another;
-        `dataset`, their id or those of several, and `base_model`, that
-        of the model that the backbone began as, if they come from the hub.
+        them; `action_std`, the actions' standard deviations, where one of the policy's scales is
+        another; `dataset`, their id or those of several, and `base_model`, that of the model that
+        the backbone began as, if they come from the hub.
         """
         found = {
             "method": self.method.name,
@@ -125,8 +125,12 @@ class TrainingRun:
         found |= self.demos.recorded
         if self.policy.origins.places:
             found["relative"] = list(self.policy.origins.places)
-        if "relative" in found or found["normalization"] != "mean_std":
-            found["action_std"] = self.demos.action_std
+        spread = self.demos.action_std
+        by_spread = "relative" not in found and found["normalization"] == "mean_std"
+        # Of an action that hardly varies beside its mean the scale is 1, or 0.
+        scale = self.policy.action_scale.std.cpu().double()
+        if not by_spread or not torch.allclose(scale, torch.tensor(spread).double(), rtol=1e-4):
+            found["action_std"] = spread
         if self.demos.datasets:
             one, *others = self.demos.datasets
             found["dataset"] = [one, *others] if others else one

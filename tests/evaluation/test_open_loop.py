@@ -274,6 +274,30 @@ def test_the_frames_are_spread_and_at_most_as_many_as_asked(
     assert found.frames == 9 and found.horizon[0].frames == 9
 
 
+def test_episodes_of_which_no_frame_was_read_are_not_reported(
+    naive_run: Path, demos_file: Path
+) -> None:
+    found = open_loop.run(naive_run, demos_file, episodes=range(8), frames=3)
+    assert len(found.episodes) == found.frames == 3
+    assert set(found.trained_on) <= set(found.episodes)
+    assert sum(one.episodes for one in found.instructions) >= len(found.episodes)
+
+
+def test_an_action_that_hardly_varies_beside_its_mean_is_judged_by_how_it_varies(
+    recipe: Recipe, demos_file: Path, tmp_path: Path
+) -> None:
+    """An encoder's ticks, say; the policy only centres it, for its scale would be of rounding."""
+    saved = artifacts.load(demos_file, "demos")
+    actions = saved.tensors["actions"].clone()
+    actions[:, 0] = 5000 + 0.3 * actions[:, 0] / actions[:, 0].std()
+    data = tmp_path / "arm.safetensors"
+    meta = saved.header.meta
+    artifacts.save(data, "demos", saved.tensors | {"actions": actions}, seed=0, meta=meta)
+    train.run(recipe, "naive", data, None, tmp_path / "run")
+    found, _ = evaluated(tmp_path / "run", data)
+    assert found.dimensions[0].training_std == pytest.approx(0.3, rel=0.2)
+
+
 def test_it_is_the_same_every_time_and_whatever_the_batch_size(
     naive_run: Path, demos_file: Path
 ) -> None:

@@ -236,3 +236,10 @@ def test_chunks_of_which_nothing_is_left_are_refused(execute: int) -> None:
 def test_a_temporal_ensemble_is_refused() -> None:
     with pytest.raises(AegisError, match="temporal ensemble 0.1"):
         RealTime(deployed(ensemble=0.1))
+
+
+def test_a_closed_one_says_so() -> None:
+    with RealTime(deployed()) as running:
+        running.select_action(images(1)[0].numpy(), TEXT, at(0))
+    with pytest.raises(AegisError, match="was closed"):
+        running.select_action(images(1)[0].numpy(), TEXT, at(1))
