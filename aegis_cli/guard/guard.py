@@ -105,8 +105,8 @@ class Guard(Removable):
             raise AegisError(
                 f"method '{method}'", f"one of {', '.join(METHODS)}", "choose with method="
             )
-        around = list(model.parameters())
-        model, path = structure.part_of(model, part), Path(anchor)
+        policy = model
+        model, path = structure.part_of(policy, part), Path(anchor)
         dual = methods.get(method).compares_layers
         self._owners = _owners(model, accumulation.resolved(process_group))
         if dual:
@@ -145,7 +145,7 @@ class Guard(Removable):
                 self.ledger,
                 self._owners,
                 process_group,
-                around,
+                list(policy.parameters()),
             )
         self._model, self._removed = model, False
         self._automatic: AutomaticLoop | None = None
