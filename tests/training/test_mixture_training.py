@@ -184,7 +184,7 @@ def test_each_set_is_known_to_its_run(number: int, sets: tuple[Path, Path], run:
 
 
 def test_others_are_known_to_be_none_of_them(demos_file: Path, run: Path) -> None:
-    report = open_loop.run(run, demos_file, frames=4, keep=False)
+    report = open_loop.run(run, demos_file, frames=100, keep=False)
     assert (report.split, len(report.episodes)) == (open_loop.OTHER, EPISODES)
 
 
