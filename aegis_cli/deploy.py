@@ -16,6 +16,7 @@ demonstrations.
 from __future__ import annotations
 
 import copy
+import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from aegis_cli.core import ensemble as temporal
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.lerobot import layout, observation
+from aegis_cli.data.selection import listed
 from aegis_cli.evaluation.rollout import Acting, load_run
 from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.recipes import is_robot_stream_run
@@ -72,6 +74,8 @@ class DeployedPolicy:
             step; None without one.
         action_names, state_names: of the A actions and the P positions, in their order; None where
             the demonstrations had none, or the policy is older than these names.
+        state: the features of the demonstrations that the positions are, `observation.state` as a
+            rule. `predict_action_chunk` reads them from an observation that has all of them.
         fps: actions per second, as many as the demonstrations had frames; None where that is not
             known.
     """
@@ -91,7 +95,7 @@ class DeployedPolicy:
 
         Args:
             recorded: what a checkpoint's meta says of the demonstrations: `action_names`,
-                `proprio_names` and `fps`, each only where it is known.
+                `proprio_names`, `state` and `fps`, each only where it is known.
             ensemble: decay of a temporal ensemble; then `replan` is 1 whatever is given.
         """
         self._policy, self._generator = policy, torch.Generator()
@@ -103,7 +107,10 @@ class DeployedPolicy:
         known = recorded or {}
         self.action_names = _names(known.get("action_names"))
         self.state_names = _names(known.get("proprio_names"))
+        self.state = tuple(listed(known.get("state", layout.STATE)))
         self.fps: float | None = known.get("fps")
+        # A backbone notes what its modules do in a pass, and would note that of two at once.
+        self._one_at_a_time = threading.Lock()
         self.reset()
 
     @property
@@ -121,7 +128,10 @@ class DeployedPolicy:
         self._policy.backbone.check_prompt(text)
 
     def begin(self) -> DeployedPolicy:
-        """The same policy at the beginning of an episode of its own; the weights are shared."""
+        """The same policy at the beginning of an episode of its own; the weights are shared.
+
+        Several may act from several threads; they wait for each other.
+        """
         other = copy.copy(self)
         other._generator = torch.Generator()
         other.reset()
@@ -228,7 +238,7 @@ class DeployedPolicy:
             AegisError: they are not finite.
         """
         # Within a program's own inference mode nothing could be differentiated.
-        with torch.inference_mode(mode=False):
+        with self._one_at_a_time, torch.inference_mode(mode=False):
             frames = [torch.from_numpy(self._fitted(p, i)) for i, p in enumerate(seen.pictures)]
             images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
             proprio, texts = torch.from_numpy(seen.positions)[None], [seen.instruction]
@@ -277,7 +287,7 @@ class DeployedPolicy:
         if positions is None:
             if not isinstance(pictures, Mapping):
                 raise AegisError("no positions", f"numbers [{self.positions}]", _ORDER)
-            seen = observation.read(pictures, self.cameras, self.state_names)
+            seen = observation.read(pictures, self.cameras, self.state_names, self.state)
             pictures, positions = seen.pictures, seen.positions
             if instruction is None:
                 instruction = seen.task

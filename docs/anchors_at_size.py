@@ -105,8 +105,8 @@ def measure(
         return Anchor(inputs=found)
     if part == "curvature":
         return Anchor(curvature=curvature.measure(model, asked, ENERGY, 0, batch, memory=memory))
-    for scores in passes.run(model, asked, batch, part, ignore):
-        total = scores.float().log_softmax(-1).amax(-1).sum()
+    for answered in passes.run(model, asked, batch, part, ignore):
+        total = answered.scores.float().log_softmax(-1).amax(-1).sum()
         torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
     return Anchor()
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -494,3 +496,28 @@ def test_what_a_policy_answers_in_bf16_is_nearly_what_it_answers_in_float32(
     assert found["bf16"].dtype == np.float32 and (found["bf16"] != found["float32"]).any()
     spread = found["float32"].std()
     assert np.abs(found["bf16"] - found["float32"]).max() < 0.1 * spread
+
+
+def test_policies_of_the_same_weights_act_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A backbone's hooks would note what is read in two passes at once as if it were one."""
+    policy, at_once, most = deployed(), [], []
+    act = policy._policy.act
+
+    def noting(*given: Any) -> torch.Tensor:
+        at_once.append(given)
+        most.append(len(at_once))
+        time.sleep(0.02)
+        found = act(*given)
+        at_once.pop()
+        return found
+
+    monkeypatch.setattr(policy._policy, "act", noting)
+    robots = [policy.begin() for _ in range(3)]
+    with ThreadPoolExecutor(3) as threads:
+        found = [
+            threads.submit(robot.predict_action_chunk, frame(), TEXT, POSITIONS) for robot in robots
+        ]
+    first, *others = (one.result() for one in found)
+    assert most == [1, 1, 1] and all(np.array_equal(first, other) for other in others)

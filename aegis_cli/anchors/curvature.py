@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge, get_gradient_edge
@@ -130,7 +131,7 @@ class CurvatureRecorder:
 
         Args:
             maps: those that are measured, as far as they are dense.
-            seed: of the words that answers are drawn as.
+            seed: of the words that answers are drawn as, where `answer` is not told otherwise.
             follow_uses: as for `InputRecorder`.
             whole: as for `SecondMoments`.
             temperature: what the answers' scores are divided by.
@@ -178,7 +179,7 @@ class CurvatureRecorder:
                 hooks.enter_context(watch_uses(self._model, self._note_use))
             yield
 
-    def answer(self, scores: Tensor, keep: bool = True) -> None:
+    def answer(self, scores: Tensor, keep: bool = True, uniform: Tensor | None = None) -> None:
         """Go back once through the graph of scores.
 
         The gradient is that of log p(word) summed over the words, each drawn from the model's own
@@ -190,12 +191,18 @@ class CurvatureRecorder:
         Args:
             scores: [n, V] unnormalised, of the positions where answers' words are predicted.
             keep: keep the graph, for other scores of the same pass.
+            uniform: [n] float64 in [0, 1), by which the words are drawn; None draws them by the
+                recorder's seed, one call after the other.
 
         Raises:
             AegisError: scores by which no word can be drawn.
         """
         self.entropy.add(scores)
-        self.follow(_log_likelihood(scores / self._temperature, self._generator), keep)
+        if uniform is None:
+            uniform = torch.rand(
+                len(scores), dtype=torch.float64, generator=self._generator, device="cpu"
+            )
+        self.follow(_log_likelihood(scores / self._temperature, uniform), keep)
 
     def follow(self, total: Tensor, keep: bool = True) -> None:
         """Go back once through the graph of a sum over independent examples."""
@@ -253,7 +260,7 @@ class CurvatureRecorder:
         read = [t for t in (*arguments, *named.values()) if isinstance(t, Tensor)]
         enters = not any(t.requires_grad for t in read)
         if enters and isinstance(output, Tensor) and output.requires_grad:
-            # Of the tensor itself the edge would move where the model goes on in place.
+            # The edge is taken now: the tensor's own would move where the model goes on in place.
             self._graph.entries.append(get_gradient_edge(output))
 
     def _follow_call(
@@ -326,10 +333,14 @@ def measure(
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
+    Each question's words are drawn by the seed and by its number in the set. So neither the batch
+    size nor the number of groups or processes shows.
+
     Args:
-        memory: as for `inputs.measure`; every group's passes draw the same words.
+        seed: of the words that answers are drawn as.
+        memory: as for `inputs.measure`.
         whole: as for `SecondMoments`.
-        ranks: the processes that share the passes; each draws words of its own.
+        ranks: the processes that share the passes.
         temperature: what the answers' scores are divided by before words are drawn from them.
         entropy: what is to count the answers of this process.
 
@@ -339,18 +350,18 @@ def measure(
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor curvature", memory, sized):
-        own = seed + (ranks.rank << 32)
         recorder = CurvatureRecorder(
-            model, maps, own, follow_uses=False, whole=whole, temperature=temperature
+            model, maps, seed, follow_uses=False, whole=whole, temperature=temperature
         )
         recorder.entropy = entropy or recorder.entropy
         if not recorder.names:
             continue
         with recorder.watch(), torch.enable_grad():
-            for scores in passes.run(model, asked, batch_size, stage, on_event, ranks):
+            for part in passes.run(model, asked, batch_size, stage, on_event, ranks):
                 # Questions of one image may share its graph: their drawn words are independent, so
                 # what their gradients have in common is 0 on average.
-                recorder.answer(scores, keep=False)
+                uniform = _uniform(seed, part.question)
+                recorder.answer(part.scores, keep=False, uniform=uniform)
         recorder.add_up(ranks)
         recorder.check_complete()
         spectra = recorder.spectra(energy, release=True)
@@ -397,9 +408,29 @@ def _output_rows(module: nn.Module, gradient: Tensor) -> Tensor:
     return gradient.flatten(2).transpose(1, 2).flatten(0, 1)
 
 
-def _log_likelihood(scores: Tensor, generator: torch.Generator) -> Tensor:
-    """The log-likelihood of words drawn from the scores [n, V] themselves."""
-    # Drawn on the CPU, where the generator is, so that the words are the same on every device.
+def _uniform(seed: int, question: Tensor) -> Tensor:
+    """A number in [0, 1) for each word of some questions' answers, [n] float64.
+
+    Args:
+        question: [n], the number of the question that each word answers.
+    """
+    own, words = question.unique_consecutive(return_counts=True)
+    found = []
+    for number, count in zip(own.tolist(), words.tolist(), strict=True):
+        found.append(np.random.default_rng((seed, number)).random(count))
+    return torch.from_numpy(np.concatenate(found))
+
+
+def _log_likelihood(scores: Tensor, uniform: Tensor) -> Tensor:
+    """The log-likelihood of words drawn from the scores [n, V] themselves.
+
+    A word is the first one up to which the chances sum to more than its number in [0, 1). Sums move
+    little by rounding, so that batches of another size have the same words.
+
+    Args:
+        uniform: [n] float64 in [0, 1), on the CPU.
+    """
+    # Drawn on the CPU, so that the words are the same on every device.
     chances = scores.detach().float().softmax(-1).cpu()
     if not chances.isfinite().all():
         raise AegisError(
@@ -407,5 +438,7 @@ def _log_likelihood(scores: Tensor, generator: torch.Generator) -> Tensor:
             "finite scores; minus infinity for a word that is never said",
             f"{FINITE}, and see that its weights are finite",
         )
-    drawn = torch.multinomial(chances, 1, generator=generator).to(scores.device)  # [n, 1]
+    below = chances.double().cumsum(-1)
+    drawn = torch.searchsorted(below / below[:, -1:], uniform[:, None], right=True)  # [n, 1]
+    drawn = drawn.to(scores.device)
     return scores.float().log_softmax(-1).gather(1, drawn).sum()

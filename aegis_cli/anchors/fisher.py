@@ -7,6 +7,7 @@ from torch import Tensor
 
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
+from aegis_cli.data import spread
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
@@ -34,8 +35,8 @@ def measure(
     parameters = dict(model.named_parameters())
     # In float64: the square of a gradient of 1e-25 is 0 in float32.
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
-    rows = torch.linspace(0, len(asked.questions) - 1, samples).long().tolist()
-    for done, row in enumerate(rows, start=1):
+    rows = spread.rows(len(asked.questions), samples)
+    for done, row in enumerate(rows.tolist(), start=1):
         if (done - 1) % ranks.count == ranks.rank:
             likelihood = _log_likelihood(model, asked, row)
             wanted = list(parameters.values())

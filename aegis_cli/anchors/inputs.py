@@ -356,7 +356,7 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
         if spectrum.vectors is None:
             continue
         directions += spectrum.values.numel()
-        # Of a normalisation all directions are kept: they are two per channel at most.
+        # A normalisation keeps all its directions, which are two per channel at most.
         whole = spectrum.vectors.ndim == 3
         kept += spectrum.values.numel() if whole else spectrum.vectors.shape[1]
     return kept / directions if directions else None

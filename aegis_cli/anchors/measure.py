@@ -76,9 +76,9 @@ def run(
 ) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
-    Files give at most as many as they hold. It runs in float32, so that neither batch size nor
-    order shows in moments, inputs and Fisher information. What is drawn depends on both: the words
-    of answers that the curvature goes back from, and the tokens where a share of them is read.
+    Files give at most as many as they hold. It runs in float32, so that neither the batch size nor
+    the number of processes shows in what is measured; where a share of the tokens is read
+    (`settings.tokens`), which ones are drawn depends on both.
 
     Where torchrun has started several processes, each calls this, and they share the passes.
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa.images import tensors
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import AnswerScores, Backbone
 from aegis_cli.models.structure import Maps
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
@@ -75,14 +75,14 @@ def run(
     stage: str,
     on_event: OnEvent,
     ranks: Ranks = ALONE,
-) -> Iterator[Tensor]:
+) -> Iterator[AnswerScores]:
     """Pass the whole set, up to `batch_size` images at a time with all their questions.
 
     Args:
         ranks: the processes that pass a part of the images each.
 
     Yields:
-        The scores [n, V] of the answers' words, part by part.
+        The scores of the answers' words, part by part, with the number of each question in the set.
     """
     image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
     own = Share(ranks.rank, ranks.count).rows(len(asked.images))
@@ -92,7 +92,7 @@ def run(
         images = tensors(asked.images[first:last])
         questions = [asked.questions[i] for i in rows.tolist()]
         texts, answers = [q.text for q in questions], [q.answer for q in questions]
-        yield from model.read_vqa(
-            images, image_of[rows] - first, texts, answers, min(QUESTIONS, batch_size)
-        )
+        together = min(QUESTIONS, batch_size)
+        for part in model.read_vqa(images, image_of[rows] - first, texts, answers, together):
+            yield AnswerScores(part.scores, rows[part.question])
         on_event(Progress(stage, last - own.start, own.stop - own.start, "images"))

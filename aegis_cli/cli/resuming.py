@@ -55,7 +55,7 @@ def inputs_of(
 ) -> tuple[list[Path], Path | None]:
     """The demonstrations and the anchor that a run goes on with: those given, else its own.
 
-    Of a run that has not written them down, the recipe may name the demonstrations: then none here.
+    Where a run has not written its demonstrations down, the recipe may name them: then none here.
 
     Raises:
         AegisError: they are not where they were, an earlier version has not written it down, or

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+_NAMED = 4  # names that an error lists
 
 
 class AegisError(Exception):
@@ -41,6 +43,12 @@ def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps:
     if not all(math.isfinite(value) for value in figures.values()):
         found = ", ".join(f"{name} {value:g}" for name, value in figures.items())
         raise Diverged(f"{found} {where}", "finite numbers", fix, good_steps)
+
+
+def few(names: Sequence[str]) -> str:
+    """Some of the names, and how many there are where that is not all."""
+    shown = ", ".join(names[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown}, ... {len(names)} in all"
 
 
 def in_short(error: Exception) -> str:

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.kinds import describe, quoted
 
 AS_WRITTEN = "bring back the file as Aegis wrote it, or make it again"
-_NAMED = 3  # tensors that an error names
+_NAMED = 3  # problems that an error names
 _LARGEST = 2**20  # of a model's sizes
 Shape = TypeVar("Shape")
 
@@ -39,9 +39,9 @@ def check_state(
     """
     problems = []
     if missing := wanted.keys() - found.keys():
-        problems.append(f"{_few(missing)} missing")
+        problems.append(f"{_quoted(missing)} missing")
     if extra := found.keys() - wanted.keys():
-        problems.append(f"{_few(extra)} not part of it")
+        problems.append(f"{_quoted(extra)} not part of it")
     for name in sorted(wanted.keys() & found.keys()):
         one, other = found[name], wanted[name]
         alike = one.dtype == other.dtype
@@ -61,10 +61,9 @@ def check_state(
         )
 
 
-def _few(names: set[str]) -> str:
-    """Some of the names, and how many they are."""
-    shown = quoted(sorted(names)[:_NAMED])
-    return shown if len(names) <= _NAMED else f"{shown}, ... {len(names)} in all"
+def _quoted(names: set[str]) -> str:
+    """Some of the names in quotes, and how many they are."""
+    return few([f"'{name}'" for name in sorted(names)])
 
 
 @contextlib.contextmanager

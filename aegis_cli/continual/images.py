@@ -29,7 +29,7 @@ from aegis_cli.core import routing
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.core.gaussians import NONE, Gaussian, fit, infer
 from aegis_cli.core.routing import Routed, activate
-from aegis_cli.data import streams
+from aegis_cli.data import spread, streams
 from aegis_cli.data.lerobot import frames
 from aegis_cli.data.streams import folders, mtil
 from aegis_cli.data.streams.contract import Part, StreamTask
@@ -311,8 +311,7 @@ class ClassificationLoss:
     def __init__(self, task: StreamTask, encoder: DualEncoder, label_smoothing: float) -> None:
         self.name, self.size = task.name, len(task.train)
         self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
-        rows = torch.linspace(0, self.size - 1, min(CALIBRATION_IMAGES, self.size)).long()
-        self._calibration = self.fetch(rows)
+        self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_IMAGES))
         # the classes' features [C, D], as long as nothing that learns acts on them
         self._texts: Tensor | None = None
 

@@ -30,7 +30,7 @@ from aegis_cli.continual.state import StreamRun
 from aegis_cli.core import routing
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.core.routing import Routed
-from aegis_cli.data import demonstrations
+from aegis_cli.data import demonstrations, spread
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
@@ -344,7 +344,7 @@ def _assemble(
 ) -> RobotStreamRun:
     """A run at its beginning: one policy per task, and sites for experts if its learner has any."""
     learner = learners.get(recipe.train.method)
-    # Of the bare backbone, before anything stands beside it.
+    # Taken from the bare backbone, before anything stands beside it.
     fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
     policies = share(backbone, shape, scales, recipe.seed)
     return RobotStreamRun(
@@ -572,8 +572,7 @@ class FlowMatchingLoss:
         self._first_step = number * recipe.train.steps
         self._settings, self._seed = recipe.train, recipe.seed
         self._policy, self._demos = policy, demos
-        rows = torch.linspace(0, self.size - 1, min(CALIBRATION_FRAMES, self.size)).long()
-        self._calibration = self.fetch(rows)
+        self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_FRAMES))
 
     def fetch(self, rows: Tensor) -> RobotBatch:
         return self._demos.batch(self._demos.train[rows], self._settings.chunk)

@@ -24,6 +24,7 @@ import torch
 
 from aegis_cli import recipes
 from aegis_cli.common import launch, locks
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
 from aegis_cli.continual import files, images, loop, state
@@ -66,6 +67,7 @@ def _run(
 ) -> StreamReport:
     folder.check(out, recipe, resume, overwrite)
     if files.is_done(out) and not overwrite:
+        _check_same_recording(out, recipe)
         return files.read(out)
     built = build(recipe, out, on_event)
     if overwrite:
@@ -82,6 +84,22 @@ def _run(
     files.write(built, report)
     (out / state.STATE).unlink(missing_ok=True)
     return report
+
+
+def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> None:
+    """Raise AegisError if a finished run learned from demonstrations of other settings.
+
+    Where files are given instead, they may have been moved.
+    """
+    if not isinstance(recipe, RobotStreamRecipe) or recipe.demos.paths is not None:
+        return
+    learned = recipes.load_training(out / "recipe.yaml").demos
+    if dataclasses.replace(learned, paths=None) != recipe.demos:
+        raise AegisError(
+            f"other demonstrations than the finished stream in '{out}' learned from",
+            f"episodes {learned.episodes}, noise {learned.noise:g} and seed {learned.seed}",
+            "give what it was trained with, start anew in another --out, or --overwrite it",
+        )
 
 
 def build(

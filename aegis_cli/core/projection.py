@@ -227,6 +227,6 @@ def conflict(ta: Tensor) -> Tensor:
 
 
 def ratio(x: Tensor, y: Tensor) -> Tensor:
-    """x / y, and 0 where y is exactly 0; NaN stays NaN."""
+    """x / y, and 0 where y is exactly 0, whatever x is."""
     zero = y == 0
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)

@@ -36,7 +36,7 @@ _MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
 Split = tuple[float | None, int, str | None]
-# Of one camera, [N, H, W, 3] uint8.
+# The frames of one camera, [N, H, W, 3] uint8.
 Frames = Tensor | FramesOnDemand | FittedFrames | JoinedFrames
 
 
@@ -421,9 +421,9 @@ def _load_folder(
             frames.append(FramesOnDemand(parts, found.info.frames, image_size))
             videos.update(part.path for part in parts)
         else:
-            made = camera_frames.load(source, index, name, image_size, own, workers, on_event)
+            made, file = camera_frames.load(source, index, name, image_size, own, workers, on_event)
             frames.append(torch.from_numpy(made))
-            mapped.append(Path(made.filename))
+            mapped.append(file)
     return Demonstrations(
         task=found.info.task,
         frames=tuple(frames),
@@ -461,10 +461,12 @@ def _split(
     validation_share, seed, only = split
     count = len(starts) - 1
     episodes = _chosen(path, count, only, splits or {})
-    if validation_share is not None and len(episodes) < 2:
+    needed = 1 if validation_share is None else 2  # one is held out
+    if len(episodes) < needed:
         raise AegisError(
-            f"{len(episodes)} episode in '{path}'" + (f" by demos.only: {only}" if only else ""),
-            "2 or more: one is held out",
+            f"{len(episodes)} episode{'s' * (not len(episodes))} in '{path}'"
+            + (f" by demos.only: {only}" if only else ""),
+            "at least one" if needed == 1 else "2 or more: one is held out",
             "choose more with demos.only" if only else "record more with aegis demos",
         )
     validated = episodes[held_out(len(episodes), validation_share, seed)]

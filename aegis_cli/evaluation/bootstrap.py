@@ -129,7 +129,7 @@ def _resampled_means(
         weight = weights[known]  # [R, N], how often each unit was drawn
         if one.names is not None:
             weight = weight[:, [column[name] for name in one.names]]
-            # Of a seed's few units a resample may have none; then all of them count.
+            # A resample may have none of a seed's few units; then all of them count.
             weight = np.where(weight.any(axis=1, keepdims=True), weight, 1)
         means.append((weight @ one.values) / (weight @ one.counts))
     return np.stack(means, 1)

@@ -20,7 +20,7 @@ from aegis_cli.common import artifacts, commands, devices, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.kinds import quoted
-from aegis_cli.data import demonstrations, joints, mixture, renaming
+from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.mixture import Robot
@@ -487,7 +487,7 @@ def _check_rate(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnE
 def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.Tensor:
     """Frame numbers [N <= most], spread evenly over the episodes."""
     own = torch.isin(shown.episode_of, torch.tensor(episodes)).nonzero().squeeze(1)
-    return own[torch.linspace(0, len(own) - 1, min(most, len(own))).long()]
+    return own[spread.rows(len(own), most)]
 
 
 # --- predictions ----------------------------------------------------------------------------------

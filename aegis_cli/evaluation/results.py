@@ -289,7 +289,7 @@ def _said(name: str, value: float | None) -> str:
 def open_loops(run: Path) -> list[Result]:
     """The open-loop evaluations of a run's last checkpoint; on its validation episodes first.
 
-    Of those that found the same, as `aegis run` and `aegis evaluate` do, the first stands for all.
+    Where several found the same, as `aegis run` and `aegis evaluate` do, the first stands for all.
     """
     found = dict[str, Result]()
     for _, one in _read(run, OPEN_LOOP, OpenLoopFigures):
@@ -330,10 +330,24 @@ def _each(
             by_recipe.append(path)
     # A probe that tells less than another of the same questions comes after it.
     apart = sorted((run / FOLDER).glob(f"{kind}-*.json"), key=lambda path: path.stem)
+    recipe = recipe_of(run) if by_recipe else None
     for path in [*by_recipe, *apart]:
         raw = kept_figures.read(path, figures)
         settings, step = raw.pop("settings", None) or {}, raw.pop("step", None)
-        yield path, Result(path.stem, raw, settings), step
+        found = Result(path.stem, raw, settings)
+        if recipe is None or path in apart or _is_asked_for(found, kind, recipe):
+            yield path, found, step
+
+
+def _is_asked_for(found: Result, kind: str, recipe: recipes.Recipe) -> bool:
+    """Whether the recipe still asks for what `aegis run` has measured.
+
+    An earlier recipe of the run may have had more question sets, or other colours.
+    """
+    if kind == "probe":
+        return _number_of_set(found) <= len(recipe.probe.of_each_set())
+    colors = found.figures.get("colors") if kind == "rollout" else None
+    return colors is None or colors in recipe.rollout.colors
 
 
 def evaluated_on(figures: Mapping[str, Any]) -> str:
@@ -352,10 +366,14 @@ def question_set(probed: Result, recipe: recipes.Recipe) -> str:
     """The question set of a probe as somebody named it: its own, or one of the recipe's."""
     if "vqa" in probed.settings:
         return str(probed.settings["vqa"])
-    sets = recipe.probe.of_each_set()
-    number = probed.name.removeprefix("probe").lstrip("-") or "1"
-    place = int(number) - 1 if number.isdigit() else 0
+    sets, place = recipe.probe.of_each_set(), _number_of_set(probed) - 1
     return str(sets[place if place < len(sets) else 0].vqa)
+
+
+def _number_of_set(probed: Result) -> int:
+    """Which of the recipe's question sets a probe of `aegis run` asked, from 1."""
+    number = probed.name.removeprefix("probe").lstrip("-") or "1"
+    return int(number) if number.isdigit() else 1
 
 
 def gate(probed: Sequence[Result], max_drop: float | None) -> bool | None:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from aegis_cli import methods
 from aegis_cli.anchors import anchor_file
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.joint import Pair
 from aegis_cli.guard import wide_step
@@ -36,7 +36,6 @@ CONSTRAINING = ("kfac", "nullspace")
 _PLACE = "aegis_place"  # in a parameter's state: the number of what it is in the base model
 # In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
 _PARTNER = "aegis_partner"
-_NAMED = 4  # maps that a warning names
 # In which a program may keep a VLM that is stored in float32, in the order of looking for them.
 _TYPES = (torch.float32, torch.bfloat16, torch.float16)
 # How far a weight that has learned is from what it was, of its own size, at most. Weights that have
@@ -344,7 +343,7 @@ def _match_in(
         at = places.get(values, [])
         if at and len(at) != len(sites):
             raise AegisError(
-                f"{len(at)} parameters with the values of {', '.join(sites[:_NAMED])}",
+                f"{len(at)} parameters with the values of {few(sites)}",
                 f"{len(sites)}, by which they can be told",
                 "freeze them in the policy, and leave only their kind out of protect=: what "
                 "is left free can undo what the others hold",
@@ -604,7 +603,7 @@ def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Iterator[
 def _report(method: str, found: Collection[str], absent: Collection[str]) -> None:
     _log.info("%s protects %d maps of the VLM", method, len(found))
     if absent:
-        named = ", ".join(sorted(absent)[:_NAMED]) + (", ..." if len(absent) > _NAMED else "")
+        named = few(sorted(absent))
         _log.warning("%d maps of the base model are not in the policy: %s", len(absent), named)
 
 

@@ -15,7 +15,7 @@ from aegis_cli import methods
 from aegis_cli.anchors import anchor_file
 from aegis_cli.anchors.curvature import SIDES
 from aegis_cli.common import artifacts
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
@@ -38,7 +38,6 @@ _TRAINING_ALONE = {
     "step": "proximal",
 }
 _IN_BACKBONE = "vlm."  # before the names of a Hugging Face model in an anchor of `aegis anchor`
-_NAMED = 4  # modules that an error names of each type
 
 
 @dataclass(frozen=True)
@@ -260,7 +259,7 @@ def _check_adapters(
     if not inside or header.meta.get("adapted") == structure.fingerprint(model, adapters=True):
         return
     raise AegisError(
-        f"anchor '{path}' was measured without these adapters: {_few(inside)}",
+        f"anchor '{path}' was measured without these adapters: {few(inside)}",
         "an anchor of the model with its adapters, since they are what learns",
         "put the adapters into the model, measure it with Guard.measure, and make the guard of "
         'that very model; or use method="aegis", which takes an anchor of the model alone',
@@ -318,11 +317,7 @@ def _by_reason(unknown: Mapping[str, str]) -> str:
     grouped: dict[str, list[str]] = {}
     for name, why in unknown.items():
         grouped.setdefault(why, []).append(name or "the model itself")
-    return "; ".join(f"{why} ({_few(names)})" for why, names in grouped.items())
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f", ... {len(names)} in all" if len(names) > _NAMED else "")
+    return "; ".join(f"{why} ({few(names)})" for why, names in grouped.items())
 
 
 def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
@@ -334,7 +329,7 @@ def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
         raise AegisError(
-            f"weights in {dtypes[half[0]]}: {_few(half)}",
+            f"weights in {dtypes[half[0]]}: {few(half)}",
             "float32 weights",
             "model.float(), and torch.autocast for fast products",
         )
@@ -384,7 +379,7 @@ def _check_measured(
     if missing := [name for name in wanted if name not in found]:
         reasons = "".join(f"; {unmeasured[name]}" for name in missing[:1] if name in unmeasured)
         raise AegisError(
-            f"an anchor without the {part} of {_few(missing)}{reasons}",
+            f"an anchor without the {part} of {few(missing)}{reasons}",
             f"the {part} of every protected map",
             "freeze it, or measure again with questions that use it",
         )

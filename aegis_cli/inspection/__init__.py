@@ -49,7 +49,7 @@ __all__ = [
 def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspection:
     """Recognise `path`: an embedded model's name, an artifact file, a run or a dataset.
 
-    Of a dataset on the hub, which goes by its id, only the meta folder is downloaded.
+    A dataset on the hub goes by its id, and only its meta folder is downloaded.
 
     Only an artifact's header is read, unless figures need the tensors. It is done at once, so
     `on_event` (there as in every stage) is never called.

@@ -131,7 +131,7 @@ class PolicyRun:
         made_from = {**self._header.inputs, "tuned": self._header.fingerprint or ""}
 
         def fill(folder: Path) -> None:
-            self._copy_records(folder, step)
+            self._copy_records(folder, out, step)
             target = folder / "checkpoints" / f"{step:06d}"
             target.mkdir(parents=True)
             checkpoint.write_policy(
@@ -147,12 +147,19 @@ class PolicyRun:
 
         _write_whole(out, fill)
 
-    def _copy_records(self, folder: Path, step: int) -> None:
-        """What is known of the training; of its log and ledger, up to the step merged."""
-        for name in ("recipe.yaml", run_folder.METRICS, machine.NAME, places.NAME):
+    def _copy_records(self, folder: Path, out: Path, step: int) -> None:
+        """What is known of the training; of its log and ledger, up to the step merged.
+
+        Args:
+            folder: where it is written.
+            out: where that is going to lie.
+        """
+        for name in ("recipe.yaml", run_folder.METRICS, machine.NAME):
             # An earlier Aegis did not say on which machine it trained, nor where its inputs lay.
-            if name not in (machine.NAME, places.NAME) or (self._run / name).is_file():
+            if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
+        if (inputs := places.of(self._run)) is not None:
+            places.keep(folder, inputs, out)
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header

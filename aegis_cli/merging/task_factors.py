@@ -11,6 +11,7 @@ from aegis_cli.anchors.curvature import CurvatureRecorder
 from aegis_cli.anchors.inputs import InputRecorder
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.core.spectrum import DENSE, Spectrum
+from aegis_cli.data import spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
@@ -73,11 +74,10 @@ def _passes(demos: Demonstrations, frames: int, stage: str, on_event: OnEvent) -
 
     So no row is padded, and hooks on the modules see valid tokens alone.
     """
-    count = min(frames, len(demos.train))
-    chosen = demos.train[torch.linspace(0, len(demos.train) - 1, count).long()]
+    chosen = demos.train[spread.rows(len(demos.train), frames)]
     done = 0
     for instruction in demos.instruction_of[chosen].unique():
         for rows in chosen[demos.instruction_of[chosen] == instruction].split(FRAMES):
             yield rows
             done += len(rows)
-            on_event(Progress(stage, done, count, "frames"))
+            on_event(Progress(stage, done, len(chosen), "frames"))

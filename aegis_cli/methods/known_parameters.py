@@ -12,11 +12,10 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.methods.backward import Gram
 from aegis_cli.models import structure
 
-_NAMED = 3  # parameters that an error names
 _SHARDED = "weights that are whole in every process: one process, or DistributedDataParallel"
 
 
@@ -50,7 +49,7 @@ class KnownParameters:
         unknown = [name for name, p in learning.items() if id(p) not in self._known]
         if unknown:
             raise AegisError(
-                f"{_few(unknown)}: parameters that were put into the model later",
+                f"{few(unknown)}: parameters that were put into the model later",
                 "the parameters that it had at the start",
                 "add adapters (peft.get_peft_model) and wrap parts first, and make the guard, or "
                 "start the method, after it",
@@ -58,7 +57,7 @@ class KnownParameters:
         resized = [name for name, p in learning.items() if p.shape != self._known[id(p)][1]]
         if resized:
             raise AegisError(
-                f"{_few(resized)}: parameters of another shape than at the start, as sharding "
+                f"{few(resized)}: parameters of another shape than at the start, as sharding "
                 "leaves them",
                 _SHARDED,
                 "train without FSDP or ZeRO",
@@ -101,7 +100,7 @@ def refuse_sharded(model: nn.Module) -> None:
     """
     if found := sharded(model):
         raise AegisError(
-            f"{_few(found)}: sharded by FSDP",
+            f"{few(found)}: sharded by FSDP",
             _SHARDED,
             "fully_shard before the guard is made, with process_group=; or DistributedDataParallel",
         )
@@ -121,7 +120,7 @@ def refuse_partly_sharded(model: nn.Module, count: int) -> None:
             wrong.append(name)
     if wrong:
         raise AegisError(
-            f"{_few(wrong)}: not sharded by FSDP2 by rows, over the {count} processes of "
+            f"{few(wrong)}: not sharded by FSDP2 by rows, over the {count} processes of "
             "process_group=",
             "all that learns sharded, or nothing",
             "fully_shard(model) after its blocks, on a mesh of one dimension",
@@ -180,12 +179,7 @@ def check_row(gram: Gram, groups: Sequence[str]) -> None:
     anchor: Tensor = gram[2]
     if not torch.any(anchor):
         raise AegisError(
-            f"an anchor gradient of zero in all {len(groups)} groups ({_few(groups)})",
+            f"an anchor gradient of zero in all {len(groups)} groups ({few(groups)})",
             "hidden states through which the anchor reaches the layers' parameters",
             "let the layers learn, and call the very layers that the method was started on",
         )
-
-
-def _few(names: Sequence[str]) -> str:
-    more = f", ... {len(names)} in all" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more

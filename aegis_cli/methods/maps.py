@@ -33,7 +33,7 @@ def start(setting: Setting) -> Parts:
         return Parts()
     learning, reference = setting.learning(), setting.reference()
     owners = setting.owners  # not the setting, which would keep the whole anchor in memory
-    # Of all groups, so that what is frozen does not change how the others are held.
+    # All groups count, so that what is frozen does not change how the others are held.
     groups = setting.backbone.parameter_groups()
     of_group = schedule(groups, weight)
     strengths: dict[int, float] = {}

@@ -80,8 +80,8 @@ class Policy(nn.Module):
 
     def targets_on_cpu(self) -> Callable[[RobotBatch], Tensor]:
         """What `targets` finds, but without the device: for threads that prepare batches."""
-        scale = copy.deepcopy(self.action_scale).cpu()
-        return lambda batch: scale(batch.actions - self.origins(batch.proprio))
+        scale, origins = (copy.deepcopy(m).cpu() for m in (self.action_scale, self.origins))
+        return lambda batch: scale(batch.actions - origins(batch.proprio))
 
     def flow_loss(
         self,

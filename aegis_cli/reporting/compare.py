@@ -90,9 +90,9 @@ class Comparison:
 def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     """Read what was measured of each run.
 
-    Of several question sets, the first that every run was probed on is compared. Where there is
-    none, each run's own first is shown, and a warning says so. Likewise with open-loop evaluations:
-    they are compared where episodes, frames and seed are the same, trained on or not.
+    The first question set that every run was probed on is compared. Where there is none, each
+    run's own first is shown, and a warning says so. Likewise with open-loop evaluations: they are
+    compared where episodes, frames and seed are the same, trained on or not.
 
     Raises:
         AegisError: a path that is no run of a policy, and no job of such.
@@ -104,8 +104,8 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     _warn_of_unfinished(found, on_event)
     _warn_of_merges(found, on_event)
     facts = [
-        differences.of_run(path, row.steps, asked)
-        for (path, _), row, asked in zip(found, rows, probed, strict=True)
+        differences.of_run(path, row.steps, asked, _by_colors(one))
+        for (path, one), row, asked in zip(found, rows, probed, strict=True)
     ]
     same_frames = len({own[0] for own in evaluated if own is not None}) < 2
     made = Comparison(rows, same_frames, differences.between(facts))
@@ -173,6 +173,11 @@ def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
     return probed
 
 
+def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
+    """The run's rollouts by their colours, the first of each; None where a task has no colours."""
+    return {result.figures.get("colors"): result for result in reversed(found.rollouts)}
+
+
 def _by_episodes(found: InspectReport) -> dict[Any, results.Result]:
     """The run's open-loop evaluations by what has to be the same for them to be compared."""
     named = ("episodes", "trained_on", "frames", "seed")
@@ -183,7 +188,7 @@ def _by_episodes(found: InspectReport) -> dict[Any, results.Result]:
 
 
 def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Named | None]:
-    """Of each run's results by name the first that all runs with any have, else its own first."""
+    """The first result by name that all runs with any have, of each; else its own first."""
     some = [own for own in measured if own]
     shared = [name for name in next(iter(some), {}) if all(name in own for own in some)]
     return [next(((n, own[n]) for n in (*shared[:1], *own) if n in own), None) for own in measured]
@@ -219,7 +224,7 @@ def _compared(
     """
     vqa, probed = (None, {}) if asked is None else (asked[0], asked[1].figures)
     open_loop = {} if evaluated is None else evaluated[1].figures
-    played = {result.figures.get("colors"): result.figures for result in reversed(found.rollouts)}
+    played = {colors: result.figures for colors, result in _by_colors(found).items()}
     seen, held_out = played.get("seen", {}), played.get("held-out", {})
     # A task without colours has one rollout, by its return or its success.
     only = played.get(None, {})

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from aegis_cli.common import artifacts
 from aegis_cli.evaluation import results
-from aegis_cli.evaluation.results import Result
+from aegis_cli.evaluation.results import PlayedResult, Result
 
 Value = str | int | float | None
 _DIGITS = 12  # of a digest, which tell two files apart
@@ -15,11 +15,17 @@ _DIGITS = 12  # of a digest, which tell two files apart
 _OF_VALIDATION = {"demonstrations", "seed", "episodes", "share held out", "chunk"}
 
 
-def of_run(path: Path, steps: int | None, asked: tuple[str, Result] | None) -> dict[str, Value]:
+def of_run(
+    path: Path,
+    steps: int | None,
+    asked: tuple[str, Result] | None,
+    played: Mapping[str | None, PlayedResult],
+) -> dict[str, Value]:
     """What has to be alike for two runs to differ in their methods alone, by its name.
 
     Args:
         asked: the question set whose figures are compared, and its probe; None without any.
+        played: the rollouts whose figures are compared, by their colours.
     """
     recipe = results.recipe_of(path)
     inputs = artifacts.read_header(path / "ledger.safetensors").inputs
@@ -33,7 +39,20 @@ def of_run(path: Path, steps: int | None, asked: tuple[str, Result] | None) -> d
         "steps": steps,
         "batch size": recipe.train.batch_size,
         "questions": None if asked is None else _questions(path, *asked),
+        "rollout": _rollout(played.get("seen", played.get(None))),
+        "held-out rollout": _rollout(played.get("held-out")),
     }
+
+
+def _rollout(found: PlayedResult | None) -> str | None:
+    """Which episodes a rollout played, and how; None without one."""
+    if found is None:
+        return None
+    words = [f"{found.figures['episodes']} episodes of {found.figures.get('task')}"]
+    for name, value in vars(found.played).items():
+        if value is not None and value is not False:
+            words.append(f"{name} {value}")
+    return ", ".join(words)
 
 
 def _questions(path: Path, vqa: str, probed: Result) -> str:

@@ -103,7 +103,7 @@ class Reader:
     def _lerobots(self, message: Mapping[Any, Any]) -> Observation:
         """The observation of a message with LeRobot's keys, or with the motors' names."""
         policy = self._policy
-        seen = observation.read(message, policy.cameras, policy.state_names)
+        seen = observation.read(message, policy.cameras, policy.state_names, policy.state)
         if seen.task is None and PROMPT not in message and self._prompt is None:
             raise AegisError(
                 f"no instruction in an observation of {', '.join(map(str, message))}",

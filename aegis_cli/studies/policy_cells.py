@@ -687,7 +687,7 @@ class PolicyRunner:
     def open_loop_error(self, label: str, recipe: Recipe) -> float | None:
         """The cell's open-loop error on the held-out episodes of its demonstrations.
 
-        Of several sets of demonstrations it is the mean of theirs; None where no action varies.
+        With several sets of demonstrations it is the mean of theirs; None where no action varies.
         """
         given = self.demos(recipe)
         sets = [given.path] if isinstance(given.path, Path) else list(given.path)

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,10 +150,21 @@ def trials(kind: StudyKind) -> Trials:
     made: dict[str, list[tuple[Any, Cell]]] = {}
     for name, variant in kind.recipe.variants.items():
         made[name] = []
-        for value in variant.values:
-            label = f"tuning/{name}/{_slug(value)}"
+        for value, folder in zip(variant.values, _folders(variant.values), strict=True):
+            label = f"tuning/{name}/{folder}"
             made[name].append((value, Cell(label, kind.trial(name, value), validation=True)))
     return made
+
+
+def _folders(values: Sequence[Any]) -> list[str]:
+    """A folder's name for each of a knob's values, no two of which are alike."""
+    found: list[str] = []
+    for value in values:
+        name = _slug(value)
+        if name in found:  # texts that differ in what no folder's name may have
+            name += "-" + hashlib.sha256(repr(value).encode()).hexdigest()[:8]
+        found.append(name)
+    return found
 
 
 def _slug(value: Any) -> str:

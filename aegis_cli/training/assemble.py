@@ -127,7 +127,7 @@ class TrainingRun:
             found["relative"] = list(self.policy.origins.places)
         spread = self.demos.action_std
         by_spread = "relative" not in found and found["normalization"] == "mean_std"
-        # Of an action that hardly varies beside its mean the scale is 1, or 0.
+        # An action that hardly varies beside its mean has a scale of 1, or 0.
         scale = self.policy.action_scale.std.cpu().double()
         if not by_spread or not torch.allclose(scale, torch.tensor(spread).double(), rtol=1e-4):
             found["action_std"] = spread

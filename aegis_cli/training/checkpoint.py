@@ -324,10 +324,18 @@ def run_of(path: Path) -> Path | None:
 def step_of(path: Path) -> int:
     """After how many steps a checkpoint was written.
 
-    Where `last` was copied as a folder, its files say so.
+    Where `last` was copied as a folder, its files say so: its state does, and where it has none, as
+    after a merge, the checkpoint beside it that has the same expert.
     """
     name = path.resolve().name
-    return int(name) if name.isdecimal() else int(artifacts.read_header(path / STATE).meta["step"])
+    if name.isdecimal():
+        return int(name)
+    if not (path / STATE).is_file():
+        own = files.sha256_file(path / EXPERT)
+        for other in reversed(whole(path.parent.parent)):
+            if files.sha256_file(other / EXPERT) == own:
+                return int(other.name)
+    return int(artifacts.read_header(path / STATE).meta["step"])
 
 
 def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:

@@ -52,12 +52,16 @@ def is_gone(place: str) -> bool:
     return path.is_absolute() and not path.exists()
 
 
-def keep(out: Path, inputs: Inputs) -> None:
-    """Write them into a run's folder, also as they are seen from there."""
-    here = out.absolute()
+def keep(out: Path, inputs: Inputs, place: Path | None = None) -> None:
+    """Write them into a run's folder, also as they are seen from there.
 
-    def relative(place: str) -> str:
-        return os.path.relpath(place, here) if Path(place).is_absolute() else place
+    Args:
+        place: where the folder is going to lie; None: where it is.
+    """
+    here = (place or out).absolute()
+
+    def relative(given: str) -> str:
+        return os.path.relpath(given, here) if Path(given).is_absolute() else given
 
     files.save_json(out / NAME, asdict(inputs) | {_RELATIVE: asdict(inputs.each(relative))})
 

@@ -35,7 +35,7 @@ def prune(out: Path, step: int, count: int) -> None:
 def best(out: Path, steps: Collection[int]) -> int | None:
     """The one of these steps with the least validation loss; None where none has a loss.
 
-    Of equal losses it is the earliest step.
+    Where losses are equal, it is the earliest step.
     """
     losses = {
         line["step"]: line["validation_loss"]

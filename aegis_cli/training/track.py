@@ -24,7 +24,7 @@ from aegis_cli.training import folder
 
 PROJECT = "aegis"
 Log = Callable[[Mapping[str, float]], None]  # one line of metrics.jsonl, its step included
-# Of a probe, of a rollout of a set of tasks or of one with colours.
+# The tables that a probe has, a rollout of a set of tasks, and one with colours.
 _TABLES = ("families", "tasks", "target_colors")
 
 

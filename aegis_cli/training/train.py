@@ -32,7 +32,7 @@ from aegis_cli.common.headers import rewrite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
-from aegis_cli.data import augment, demonstrations, mixture
+from aegis_cli.data import augment, demonstrations, mixture, spread
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
@@ -666,8 +666,7 @@ def validation_loss(
     as many passes as a step's.
     """
     held_out, backbone = len(demos.validation), policy.backbone
-    rows = torch.linspace(0, held_out - 1, min(VALIDATION_FRAMES, held_out)).long()
-    frames = demos.validation[rows]
+    frames = demos.validation[spread.rows(held_out, VALIDATION_FRAMES)]
 
     def prepare(part: Tensor) -> tuple[RobotBatch, Ranks, int]:
         """This process's frames of a batch, who shares it, and in how many passes."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -375,7 +377,11 @@ def test_reading_scores_answers_as_forward_does() -> None:
     ]  # texts of one length are read together
     assert len(parts) == 1 and len(wanted) > 2  # one part, since all read the same images
     # scores are float32
-    torch.testing.assert_close(parts[0], torch.cat(wanted), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(parts[0].scores, torch.cat(wanted), rtol=1e-5, atol=1e-6)
+    lengths = [len(tokens(model, question)[0]) for question in asked.questions]
+    words = [len(model.tokenizer.encode(answer)) + 1 for answer in answers]
+    in_order = sorted(range(len(words)), key=lambda i: lengths[i])
+    assert parts[0].question.tolist() == [i for i in in_order for _ in range(words[i])]
 
 
 # --- Fisher information ---------------------------------------------------------------------------
@@ -456,9 +462,16 @@ def test_the_rows_of_a_convolution_times_its_weights_are_its_outputs(
 # --- curvature ------------------------------------------------------------------------------------
 
 
-def likeliest(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def matrix(spectrum: Spectrum) -> Tensor:
+    """What a spectrum holds of its matrix, in float64."""
+    assert spectrum.vectors is not None
+    vectors = spectrum.vectors.double()
+    return (vectors * spectrum.values[: vectors.shape[1]]) @ vectors.T
+
+
+def of_likeliest(scores: Tensor, uniform: Tensor) -> Tensor:
     """In place of a draw: the same words whoever asks."""
-    return scores.argmax(-1, keepdim=True)
+    return scores.log_softmax(-1).amax(-1).sum()
 
 
 def inputs_and_gradients(
@@ -498,7 +511,7 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
 
     Over the outputs that is sum |g|^2 x x^T, over the inputs sum |x|^2 g g^T.
     """
-    monkeypatch.setattr(torch, "multinomial", likeliest)
+    monkeypatch.setattr(curvature, "_log_likelihood", of_likeliest)
     model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
     found = curvature.measure(model, asked, 1.0, seed=0, temperature=temperature)
     dense = [
@@ -519,10 +532,7 @@ def test_curvature_holds_the_partial_traces_of_each_tokens_products(
             "outputs": torch.einsum("ni,ni,no,np->op", x, x, g, g),
         }
         for side, moment in wanted.items():
-            spectrum = found[f"{site}.{side}"]
-            assert spectrum.vectors is not None
-            vectors = spectrum.vectors.double()
-            got = (vectors * spectrum.values[: vectors.shape[1]]) @ vectors.T
+            got = matrix(found[f"{site}.{side}"])
             torch.testing.assert_close(
                 got / got.trace(), moment / moment.trace(), rtol=1e-3, atol=1e-5
             )
@@ -555,6 +565,39 @@ def test_curvature_follows_the_seed_alone() -> None:
         for s in first
     )
     assert any(not torch.equal(first[s].values, other[s].values) for s in first)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_curvature_does_not_depend_on_the_batch_size(size: int) -> None:
+    model, asked = make_tiny(), make_set((2, 0, 1, 0, 2))
+    wanted, found = (curvature.measure(model, asked, 1.0, 3, one) for one in (32, size))
+    assert list(found) == list(wanted)
+    for name, spectrum in wanted.items():
+        whole = matrix(spectrum)
+        assert (matrix(found[name]) - whole).abs().max() <= 1e-4 * whole.abs().max()
+
+
+@pytest.mark.parametrize("words", [2, 7, 300])
+def test_words_are_drawn_as_often_as_their_scores_say(words: int) -> None:
+    scores = torch.randn(words, generator=torch.Generator().manual_seed(words)).double()
+    scores[words // 2] = -math.inf  # never said
+    uniform = torch.linspace(0, 1, 10_001, dtype=torch.float64)[:-1]
+    rows = scores.repeat(10_000, 1).requires_grad_()
+    curvature._log_likelihood(rows, uniform).backward()
+    # d log p(word) / d scores is 1 at the drawn word, less the chances themselves.
+    chances = scores.softmax(-1)
+    drawn = (rows.grad + chances).mean(0)
+    torch.testing.assert_close(drawn, chances, rtol=0, atol=2e-4)
+    assert drawn[words // 2] == 0
+
+
+def test_each_questions_words_are_drawn_by_its_number_alone() -> None:
+    alone = [curvature._uniform(5, torch.full((3,), i)) for i in (7, 2)]
+    torch.testing.assert_close(
+        curvature._uniform(5, torch.tensor([7, 7, 7, 2, 2, 2])), torch.cat(alone)
+    )
+    assert not torch.equal(*alone)
+    assert not torch.equal(alone[0], curvature._uniform(6, torch.full((3,), 7)))
 
 
 def test_no_hook_stays_after_curvature() -> None:

@@ -519,6 +519,17 @@ def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) 
         train.run(other, tmp_path / "run", resume=True)
 
 
+def test_other_demonstrations_are_not_those_of_a_finished_run(make: Make, tmp_path: Path) -> None:
+    recorded = make(demos=RobotDemos(episodes=3))
+    train.run(recorded, tmp_path / "run")
+    before = contents(tmp_path / "run")
+    other = dataclasses.replace(recorded, demos=RobotDemos(episodes=4))
+    with pytest.raises(AegisError, match="(?s)other demonstrations than.*episodes 3"):
+        train.run(other, tmp_path / "run", resume=True)
+    assert train.run(recorded, tmp_path / "run", resume=True).success
+    assert contents(tmp_path / "run") == before
+
+
 # --- the command line -----------------------------------------------------------------------------
 
 

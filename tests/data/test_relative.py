@@ -216,3 +216,13 @@ def test_the_files_of_an_absolute_policy_say_nothing_of_it(
     start("naive", tmp_path / "run", demos=arm, recipe=small_recipe(tiny_folder, steps=1))
     export.run(tmp_path / "run", tmp_path / "out", "lerobot")
     assert "relative" not in checkpoint.load_policy(tmp_path / "out")[1]
+
+
+def test_targets_for_other_threads_stay_on_the_cpu() -> None:
+    """As the policy goes to a device, which 'meta' stands for."""
+    policy = make_policy()
+    policy.origins = Origins([1, None])
+    batch = robot_batch(4)
+    wanted, on_cpu = policy.targets(batch), policy.targets_on_cpu()
+    policy.to("meta")
+    torch.testing.assert_close(on_cpu(batch), wanted)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from samples.reports import open_loop, probe, rollout, write_job
 
+from aegis_cli import recipes
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Warned
@@ -266,3 +268,19 @@ def test_a_gate_passes_if_every_probe_does() -> None:
     assert verdict(0.1, 0.5, max_drop=0.5) is True
     assert verdict(0.1, 0.6, max_drop=0.5) is False
     assert verdict(0.1, passed=False) is False and verdict(9.0, max_drop=0.5, passed=True) is True
+
+
+def test_what_the_recipe_no_longer_asks_for_is_no_result(run: Path) -> None:
+    """A job whose recipe has fewer question sets and colours leaves the earlier files there."""
+    files.save_json(run / "probe-2.json", probe("shape", 1))
+    assert len(results.probes(run)) == 1 and len(results.rollouts(run)) == 2
+    recipe = results.recipe_of(run)
+    two = replace(recipe, probe=replace(recipe.probe, vqa=("scenes", "easy-vqa")))
+    (run / "recipe.yaml").write_text(recipes.to_yaml(two))
+    sets = [results.question_set(found, two) for found in results.probes(run)]
+    assert sets == ["scenes", "easy-vqa"]
+    seen = replace(recipe, rollout=replace(recipe.rollout, colors=("seen",)))
+    (run / "recipe.yaml").write_text(recipes.to_yaml(seen))
+    assert [found.figures["colors"] for found in results.rollouts(run)] == ["seen"]
+    results.keep(run, "rollout-held-out", rollout("held-out", 0.25), {"seed": 0})
+    assert [found.figures["colors"] for found in results.rollouts(run)] == ["seen", "held-out"]

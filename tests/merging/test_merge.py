@@ -466,6 +466,31 @@ def test_anchors_and_demonstrations_that_do_not_fit(
     assert snapshot(tmp_path) == before
 
 
+def test_a_merged_run_whose_links_were_followed_is_the_same_run(
+    merge: Callable[..., Any], aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", tmp_path / "merged")
+    copied = shutil.copytree(tmp_path / "merged", tmp_path / "copied", symlinks=False)
+    facts = [
+        json.loads(aegis("inspect", each, "--json")[1])["facts"]
+        for each in (tmp_path / "merged", copied)
+    ]
+    assert facts[0]["steps"] == facts[1]["steps"] == 8
+
+
+def test_a_merged_run_knows_where_its_inputs_are_seen_from_it(
+    merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+) -> None:
+    """However deep it lies, it may be moved together with them."""
+    out = tmp_path / "deep" / "down" / "merged"
+    out.parent.mkdir(parents=True)
+    merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
+    said = json.loads((out / "inputs.json").read_text())
+    assert said["demos"] == [str(merge_place.demos)]
+    (seen,) = said["relative"]["demos"]
+    assert (out / seen).resolve() == merge_place.demos.resolve()
+
+
 def test_a_folder_that_is_not_empty_is_not_replaced(
     aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:

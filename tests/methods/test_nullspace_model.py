@@ -79,7 +79,7 @@ def scores(policy: Policy) -> Tensor:
     backbone, asked = policy.backbone, small_set()
     image = torch.from_numpy(asked.images)
     parts = [
-        part
+        part.scores
         for q in ASKED
         for part in backbone.read_vqa(
             image, torch.zeros(1, dtype=torch.int64), [q.text], [q.answer]

@@ -226,11 +226,14 @@ def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackb
     frames, image_of = images(2), torch.tensor([0, 1, 1, 0])
     said = backbone._prompter.answer_ids(SAID)
     with torch.no_grad():
-        found = torch.cat(list(backbone.read_vqa(frames, image_of, TEXTS, SAID))).log_softmax(-1)
+        parts = list(backbone.read_vqa(frames, image_of, TEXTS, SAID))
+        found = torch.cat([part.scores for part in parts]).log_softmax(-1)
         wanted = backbone.answer_log_likelihood(frames[image_of], TEXTS, SAID)
     assert len(found) == sum(len(words) + 1 for words in said)
     order = sorted(range(4), key=lambda i: (backbone._prompter.lengths(TEXTS)[i], len(said[i])))
     targets = [[*said[i], backbone._ends()[0]] for i in order]
+    answered = torch.cat([part.question for part in parts]).tolist()
+    assert answered == [i for i in order for _ in (*said[i], "its end")]
     chosen = found[range(len(found)), sum(targets, [])]
     close(
         torch.stack([part.sum() for part in chosen.split([len(t) for t in targets])]), wanted[order]
@@ -381,7 +384,8 @@ def test_what_threads_prepare_is_answered_and_read_alike(
         monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
         monkeypatch.setattr(prefetch, "workers", lambda: 3)
         with torch.no_grad():
-            scores = torch.cat(list(backbone.read_vqa(shown, image_of, TEXTS, SAID, together=1)))
+            parts = backbone.read_vqa(shown, image_of, TEXTS, SAID, together=1)
+            scores = torch.cat([part.scores for part in parts])
             told.append((list(backbone.answers(iter(batches))), scores))
     (one, one_scores), (other, other_scores) = told
     assert [said for said, _ in one] == [said for said, _ in other] and len(one) == 4

@@ -122,7 +122,7 @@ def test_no_gradient_comes_to_what_takes_no_part(name: str, hf_backbone: Loaded)
     """CLIP's layers behind the one that is read, which are called all the same."""
     backbone = hf_backbone(name)
     for scored in backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID):
-        scored.square().sum().backward()
+        scored.scores.square().sum().backward()
     without = {n for n, p in backbone.named_parameters() if p.grad is None}
     idle = set()
     for part in backbone.idle:
@@ -224,9 +224,8 @@ def asked() -> VQASet:
 def scores(backbone: HFBackbone) -> Tensor:
     question = asked().questions[0]
     frames = torch.from_numpy(asked().images)
-    return torch.cat(
-        list(backbone.read_vqa(frames, torch.tensor([0]), [question.text], [question.answer]))
-    )
+    (part,) = backbone.read_vqa(frames, torch.tensor([0]), [question.text], [question.answer])
+    return part.scores
 
 
 def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loaded) -> None:
@@ -237,8 +236,8 @@ def test_a_tied_head_is_watched_at_the_words_of_answers_alone(hf_backbone: Loade
     backbone.get_submodule(head).register_forward_hook(
         lambda _, a, __: seen.append(a[0].flatten(0, -2).shape[0])
     )
-    scores = torch.cat(list(backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID)))
-    assert sum(seen) == len(scores)
+    parts = list(backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID))
+    assert sum(seen) == sum(len(part.scores) for part in parts)
 
 
 @torch.no_grad()
@@ -248,11 +247,16 @@ def test_a_pass_takes_no_more_questions_than_asked_for(
 ) -> None:
     backbone, sizes = hf_backbone("paligemma"), []
     texts, said, image_of = TEXTS[:1] * 7, SAID[:1] * 7, torch.tensor([0, 0, 0, 1, 1, 1, 1])
-    wanted = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said)))
+
+    def read(*together: int) -> Tensor:
+        parts = backbone.read_vqa(images(2), image_of, texts, said, *together)
+        return torch.cat([part.scores for part in parts])
+
+    wanted = read()
     inner = backbone._scores
     monkeypatch.setattr(
         backbone, "_scores", lambda batch, last: sizes.append(len(batch.ids)) or inner(batch, last)
     )
-    found = torch.cat(list(backbone.read_vqa(images(2), image_of, texts, said, together)))
+    found = read(together)
     assert sizes == ([1] * 7 if together == 1 else [3, 3, 1])
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)

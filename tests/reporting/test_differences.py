@@ -11,7 +11,7 @@ from samples.reports import write_job
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.events import Event, Warned
-from aegis_cli.recipes import Demos, Probe, Train
+from aegis_cli.recipes import Demos, Probe, Rollout, Train
 from aegis_cli.reporting import compare, differences
 
 
@@ -43,6 +43,11 @@ def changed_run(folder: Path, digest: str = "a" * 64, steps: int = 6, **changes:
         ({"train": Train(batch_size=7)}, "batch size", "differ in batch size (16; 7)"),
         ({"probe": Probe(seed=2)}, "questions", "(40 of scenes; 40 of scenes, seed 2)"),
         ({"probe": Probe(ask="{} Please.")}, "questions", "asked as '{} Please.'"),
+        (
+            {"rollout": Rollout(seed=4, colors=("seen",))},
+            "rollout",
+            "(4 episodes of reach, seed 0, replan 4; 4 episodes of reach, seed 4, replan 4)",
+        ),
     ],
 )
 def test_what_runs_differ_in_beside_their_methods_is_told_in_one_line(

@@ -88,15 +88,9 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
     found = dataset.load(folder)
     (key,) = found.cameras(camera)
     read = source.find(found)
-    return camera_frames.load(
-        read,
-        rows.read_index(read),
-        key,
-        side,
-        source.digests(read, [key])[0],
-        1,
-        lambda _: None,
-    )
+    digest = source.digests(read, [key])[0]
+    index = rows.read_index(read)
+    return camera_frames.load(read, index, key, side, digest, 1, lambda _: None)[0]
 
 
 def as_version_2(folder: Path, version: str) -> Path:

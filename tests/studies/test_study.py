@@ -843,3 +843,13 @@ def test_policies_that_cannot_be_rolled_out_are_compared_by_their_open_loop_erro
 
 def test_one_set_of_questions_has_no_name(finished: tuple[Path, StudyReport]) -> None:
     assert [task.vqa for task in finished[1].tasks] == [None]
+
+
+def test_values_whose_names_would_be_alike_have_folders_of_their_own() -> None:
+    values = ["{} Answer briefly.", "Answer briefly. {}", None, 0.1, "0.1", "layers.*", "layers.?"]
+    found = stage._folders(values)
+    assert len(set(found)) == len(values) and stage._folders(values[:1] + values[2:4]) == [
+        "Answer_briefly.",
+        "fixed",
+        "0.1",
+    ]

@@ -235,9 +235,11 @@ def test_two_processes_measure_what_one_measures(
     )
     assert here.header.meta == there.header.meta and here.tensors.keys() == there.tensors.keys()
     for name, values in here.tensors.items():
-        # Each process draws answers of its own for the curvature; eigenvectors have no sign.
-        if not name.startswith("curvature.") and not name.endswith(".vectors"):
-            torch.testing.assert_close(values, there.tensors[name], rtol=1e-5, atol=1e-7)
+        other = there.tensors[name]
+        if name.endswith(".values"):  # the least of them are rounding
+            assert (values - other).abs().max() <= 1e-5 * other.abs().max(), name
+        elif not name.endswith(".vectors"):  # which have no sign
+            torch.testing.assert_close(values, other, rtol=1e-5, atol=1e-7)
     said, expected = (
         [json.loads(line) for line in (each.out / "predictions.jsonl").read_text().splitlines()]
         for each in (both, alone)

@@ -10,8 +10,11 @@ deleting it costs the decoding.
 from __future__ import annotations
 
 import hashlib
+import math
+import mmap
 import os
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from aegis_cli.common import files
 from aegis_cli.common import pictures as fitting
@@ -31,6 +35,8 @@ from aegis_cli.data.lerobot.source import DataFile, Source
 
 _PART = 256  # frames that one call decodes, or a little more
 _PER_WORKER = 8  # parts that repay a worker's start
+# Python names it since 3.13. Linux then charges no memory for a private mapping as a whole.
+_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 _SAME = 2.0  # of 255: by how much decoders of several machines may differ in the mean
 
 
@@ -107,8 +113,8 @@ def load(
     digest: str,
     workers: int | None,
     on_event: OnEvent,
-) -> np.ndarray:
-    """All frames of a camera, [N, H, W, 3] uint8, memory-mapped; decoded first if no file has them.
+) -> tuple[np.ndarray, Path]:
+    """All frames of a camera, memory-mapped; decoded first if no file has them.
 
     Frames of episodes that are not read have their places, which take no room on the disk.
 
@@ -118,6 +124,9 @@ def load(
         digest: digest of everything that the frames are decoded from.
         workers: processes; the frames do not depend on it. Default: up to one per core, fewer for
             few frames.
+
+    Returns:
+        The frames [N, H, W, 3] uint8, and the file that has them.
 
     Raises:
         AegisError: a picture or video that is missing or damaged, or a cache that cannot be
@@ -133,7 +142,7 @@ def load(
     frames = _open(path, count)
     if kept:
         _check_some(path, frames, source, index, camera)
-    return frames
+    return frames, path
 
 
 def _make_cache(folder: Path, parts: Sequence[Part]) -> None:
@@ -269,7 +278,7 @@ def _write(
         )
     try:
         with files.aside(path) as (aside, file):
-            offset = np.lib.format.open_memmap(aside, "w+", np.uint8, shape).offset
+            offset = npy.open_memmap(aside, "w+", np.uint8, shape).offset
             done, stage = 0, f"decode {layout.short(camera)}"
             workers = workers or worker_count(len(parts) // _PER_WORKER)
             decode = partial(_decode, aside, offset, shape[1:3])
@@ -329,9 +338,7 @@ def _check_some(path: Path, frames: np.ndarray, source: Source, index: Index, ca
 
 def _open(path: Path, frames: int) -> np.ndarray:
     try:
-        # The mapping is private to this process. As far as torch knows, a tensor over it may be
-        # written to; the file never is.
-        array = np.load(path, mmap_mode="c", allow_pickle=False)
+        array = _mapped(path)
         if array.dtype != np.uint8 or array.ndim != 4 or len(array) != frames:
             raise ValueError(f"{array.dtype} {list(array.shape)}")
     except (OSError, ValueError) as error:
@@ -341,3 +348,22 @@ def _open(path: Path, frames: int) -> np.ndarray:
             f"rm '{path}'",
         ) from error
     return array
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """The array of a .npy file, which may be larger than the memory.
+
+    The mapping is private to this process. As far as torch knows, a tensor over it may be written
+    to; the file never is. NumPy's own mapping of that kind has to fit into memory as a whole.
+
+    Raises:
+        OSError, ValueError: a file that cannot be read, or is damaged.
+    """
+    with open(path, "rb") as file:
+        version = npy.read_magic(file)
+        shape, _, kind = npy.read_array_header_1_0(file)
+        if version != (1, 0) or kind.hasobject:
+            raise ValueError(f"version {version} of {kind}")
+        start, flags = file.tell(), mmap.MAP_PRIVATE | _NORESERVE
+        bytes_of = mmap.mmap(file.fileno(), 0, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+    return np.frombuffer(bytes_of, kind, math.prod(shape), start).reshape(shape)

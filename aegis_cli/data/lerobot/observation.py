@@ -50,7 +50,10 @@ def is_one(mapping: Mapping[Any, Any], state_names: Sequence[str] | None) -> boo
 
 
 def read(
-    observation: Mapping[str, Any], cameras: Sequence[str], state_names: Sequence[str] | None
+    observation: Mapping[str, Any],
+    cameras: Sequence[str],
+    state_names: Sequence[str] | None,
+    state: Sequence[str] = (layout.STATE,),
 ) -> Observed:
     """The pictures, the positions and the task of an observation of either kind.
 
@@ -60,13 +63,17 @@ def read(
     Args:
         cameras: the policy's, in its order; empty for one picture of any name.
         state_names: of the policy's positions, in their order; None where it does not know them.
+        state: the features that its positions were in its demonstrations. Where an observation has
+            all of these, they are read; else `observation.state` has them side by side.
 
     Raises:
         AegisError: cameras or positions that are missing, or that the policy does not know.
     """
     observation = {key: value for key, value in observation.items() if isinstance(key, str)}
-    if layout.STATE in observation:
-        positions = _unbatched(_array(observation[layout.STATE]), 1)
+    read_from = state if all(name in observation for name in state) else (layout.STATE,)
+    if all(name in observation for name in read_from):
+        parts = [_unbatched(_array(observation[name]), 1) for name in read_from]
+        positions = parts[0] if len(parts) == 1 else np.concatenate([p.reshape(-1) for p in parts])
         shown = {name: v for name, v in observation.items() if _is_picture(name, cameras)}
         _check(shown, cameras, [layout.STATE], [layout.STATE])
     else:

@@ -87,7 +87,7 @@ def _not_finite(
     """
     episodes = set[int]()
     for file, places in bad:
-        episodes |= {_episode_at(source, file, int(place)) for place in places}
+        episodes |= _episodes_at(source, file, places)
     file, places = bad[0]
     count = sum(len(places) for _, places in bad)
     where = f"row {int(_rows_of(file)[places[0]])} of '{file.path}'"
@@ -114,10 +114,10 @@ def _rows_of(file: DataFile) -> np.ndarray:
     return np.concatenate([np.arange(rows.first, rows.first + rows.count) for rows in file.rows])
 
 
-def _episode_at(source: Source, file: DataFile, place: int) -> int:
-    """The episode of a file's row, by its place among those that are read."""
+def _episodes_at(source: Source, file: DataFile, places: np.ndarray) -> set[int]:
+    """The episodes of a file's rows, by their places [n] among those that are read."""
     ends = np.cumsum([source.dataset.episodes[number].length for number in file.episodes])
-    return file.episodes[int(np.searchsorted(ends, place, side="right"))]
+    return {file.episodes[i] for i in np.unique(np.searchsorted(ends, places, side="right"))}
 
 
 def _read(file: DataFile, name: str) -> Any:
@@ -140,7 +140,8 @@ def _check_order(source: Source, file: DataFile, frame: np.ndarray) -> None:
     wrong = np.flatnonzero(frame != wanted)
     if len(wrong):
         place = int(wrong[0])
-        row, episode = int(_rows_of(file)[place]), _episode_at(source, file, place)
+        row = int(_rows_of(file)[place])
+        (episode,) = _episodes_at(source, file, wrong[:1])
         raise AegisError(
             f"row {row} of '{file.path}' is frame {int(frame[place])} of episode {episode}",
             f"frame {wanted[place]} of episode {episode}",

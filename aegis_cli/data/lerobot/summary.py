@@ -80,7 +80,7 @@ def on_sheet(found: Dataset) -> list[int]:
 def save_sheet(folder: Path, out: Path) -> None:
     """Write a PNG with the first and last frame of some episodes, from every camera.
 
-    Of other episodes nothing is read.
+    Nothing is read of other episodes.
 
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
@@ -93,6 +93,8 @@ def save_sheet(folder: Path, out: Path) -> None:
     found = dataset.load(folder)
     if not found.info.cameras:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")
+    if not found.episodes:
+        raise AegisError(f"no episode in '{folder}'", "a recorded one", "leave out --plot")
     shown = on_sheet(found)
     read = source.find(found, shown)
     index = rows.read_index(read)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +33,18 @@ STORED_TYPES = {
     "bfloat16": torch.bfloat16,
     "float16": torch.float16,
 }
+
+
+class AnswerScores(NamedTuple):
+    """Scores of the words of some questions' answers, with their graph.
+
+    Attributes:
+        scores: [n, V] unnormalised; those of one answer are together, in the words' order.
+        question: [n] int64 on the CPU, the question that each word answers.
+    """
+
+    scores: Tensor
+    question: Tensor
 
 
 @dataclass(frozen=True)
@@ -190,7 +202,7 @@ class Backbone(nn.Module, ABC):
         questions: Sequence[str],
         answers: Sequence[str],
         together: int = 8,
-    ) -> Iterator[Tensor]:
+    ) -> Iterator[AnswerScores]:
         """Read questions with their answers, so that hooks on the modules see valid tokens alone.
 
         Each image is passed once, where no text changes its tokens, and every text without padding.
@@ -204,9 +216,9 @@ class Backbone(nn.Module, ABC):
                 each question.
 
         Yields:
-            Scores [n, V] of the words of some questions' answers, in parts that together cover all,
-            with their graph where gradients are enabled. No two parts share one, so that a backward
-            pass from a part frees its graph.
+            Scores of some questions' answers, in parts that together cover all, with their graph
+            where gradients are enabled. No two parts share one, so that a backward pass from a part
+            frees its graph.
         """
 
     @abstractmethod

@@ -20,5 +20,5 @@ def takes_cache(module: nn.Module) -> bool:
 
 
 def _arguments(module: nn.Module) -> set[str]:
-    # Of the class: a compiled layer has another forward of its own.
+    # The class's forward counts: a compiled layer has another of its own.
     return set(inspect.signature(type(module).forward).parameters)

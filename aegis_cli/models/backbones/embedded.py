@@ -23,7 +23,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
 from aegis_cli.models.backbones import embedded_file
-from aegis_cli.models.backbones.base import Backbone, Batch, Encoding
+from aegis_cli.models.backbones.base import AnswerScores, Backbone, Batch, Encoding
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 MAX_TEXT = 20  # tokens of a question with its answer
@@ -259,12 +259,12 @@ class EmbeddedVLM(Backbone):
         questions: Sequence[str],
         answers: Sequence[str],
         together: int = 8,
-    ) -> Iterator[Tensor]:
+    ) -> Iterator[AnswerScores]:
         _, image = self.image_pass(self.pixels(images))
         prompts = [self.tokenizer.prompt(text) for text in questions]
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         rows = [prompt + answer for prompt, answer in zip(prompts, said, strict=True)]
-        found = []
+        found, question = [], []
         # Texts of one length make a batch without padding.
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
@@ -277,8 +277,10 @@ class EmbeddedVLM(Backbone):
             scores = self.logits(hidden[-1]).squeeze(1)
             position = torch.arange(length, device=self.device)
             found.append(scores[(position >= prompt_length - 1) & (position < length - 1)])
+            for i in chosen:
+                question += [i] * len(said[i])
         # In one part, since all go back through the same images.
-        yield torch.cat(found)
+        yield AnswerScores(torch.cat(found), torch.tensor(question))
 
     def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
         """Each row's image keys and values.

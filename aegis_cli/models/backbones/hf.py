@@ -26,7 +26,7 @@ from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.core.attention import Rotation, rotate
 from aegis_cli.data.batch import Asked, Images
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
+from aegis_cli.models.backbones.base import AnswerScores, Backbone, Batch, Encoding, Suffix
 from aegis_cli.models.backbones.caches import CACHE, EARLIER, takes_cache
 from aegis_cli.models.backbones.compiling import MULTIPLE, compile_layers
 from aegis_cli.models.backbones.families import FAMILIES, Family
@@ -343,7 +343,7 @@ class HFBackbone(Backbone):
         questions: Sequence[str],
         answers: Sequence[str],
         together: int = 8,
-    ) -> Iterator[Tensor]:
+    ) -> Iterator[AnswerScores]:
         """See `Backbone.read_vqa`; an image is passed for each question, which may change it."""
         said = self._prompter.answer_ids(answers)
         # The shapes matter because an image of another size may become another number of tokens.
@@ -361,9 +361,10 @@ class HFBackbone(Backbone):
 
         with prefetch.for_device(prepare, parts, self.device) as prepared:
             for part, batch in zip(parts, prepared, strict=True):
-                words = len(said[part[0]])
                 # One more than the answer's words: the last position predicts its end.
-                yield self._scores(batch.to(self.device), words + 1).flatten(0, 1)
+                words = len(said[part[0]]) + 1
+                scores = self._scores(batch.to(self.device), words).flatten(0, 1)
+                yield AnswerScores(scores, torch.tensor(part).repeat_interleave(words))
 
     # --- weights -------------------------------------------------------------------------------
 

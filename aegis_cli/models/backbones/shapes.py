@@ -119,7 +119,7 @@ SHAPES: dict[str, Shape] = {
     ),
 }
 
-# Of no model, but of the same parts: for a look at whether transformers is one that is known.
+# No model has this shape. It has all their parts, to see whether this transformers is known.
 SMALL = Shape(
     "smolvlm",
     {

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from pathlib import Path
 
 import av
 import numpy as np
 import pyarrow as pa
 import pytest
+from numpy.lib import format as npy
 from PIL import Image
 from pyarrow import parquet
 from samples.lerobot import episodes, frames, read, save
@@ -134,3 +137,19 @@ def test_a_reduction_averages_over_what_it_leaves_out(tmp_path: Path) -> None:
     made = episodes(1, size=(128, 128))
     made[0].frames["top"][:] = rng.integers(0, 2, (5, 128, 128, 1), dtype=np.uint8) * 255
     assert read(save(tmp_path / "d", made), side=8).std() < 20  # a single pixel's is 127
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems charge for a private mapping")
+def test_frames_need_not_fit_into_memory(tmp_path: Path) -> None:
+    """A sparse file of more frames than there is memory for, of which one is read and written."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    count = 2 * memory // (256 * 256 * 3) + 1
+    path = tmp_path / "frames.npy"
+    try:
+        npy.open_memmap(path, "w+", np.uint8, (count, 256, 256, 3))
+    except OSError as error:
+        pytest.skip(f"no room for a sparse file here: {error}")
+    found = camera_frames._open(path, count)
+    found[-1] = 255
+    assert found.shape == (count, 256, 256, 3) and found[-1].all() and not found[0].any()
+    assert not camera_frames._open(path, count)[-1].any()

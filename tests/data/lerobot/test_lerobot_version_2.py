@@ -266,3 +266,18 @@ def test_a_video_that_is_missing(bad: Bad, place: Path, monkeypatch: pytest.Monk
     save(place / "d", made, as_video=True)
     (as_version_2(place / "d", "v2.1") / VIDEO).unlink()
     bad(*training(demos="d"), says=("no file", VIDEO))
+
+
+@pytest.mark.parametrize("with_data", [True, False])
+def test_a_recording_that_ended_before_its_first_episode(
+    with_data: bool, bad: Bad, tmp_path: Path
+) -> None:
+    folder = as_version_2(save(tmp_path / "d", episodes(COUNT, ("top",))), "v2.1")
+    edit_info(folder, lambda info: info.update(total_episodes=0, total_frames=0))
+    for name in (TASKS, EPISODES, STATS):
+        (folder / name).write_text("")
+    if not with_data:
+        shutil.rmtree(folder / "data")
+    anchor = ("anchor", "--demos", folder, "--out", tmp_path / "a.safetensors")
+    bad(*anchor, "--parts", "moments", says=("0 episodes in", "at least one"))
+    bad("inspect", folder, "--plot", tmp_path / "s.png", says=("no episode in",))

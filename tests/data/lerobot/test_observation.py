@@ -160,3 +160,24 @@ def test_other_floats_than_lerobots_are_no_picture(given: Any, told: str) -> Non
 def test_a_motor_that_gives_no_number_is_named(value: Any) -> None:
     with pytest.raises(AegisError, match=r"'lift\.pos' is \w+"):
         observation.read(robots(**{"lift.pos": value}), CAMERAS, JOINTS)
+
+
+@pytest.mark.parametrize(
+    ("state", "given", "wanted"),
+    [
+        (("observation.ee",), {"observation.ee": STATE, "observation.state": -STATE}, STATE),
+        (("observation.ee",), {"observation.state": STATE}, STATE),  # as a robot's program has it
+        (
+            ("observation.state", "observation.ee"),
+            {"observation.ee": torch.tensor([[7.0]]), "observation.state": torch.tensor(STATE)},
+            [*STATE, 7.0],
+        ),
+        (("observation.state", "observation.ee"), {"observation.state": STATE}, STATE),
+    ],
+)
+def test_the_features_that_training_read_are_read_where_all_are_there(
+    state: tuple[str, ...], given: dict[str, Any], wanted: Any
+) -> None:
+    shown = without(lerobots(), "observation.state") | given
+    found = observation.read(shown, CAMERAS, None, state)
+    np.testing.assert_array_equal(found.positions, np.asarray(wanted, np.float32))
