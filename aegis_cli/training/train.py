@@ -140,7 +140,35 @@ def run(
             folder.begin(out, recipe)
             inputs.keep(out, places)
             files.save_json(out / machine.NAME, machine.describe())
+            _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
+
+
+def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event: OnEvent) -> None:
+    """Warn where episodes that are held out may be among those that `expert.start` learned from.
+
+    They are drawn anew where the same demonstrations have grown, or are divided otherwise.
+    """
+    recipe, start = run.recipe, run.recipe.expert.start
+    if start is None or not Path(start).is_dir():
+        return
+    path = Path(start)
+    before = path if (path / "recipe.yaml").is_file() else checkpoint.run_of(path)
+    if before is None or recipes.is_stream_run(before):
+        return
+    learned = inputs.of(before)
+    if learned is None or learned.demos != places.demos:
+        return
+    begun = recipes.load(before / "recipe.yaml", kind=Recipe)
+    splits = {(each.train.validation_share, each.seed, each.demos.only) for each in (begun, recipe)}
+    there = artifacts.read_header(before / LEDGER).inputs
+    if len(splits) > 1 or mixture.digests(there) != mixture.digests(run.inputs):
+        text = (
+            f"the run in '{before}', which this one begins with, may have learned from episodes "
+            "that are held out now, so that the validation loss looks better than it is. Leave "
+            "some new episodes out with demos.only, and judge by these: aegis evaluate --episodes"
+        )
+        on_event(Warned("train", text))
 
 
 def _says_otherwise(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:

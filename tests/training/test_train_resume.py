@@ -31,7 +31,7 @@ from samples.vqa_files import write_jsonl
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 from aegis_cli.data.record import run as record
 from aegis_cli.methods import METHODS
 from aegis_cli.models.policy import Policy
@@ -85,7 +85,20 @@ def test_a_run_on_demonstrations_that_have_grown_says_so_and_how_another_begins_
     assert "arm' have changed since the run" in caught.value.found
     assert f"--set backbone={run} --set expert.start={run}" in caught.value.fix
     begun = replace(recipe, backbone=str(run), expert=replace(recipe.expert, start=str(run)))
-    train.run(begun, "naive", data, None, tmp_path / "next")
+    assert warned_of_learned_episodes(begun, data, tmp_path / "next")
+    again = replace(begun, backbone=str(tmp_path / "next"))
+    again = replace(again, expert=replace(again.expert, start=str(tmp_path / "next")))
+    assert not warned_of_learned_episodes(again, data, tmp_path / "after")
+    other = replace(again, train=replace(again.train, validation_share=0.4))
+    assert warned_of_learned_episodes(other, data, tmp_path / "other")
+
+
+def warned_of_learned_episodes(recipe: Recipe, data: Path, out: Path) -> bool:
+    """Whether a training says that it holds out what it has begun with."""
+    told: list[Event] = []
+    train.run(recipe, "naive", data, None, out, on_event=told.append)
+    texts = [event.text for event in told if isinstance(event, Warned)]
+    return any("may have learned from episodes that are held out now" in text for text in texts)
 
 
 def test_a_run_that_is_given_another_camera_says_which_it_began_with(
