@@ -96,7 +96,7 @@ def on_gpu() -> bool:
     return pick().type == "cuda"
 
 
-def reading_waits(device: torch.device) -> bool:
+def reading_stalls(device: torch.device) -> bool:
     """Whether to read a number of that device is to wait until it has done all it was given.
 
     A GPU then stands still until it is given more. So what a step leaves is read now and then, and

@@ -33,7 +33,7 @@ def for_device(
     For a GPU several threads call `make`, as a model's own processor can take longer for a batch
     than a GPU. A CPU has no time to spare, and takes one after the other.
     """
-    if not devices.reading_waits(device):
+    if not devices.reading_stalls(device):
         yield map(make, items)
         return
     count = workers()

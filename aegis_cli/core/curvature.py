@@ -35,11 +35,11 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.core import joint
+from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum
+from aegis_cli.core.stacking import Pair
 
 # A proximal step of this weight takes away all that has a curvature. In float32 a larger one may be
 # infinite, and infinity times a curvature of 0 is no number.
@@ -51,7 +51,7 @@ class Curvature:
     """The curvature at one linear map or convolution, or at several that are stacked.
 
     The matrix h is made anew when it is used, because it is as large as the map. Of n stacked maps
-    (core/joint.py) every tensor, displacements included, has a first dimension n more.
+    (core/stacking.py) every tensor, displacements included, has a first dimension n more.
 
     Attributes:
         inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one. They may be in half
@@ -157,13 +157,13 @@ def stacked(found: Sequence[Curvature]) -> Curvature:
     if len(found) == 1:
         return first
     return Curvature(
-        inputs=joint.padded([one.inputs for one in found]),
-        outputs=joint.padded([one.outputs for one in found]),
-        c=joint.padded([one.c for one in found]),
-        g=joint.padded([one.g for one in found]),
+        inputs=stacking.padded([one.inputs for one in found]),
+        outputs=stacking.padded([one.outputs for one in found]),
+        c=stacking.padded([one.c for one in found]),
+        g=stacking.padded([one.g for one in found]),
         damping=first.damping,
-        c_rest=joint.rests([float(one.c_rest) for one in found], first.c),
-        g_rest=joint.rests([float(one.g_rest) for one in found], first.g),
+        c_rest=stacking.rests([float(one.c_rest) for one in found], first.c),
+        g_rest=stacking.rests([float(one.g_rest) for one in found], first.g),
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aegis_cli.core import joint
+from aegis_cli.core import stacking
 
 # Rows summed in float32 before the sum moves to float64. Centred rows of one block lose at most
 # ~64 rounding errors of 6e-8 (measured on 5,000 rows: 2e-8 relative on the variance), at half the
@@ -170,13 +170,13 @@ def shared_moments(
 def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
     """Layers that follow each other, stacked [n, B, T, D] while their shapes are alike.
 
-    As many as have `joint.MOST` entries, since larger ones keep a GPU busy by themselves.
+    As many as have `stacking.MOST` entries, since larger ones keep a GPU busy by themselves.
     """
     groups: list[list[Tensor]] = []
     for h in hidden:
         last = groups[-1] if groups else []
         alike = bool(last) and _kind(last[0]) == _kind(h)
-        if not alike or (len(last) + 1) * h.numel() > joint.MOST:
+        if not alike or (len(last) + 1) * h.numel() > stacking.MOST:
             groups.append([])
         groups[-1].append(h)
     return [torch.stack(group) for group in groups]

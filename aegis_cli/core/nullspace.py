@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.core import joint
+from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import Spectrum, rank
+from aegis_cli.core.stacking import Pair
 
 Remembered = tuple[Tensor | None, ...]  # what a protection keeps of a map's values
 
@@ -46,7 +46,7 @@ class Protection(Protocol):
 class Dense:
     """Protection of a linear map or convolution: A = U f U^T + r (1 - U U^T).
 
-    A itself [d, d] is never made. Of n maps that are stacked (core/joint.py) every tensor has a
+    A itself [d, d] is never made. Of n maps that are stacked (core/stacking.py) every tensor has a
     first dimension n more.
 
     Attributes:
@@ -315,9 +315,9 @@ def stacked(found: Sequence[Protection]) -> Protection:
     dense = [one for one in found if isinstance(one, Dense)]
     channels = [one for one in found if isinstance(one, Elementwise)]
     if len(dense) == len(found):
-        factor = joint.padded([one.factor for one in dense])
-        rest = joint.rests([float(one.rest) for one in dense], factor)
-        return Dense(joint.padded([one.basis for one in dense]), factor, rest)
+        factor = stacking.padded([one.factor for one in dense])
+        rest = stacking.rests([float(one.rest) for one in dense], factor)
+        return Dense(stacking.padded([one.basis for one in dense]), factor, rest)
     if len(channels) == len(found):
         return Elementwise(torch.stack([one.inside for one in channels]))
     raise TypeError("only maps or normalisations are stacked, not tables")

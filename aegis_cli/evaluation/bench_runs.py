@@ -188,7 +188,7 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     frames, device = run.demos.train[rows], run.policy.backbone.device
     batch = run.demos.batch(frames, recipe.train.chunk)
-    if devices.reading_waits(device):
+    if devices.reading_stalls(device):
         # Training has it ready on the GPU before its step begins.
         batch = train.prepared(run, batch, frames, 0).with_prepared_on(device)
     return run, batch

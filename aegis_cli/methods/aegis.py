@@ -146,7 +146,7 @@ def _penalty(
 def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
     """Mean [D] and variance [D] of each layer over a pass's tokens in the mask [B, T]."""
     # To select rows on a GPU would wait for their number, once a layer.
-    waits = devices.reading_waits(mask.device)
+    waits = devices.reading_stalls(mask.device)
     if seen.total is not None:
         return shared_moments(seen.hidden, mask, seen.total, reads=not waits)
     if waits:
@@ -203,7 +203,7 @@ def project_update(
     # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
     _, along, aa = owners.total(torch.stack(projection.inner(moved, anchor)))
     excess: float | Tensor = projection.ratio(torch.relu(along), aa)
-    if not devices.reading_waits(aa.device):
+    if not devices.reading_stalls(aa.device):
         excess = float(excess)
         if excess == 0:
             return

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
-from aegis_cli.core import joint
+from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.projection import Combine
+from aegis_cli.core.stacking import Pair
 from aegis_cli.data.batch import RobotBatch, Share
 
 Options = Mapping[str, Any]
@@ -92,14 +92,14 @@ def together(
         directions: how many directions of a site's inputs are known.
         alone: whether a site is never stacked with others.
     """
-    waits = any(devices.reading_waits(weight.device) for weight, _ in pairs.values())
+    waits = any(devices.reading_stalls(weight.device) for weight, _ in pairs.values())
     if owners.several or not waits:
         return [[site] for site in pairs]
 
     def kind(site: str) -> Hashable:
-        return site if alone(site) else joint.kind_of(pairs[site])
+        return site if alone(site) else stacking.kind_of(pairs[site])
 
-    return joint.groups(pairs, kind, lambda site: (pairs[site][0].numel(), directions(site)))
+    return stacking.groups(pairs, kind, lambda site: (pairs[site][0].numel(), directions(site)))
 
 
 @dataclass(frozen=True)

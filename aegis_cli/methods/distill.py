@@ -74,7 +74,7 @@ def relative_distance(
             result is what this share contributes.
     """
     layers = []
-    if devices.reading_waits(mask.device):
+    if devices.reading_stalls(mask.device):
         # To select rows would wait for their number.
         for h, h0 in zip(hidden, taught, strict=True):
             layers.append(_relative_padded(_wide(h), _wide(h0), mask[..., None], total))

@@ -35,12 +35,12 @@ from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
-from aegis_cli.core import curvature, joint
+from aegis_cli.core import curvature, stacking
 from aegis_cli.core.curvature import Curvature
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.nullspace import copied_small, minus
 from aegis_cli.core.projection import ratio
 from aegis_cli.core.spectrum import DENSE
+from aegis_cli.core.stacking import Pair
 from aegis_cli.methods.base import (
     Method,
     Options,
@@ -111,7 +111,7 @@ def _constrain(groups: Sequence[_Group], weight: float, growth: float) -> Callab
         if growth:
             strength = strength / _shrunk(update.rate_left, growth)
         for group in groups:
-            joint.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
+            stacking.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
 
     return constrain
 
@@ -123,7 +123,7 @@ def _pull(groups: Sequence[_Group], weight: float) -> Callable[[], None]:
     def pull() -> None:
         for group in groups:
             added = group.curvature.gradient(*group.moved(), weight)
-            for now, parts in zip(group.maps, joint.apart(added, group.here()), strict=True):
+            for now, parts in zip(group.maps, stacking.apart(added, group.here()), strict=True):
                 for tensor, by in zip(now, parts, strict=True):
                     # Without a gradient it has not moved.
                     if tensor is not None and tensor.grad is not None and by is not None:
@@ -160,7 +160,7 @@ class _Group:
 
     def moved(self) -> Pair:
         """How far they are from where they began, stacked."""
-        return minus(joint.stacked(self.here()), self.origin)
+        return minus(stacking.stacked(self.here()), self.origin)
 
 
 def _grouped(
@@ -170,7 +170,7 @@ def _grouped(
     groups = []
     for names in together(maps, owners, lambda site: found[site].inputs.shape[-1]):
         own = [maps[name] for name in names]
-        now = joint.stacked([pair_here(pair) for pair in own])
+        now = stacking.stacked([pair_here(pair) for pair in own])
         curved = curvature.stacked([found[name] for name in names])
         groups.append(_Group(own, copied_small(now), curved))
     return groups
@@ -188,7 +188,7 @@ def shares(
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
     found_squares = owners.total(_squares(learning))
     entries = [sum(t.numel() for t in tensors) for tensors in learning]
-    if devices.reading_waits(found_squares.device):
+    if devices.reading_stalls(found_squares.device):
         return _unread_shares(learning, found_squares, entries, balance)
     # One transfer for all maps.
     squares = found_squares.tolist()

@@ -24,9 +24,9 @@ import torch
 from torch import nn
 
 from aegis_cli.common.ranks import Ranks, rows_here
-from aegis_cli.core import joint, nullspace
-from aegis_cli.core.joint import Pair
+from aegis_cli.core import nullspace, stacking
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Rows, Strength
+from aegis_cli.core.stacking import Pair
 from aegis_cli.methods.base import (
     Method,
     Parts,
@@ -74,7 +74,7 @@ def _by_coordinates(groups: Sequence[_Group], every: int) -> Parts:
     @torch.no_grad()
     def begin() -> None:
         for group in groups:
-            before[group.sites[0]] = group.protection.remember(*joint.stacked(group.here()))
+            before[group.sites[0]] = group.protection.remember(*stacking.stacked(group.here()))
 
     @torch.no_grad()
     def constrain(_: Update) -> None:
@@ -113,8 +113,8 @@ class _Group:
         if len(self.sites) == 1:
             _project(self.here()[0], before[0], self.protection)
             return
-        moved = nullspace.minus(joint.stacked(self.here()), joint.stacked(before))
-        joint.subtract(self.here(), self.protection.removed(*moved))
+        moved = nullspace.minus(stacking.stacked(self.here()), stacking.stacked(before))
+        stacking.subtract(self.here(), self.protection.removed(*moved))
 
     def hold(self, before: Remembered) -> None:
         """Take what has changed along the protected directions out of the weights."""
@@ -124,7 +124,7 @@ class _Group:
             self.protection.hold(weight.data, None if bias is None else bias.data, before)
             return
         assert isinstance(self.protection, Dense | Elementwise)
-        joint.subtract(here, self.protection.changed(*joint.stacked(here), before))
+        stacking.subtract(here, self.protection.changed(*stacking.stacked(here), before))
 
 
 def _grouped(

@@ -49,7 +49,7 @@ from aegis_cli.training import (
 from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
-from aegis_cli.training.unread import Unread
+from aegis_cli.training.step_figures import UnreadFigures
 
 Questions = sets.Scenes | sets.Listed
 
@@ -86,7 +86,7 @@ class TrainingRun:
     watched: WatchedFiles = field(default_factory=WatchedFiles)
     temporary: Path | None = None
     reused: Mapping[str, Tensor] | None = None
-    unread: Unread = field(default_factory=Unread)
+    unread: UnreadFigures = field(default_factory=UnreadFigures)
     masters: Masters = NONE
     average: Average = field(default_factory=Average)
 
@@ -281,7 +281,7 @@ def build(
         ranks,
         plain,
         read.watched,
-        unread=Unread.of(backbone.device, made, parts, sharded=owners.several),
+        unread=UnreadFigures.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
         average=_average(recipe.train, policy),
     )
@@ -661,7 +661,7 @@ def _vqa_loss(
     asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
 
-    waits = devices.reading_waits(backbone.device)
+    waits = devices.reading_stalls(backbone.device)
 
     def make(place: tuple[int, Share]) -> tuple[Any, list[str], list[str], Any]:
         """The images, questions and answers of a share of a step, as the backbone takes them."""

@@ -180,7 +180,7 @@ def _bend(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
     """Bend the task's gradient by the anchor's, group by group; their inner products before."""
     combine = settings.parts.combine or projection.naive
     total = settings.ranks.total if parallel.is_sharded(settings.policy) else None
-    reads = not devices.reading_waits(settings.policy.backbone.device)
+    reads = not devices.reading_stalls(settings.policy.backbone.device)
     gram, _ = bend(settings.groups, anchor, combine, total, reads)
     return gram
 

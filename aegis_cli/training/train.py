@@ -416,7 +416,7 @@ def _heeds(run: TrainingRun, due: _Due) -> bool:
     if run.stepper.pending:
         return False
     # With several processes this is a message, for which a GPU would wait.
-    return due.line or not (run.ranks.several and run.unread.waits)
+    return due.line or not (run.ranks.several and run.unread.deferred)
 
 
 def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
@@ -434,7 +434,7 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[Robo
     than a GPU for a step. One more sends the next batch there, where each takes up to gigabytes.
     """
     device = run.policy.backbone.device
-    if not devices.reading_waits(device):
+    if not devices.reading_stalls(device):
         with prefetch.ahead(_fetching(run), steps) as batches:
             yield batches
         return
@@ -447,7 +447,7 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[Robo
 
 def fetched_ahead(run: TrainingRun) -> int:
     """How many batches may be ready for a GPU before it asks for one."""
-    return prefetch.workers() + 2 if devices.reading_waits(run.policy.backbone.device) else 0
+    return prefetch.workers() + 2 if devices.reading_stalls(run.policy.backbone.device) else 0
 
 
 def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
@@ -457,7 +457,7 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
     """
     settings, seed = run.recipe.train, run.recipe.seed
     order = run.order
-    waits = devices.reading_waits(run.policy.backbone.device)
+    waits = devices.reading_stalls(run.policy.backbone.device)
 
     def fetch(index: int) -> RobotBatch:
         rows = order.rows(index)
@@ -593,7 +593,7 @@ def update(
     )
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
-    if not run.unread.waits:
+    if not run.unread.deferred:
         read(run, window)
     if run.parts.refresh > 1:
         run.reused = result.taken

@@ -23,7 +23,6 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.nullspace import Protection, Strength, allowed, minus, protect
 from aegis_cli.core.spectrum import (
     Spectrum,
@@ -33,6 +32,7 @@ from aegis_cli.core.spectrum import (
     second_moment,
     with_rest,
 )
+from aegis_cli.core.stacking import Pair
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 

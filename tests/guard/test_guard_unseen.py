@@ -145,7 +145,7 @@ def test_a_model_that_has_moved_since_the_guard_was_made(
 
 def test_an_anchor_follows_a_model_to_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """The meta device computes nothing, and refuses tensors of any other."""
-    monkeypatch.setattr(devices, "reading_waits", lambda _: True)  # no rows are selected there
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)  # no rows are selected there
     layers = [Moments(4, torch.zeros(3), torch.ones(3)) for _ in range(2)]
     penalty = _penalty(Anchor(layers, layers), "all", "variance", torch.empty(0))
     hidden = tuple(torch.zeros(2, 5, 3, device="meta") for _ in layers)

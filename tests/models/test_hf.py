@@ -381,7 +381,7 @@ def test_what_threads_prepare_is_answered_and_read_alike(
     batches = [(shown[[i, 2]], [TEXTS[i], TEXTS[2]], [SAID[i], SAID[1]]) for i in (0, 1, 2, 1)]
     told = []
     for waits in (False, True):
-        monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
+        monkeypatch.setattr(devices, "reading_stalls", lambda _, waits=waits: waits)
         monkeypatch.setattr(prefetch, "workers", lambda: 3)
         with torch.no_grad():
             parts = backbone.read_vqa(shown, image_of, TEXTS, SAID, together=1)

@@ -390,7 +390,7 @@ def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same
         model, "prepare_answers", lambda *_: prepared.append(threading.current_thread().name)
     )
     for waits in (False, True):
-        monkeypatch.setattr(devices, "reading_waits", lambda _, waits=waits: waits)
+        monkeypatch.setattr(devices, "reading_stalls", lambda _, waits=waits: waits)
         loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
         # A run that goes on begins anywhere.
         places = [(step, Share(i, shares)) for step in (5, 6, 7, 0, 1) for i in range(shares)]

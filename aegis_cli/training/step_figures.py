@@ -44,18 +44,18 @@ class StepFigures:
 
 
 @dataclass
-class Unread:
+class UnreadFigures:
     """Figures of steps that nobody has read yet.
 
     Attributes:
-        waits: whether reading them is put off.
+        deferred: whether reading them is put off.
         moves: 1 where the step that was noted last moves the weights, 0 from the first one on that
             is not finite, [] float64; None where nothing is put off, for such a step ends the run.
         moved: how many steps have moved the weights since the run began, once the optimizers have
             taken the one that was noted last; [] float64 where reading is put off.
     """
 
-    waits: bool = False
+    deferred: bool = False
     moves: Tensor | None = None
     moved: int | Tensor = 0
     _steps: list[tuple[int, Tensor, list[int]]] = field(default_factory=list)
@@ -64,7 +64,7 @@ class Unread:
     @classmethod
     def of(
         cls, device: torch.device, optimizers: Sequence[Optimizer], parts: Parts, sharded: bool
-    ) -> Unread:
+    ) -> UnreadFigures:
         """Put reading off on a GPU, unless a step that is not finite would then move the weights.
 
         AdamW's fused kernel can be told to stand still, other optimizers and sharded weights
@@ -75,7 +75,7 @@ class Unread:
         told = all(isinstance(o, torch.optim.AdamW) for o in optimizers) and not sharded
         itself = parts.penalty is not None and parts.constrain is not None
         reuses = parts.refresh > 1
-        return cls(waits=devices.reading_waits(device) and told and not itself and not reuses)
+        return cls(deferred=devices.reading_stalls(device) and told and not itself and not reuses)
 
     def __len__(self) -> int:
         return len(self._steps)
@@ -87,7 +87,7 @@ class Unread:
             parts += [found.row.tt, found.row.ta, found.row.aa, found.row.w2]
         figures = torch.cat([part.detach().double() for part in parts])
         self._steps.append((index, figures, [len(part) for part in parts]))
-        if self.waits:
+        if self.deferred:
             broken = (~figures.isfinite().all()).float()
             self._broken = broken if self._broken is None else self._broken.maximum(broken)
             before = index if self.moves is None else self.moved
@@ -98,7 +98,7 @@ class Unread:
 
     def stop(self, optimizers: Sequence[Optimizer]) -> None:
         """Let the optimizers leave everything as it is from the first step that is not finite."""
-        if self.waits:
+        if self.deferred:
             for optimizer in optimizers:
                 # What a GradScaler tells the fused kernel, which then undoes its count too.
                 optimizer.found_inf = self._broken  # type: ignore[attr-defined]

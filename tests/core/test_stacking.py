@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from aegis_cli.core import curvature, joint, nullspace
+from aegis_cli.core import curvature, nullspace, stacking
 from aegis_cli.core.curvature import Curvature
-from aegis_cli.core.joint import Pair
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Rows
+from aegis_cli.core.stacking import Pair
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
@@ -71,9 +71,9 @@ def test_stacked_curvatures_take_what_each_takes(shape: tuple[int, ...], biased:
         moved = pairs(len(ranks), shape, biased)
         together = curvature.stacked(each)
         for name in ("excess", "gradient"):
-            found = getattr(together, name)(*joint.stacked(moved), 0.7)
+            found = getattr(together, name)(*stacking.stacked(moved), 0.7)
             alone = [getattr(one, name)(*pair, 0.7) for one, pair in zip(each, moved, strict=True)]
-            assert_same(joint.apart(found, moved), alone)
+            assert_same(stacking.apart(found, moved), alone)
 
 
 def dense(size: int, rank: int, rest: float) -> Protection:
@@ -101,17 +101,17 @@ def check_protection(
     each: Sequence[Protection], now: Sequence[Pair], before: Sequence[Pair]
 ) -> None:
     together = nullspace.stacked(each)
-    removed = together.removed(*joint.stacked(now))
+    removed = together.removed(*stacking.stacked(now))
     alone = [one.removed(*pair) for one, pair in zip(each, now, strict=True)]
-    assert_same(joint.apart(removed, now), alone)
+    assert_same(stacking.apart(removed, now), alone)
 
     held = []
     for one, pair, old in zip(each, now, before, strict=True):
         held.append(nullspace.copied(pair))
         one.hold(*held[-1], one.remember(*old))
     assert isinstance(together, Dense | Elementwise)
-    remembered = together.remember(*joint.stacked(before))
-    joint.subtract(now, together.changed(*joint.stacked(now), remembered))
+    remembered = together.remember(*stacking.stacked(before))
+    stacking.subtract(now, together.changed(*stacking.stacked(now), remembered))
     assert_same(now, held)
 
 
@@ -122,13 +122,13 @@ def test_tables_are_not_stacked() -> None:
 
 def test_maps_on_two_devices_are_of_two_kinds() -> None:
     here, there = (torch.zeros(OUT, 5, device=device) for device in ("cpu", "meta"))
-    assert joint.kind_of((here, None)) == joint.kind_of((here.clone(), None))
-    assert joint.kind_of((here, None)) != joint.kind_of((there, None))
+    assert stacking.kind_of((here, None)) == stacking.kind_of((here.clone(), None))
+    assert stacking.kind_of((here, None)) != stacking.kind_of((there, None))
 
 
 def test_a_lone_map_is_left_as_it_is() -> None:
     one, pair = curved(5, 2, 0.1), (draw(OUT, 5), None)
-    assert curvature.stacked([one]) is one and joint.stacked([pair]) is pair
+    assert curvature.stacked([one]) is one and stacking.stacked([pair]) is pair
 
 
 @given(
@@ -144,7 +144,7 @@ def test_groups_have_each_site_once_and_one_kind_and_no_more_than_they_may(
     def kind(site: str) -> int:
         return len(site) % kinds
 
-    found = joint.groups(sizes, kind, sizes.__getitem__, most)
+    found = stacking.groups(sizes, kind, sizes.__getitem__, most)
     assert sorted(site for group in found for site in group) == sorted(sizes)
     for group in found:
         assert len({kind(site) for site in group}) == 1

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from aegis_cli.common import artifacts, devices, prefetch
 from aegis_cli.common.errors import Diverged
-from aegis_cli.core import joint, projection
+from aegis_cli.core import projection, stacking
 from aegis_cli.core.moments import (
     batch_moments,
     joint_moments,
@@ -31,7 +31,7 @@ from aegis_cli.methods import METHODS, distill, kfac
 from aegis_cli.recipes import Aegis, Recipe
 from aegis_cli.recipes.policy import Ewc, Kfac
 from aegis_cli.training import assemble, step, train
-from aegis_cli.training.unread import Unread
+from aegis_cli.training.step_figures import UnreadFigures
 
 LATER = replace(SETTINGS, log_every=3, validate_every=6, checkpoint_every=6)
 READS = ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__float__")
@@ -39,7 +39,7 @@ READS = ("item", "tolist", "cpu", "numpy", "nonzero", "__bool__", "__int__", "__
 
 @pytest.fixture
 def waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
 
 
 @contextmanager
@@ -152,7 +152,7 @@ def test_the_same_reads_are_seen_where_nobody_waits(
 
 def treat_each_map_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Products of stacked maps round in another way, and what ends in the same bytes is asked."""
-    monkeypatch.setattr(joint, "groups", lambda sites, *_: [[site] for site in sites])
+    monkeypatch.setattr(stacking, "groups", lambda sites, *_: [[site] for site in sites])
 
 
 @pytest.mark.parametrize("method", ["naive", "aegis", "nullspace", "kfac", "maps", "distill"])
@@ -161,7 +161,7 @@ def test_a_run_that_reads_late_ends_as_one_that_reads_at_once(
 ) -> None:
     chosen = replace(recipe, train=LATER)
     start(method, tmp_path / "at-once", recipe=chosen)
-    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
     if method == "nullspace":
         treat_each_map_alone(monkeypatch)
     start(method, tmp_path / "late", recipe=chosen)
@@ -241,7 +241,7 @@ def test_a_step_that_is_not_finite_moves_nothing_however_late_it_is_read(
     ends = {}
     for name in ("at-once", "late"):
         if name == "late":
-            monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+            monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
         with pytest.raises(Diverged, match="at step 4") as caught:
             start(method, tmp_path / name, recipe=chosen)
         assert caught.value.good_steps == 3
@@ -260,13 +260,13 @@ def test_only_adamw_can_be_told_to_stand_still(waits: None) -> None:
     weight = torch.nn.Parameter(torch.zeros(2))
     adamw, sgd = torch.optim.AdamW([weight], fused=True), torch.optim.SGD([weight])
     plain, cpu = METHODS["naive"].start(None), torch.device("cpu")  # type: ignore[arg-type]
-    assert Unread.of(cpu, [adamw], plain, sharded=False).waits
-    assert not Unread.of(cpu, [sgd, adamw], plain, sharded=False).waits
-    assert not Unread.of(cpu, [adamw], plain, sharded=True).waits
+    assert UnreadFigures.of(cpu, [adamw], plain, sharded=False).deferred
+    assert not UnreadFigures.of(cpu, [sgd, adamw], plain, sharded=False).deferred
+    assert not UnreadFigures.of(cpu, [adamw], plain, sharded=True).deferred
     by_the_anchor = replace(plain, penalty=lambda _: None, constrain=lambda _: None)  # type: ignore
-    assert not Unread.of(cpu, [adamw], by_the_anchor, sharded=False).waits
+    assert not UnreadFigures.of(cpu, [adamw], by_the_anchor, sharded=False).deferred
     reuses = replace(plain, penalty=lambda _: None, refresh=2)  # type: ignore
-    assert not Unread.of(cpu, [adamw], reuses, sharded=False).waits
+    assert not UnreadFigures.of(cpu, [adamw], reuses, sharded=False).deferred
 
 
 # --- the same figures without a number ------------------------------------------------------------
@@ -307,8 +307,8 @@ def test_moments_of_several_layers_at_once_are_those_of_each(
     layers += [(i + first).detach().requires_grad_() for i in range(5)]
     expected = graded([padded_moments(h, mask) for h in layers], layers)
     # As many as two layers have: the last five are three groups.
-    for most in (joint.MOST, 2 * first.numel(), 1):
-        monkeypatch.setattr(joint, "MOST", most)
+    for most in (stacking.MOST, 2 * first.numel(), 1):
+        monkeypatch.setattr(stacking, "MOST", most)
         found = graded(joint_moments(layers, mask), layers)
         for one, other in zip(expected, found, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
@@ -325,8 +325,8 @@ def test_moments_that_processes_share_are_the_same_without_selecting_rows(
         return here + torch.ones_like(here)
 
     expected = graded(shared_moments(layers, mask, total), layers)
-    for most in (joint.MOST, 2 * first.numel()):
-        monkeypatch.setattr(joint, "MOST", most)
+    for most in (stacking.MOST, 2 * first.numel()):
+        monkeypatch.setattr(stacking, "MOST", most)
         found = graded(shared_moments(layers, mask, total, reads=False), layers)
         for one, other in zip(expected, found, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
@@ -339,7 +339,7 @@ def test_distances_without_selecting_rows_are_the_same(
     hidden, taught, mask = some_states()
     total = (lambda x: x) if shared else None
     one = distill.relative_distance([hidden], [taught], mask, total)
-    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
     other = distill.relative_distance([hidden], [taught], mask, total)
     torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
 
@@ -351,7 +351,7 @@ def test_shares_without_numbers_are_the_same(monkeypatch: pytest.MonkeyPatch) ->
         weight.grad = size * torch.randn(3, 4, generator=torch.Generator().manual_seed(i))
         maps[f"map{i}"] = weight, bias
     one = kfac.shares(maps, balance=1.0)
-    monkeypatch.setattr(devices, "reading_waits", lambda _: True)
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
     other = kfac.shares(maps, balance=1.0)
     for tensor, share in one.items():
         assert float(other[tensor]) == pytest.approx(share, rel=1e-6)

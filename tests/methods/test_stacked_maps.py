@@ -14,7 +14,7 @@ from samples.nullspace import with_one
 from torch import Tensor, nn
 
 from aegis_cli.common import devices
-from aegis_cli.core import joint
+from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import channel_moment, decompose, lone_row, second_moment
 from aegis_cli.methods import METHODS
@@ -65,7 +65,7 @@ def trained(method: str, options: dict[str, Any], together: bool) -> tuple[Toy, 
     """A toy after some constrained steps, and how many maps each group had."""
     found = METHODS[method]
     counts: list[int] = []
-    stack = joint.stacked
+    stack = stacking.stacked
 
     def counted(pairs: Any) -> Any:
         counts.append(len(pairs))
@@ -73,8 +73,8 @@ def trained(method: str, options: dict[str, Any], together: bool) -> tuple[Toy, 
 
     with pytest.MonkeyPatch.context() as patch, torch.random.fork_rng():
         torch.manual_seed(1)
-        patch.setattr(devices, "reading_waits", lambda _: together)
-        patch.setattr(joint, "stacked", counted)
+        patch.setattr(devices, "reading_stalls", lambda _: together)
+        patch.setattr(stacking, "stacked", counted)
         toy = Toy()
         found.adapt(toy, {}, options)
         sites = dict.fromkeys((*LAYERS, "stem"), "maps")
