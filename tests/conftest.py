@@ -21,6 +21,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
 
 import pytest
+from hypothesis import settings
 from samples import fast
 from samples.tiny import make_tiny
 
@@ -32,6 +33,10 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 TESTS = Path(__file__).parent
+
+# An example may take longer on a machine that does something else, too.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 
 # Samples whose fixtures tests name as arguments.
 pytest_plugins = [

@@ -66,7 +66,7 @@ def test_a_file_that_lost_its_digest_is_not_taken_for_a_sealed_one(tmp_path: Pat
     pytest.fail("no such damage in 100 draws")
 
 
-@settings(deadline=None, derandomize=True, database=None, max_examples=60)
+@settings(derandomize=True, database=None, max_examples=60)
 @given(document=JSON, seed=st.integers(0, 2**32))
 def test_any_json_can_be_damaged(document: object, seed: int) -> None:
     """And what comes of it can be written again, so that a case never ends the campaign."""

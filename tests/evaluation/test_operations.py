@@ -13,7 +13,7 @@ SIZES = st.integers(1, 5)
 
 
 @given(SIZES, SIZES, SIZES, SIZES, SIZES, SIZES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_attention_counts_whatever_the_heads_of_keys(
     rows: int, heads: int, shared: int, queries: int, keys: int, width: int
 ) -> None:

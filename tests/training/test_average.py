@@ -52,7 +52,7 @@ def state(out: Path, kind: str, at: int | None = None) -> dict[str, Tensor]:
 # --- the average ----------------------------------------------------------------------------------
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     decay=st.floats(0.01, 0.999),
     waits=st.lists(st.integers(1, 4), min_size=1, max_size=12),
