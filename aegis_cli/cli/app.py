@@ -778,7 +778,7 @@ def inspect(
 ) -> None:
     """Say what a file, run or dataset is, with a run's energies, routing or tables.
 
-    A run's page tells what was trained, how well it does, what was lost, and whether its gate is
+    For a run it tells what was trained, how well it does, what was lost, and whether its gate is
     passed, as far as `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured
     that.
 

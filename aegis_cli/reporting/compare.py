@@ -188,7 +188,7 @@ def _by_episodes(found: InspectReport) -> dict[Any, results.Result]:
 
 
 def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Named | None]:
-    """The first result by name that all runs with any have, of each; else its own first."""
+    """Each run's first result whose name all runs with any have, else its own first."""
     some = [own for own in measured if own]
     shared = [name for name in next(iter(some), {}) if all(name in own for own in some)]
     return [next(((n, own[n]) for n in (*shared[:1], *own) if n in own), None) for own in measured]
