@@ -103,6 +103,7 @@ class Measurement(Removable):
         self._hooks = LayerHooks(self._layers)  # last, since what fails before would leave them
         self._samples: int | None = 0  # None: a pass has not told how many it had
         self._broken, self._unanswered = False, False
+        self._removed = False
 
     @contextlib.contextmanager
     def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
@@ -115,8 +116,15 @@ class Measurement(Removable):
                 prompts have no images.
 
         Raises:
-            AegisError: a mask that does not fit, or a map whose inputs cannot be told from padding.
+            AegisError: a mask that does not fit, a map whose inputs cannot be told from padding, or
+                a measurement whose hooks were taken off.
         """
+        if self._removed:
+            raise AegisError(
+                "a measurement that was removed",
+                "one at work; a `with` block removes it where it ends",
+                "watch inside the block, or make a new measurement",
+            )
         if self._model.training:
             raise AegisError(
                 "a model in training mode", "one that answers as it did before", "model.eval()"
@@ -230,8 +238,9 @@ class Measurement(Removable):
         )
 
     def remove(self) -> None:
-        """Take the hooks off."""
+        """Take the hooks off; what was measured stays."""
         self._hooks.remove()
+        self._removed = True
 
     def _check_answered(self) -> None:
         if self._unanswered:

@@ -194,6 +194,19 @@ def test_inputs_that_are_not_finite_are_refused() -> None:
         found.anchor()
 
 
+@pytest.mark.parametrize("parts", [("moments",), ("inputs",)])
+def test_a_measurement_that_was_removed_says_so(parts: tuple[str, ...]) -> None:
+    model, (pixels, ids, mask) = make(), batch(0)
+    image = torch.zeros_like(mask, dtype=torch.bool)
+    options = {"layers": LAYERS, "parts": parts, "vision": "vision"}
+    with Guard.measure(model, **options) as found, found.watch(mask, image):
+        model(pixels, ids, mask)
+    removed = pytest.raises(AegisError, match="a measurement that was removed")
+    with removed, found.watch(mask, image):
+        model(pixels, ids, mask)
+    assert found.anchor()
+
+
 def test_a_mask_of_no_token_is_refused_whatever_is_measured() -> None:
     model, (pixels, ids, mask) = make(), batch(0)
     found = Guard.measure(model, parts=("inputs",), vision="vision")
