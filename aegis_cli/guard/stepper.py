@@ -6,6 +6,7 @@ import math
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -17,11 +18,10 @@ from torch.optim.optimizer import (
 )
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.ranks import ALONE, Ranks, rows_here
+from aegis_cli.common.ranks import ALONE, Ranks
+from aegis_cli.guard.learning_parameters import LearningParameters
 from aegis_cli.methods.base import Parts
-from aegis_cli.methods.known_parameters import check_reached
 from aegis_cli.methods.stepper import Stepper
-from aegis_cli.models import structure
 from aegis_cli.models.buffers import WrittenBuffers
 
 Scaler = torch.amp.GradScaler
@@ -49,32 +49,18 @@ class GuardedStepper:
             may_shard: as of `Stepper`.
             averaging: modules that may not average what they read while the method works, by name.
         """
-        self._model, self._parts = model, parts
-        self._averaging = averaging or {}
-        self._learning = structure.learning(model)
-        self._devices = [p.device for p in self._learning.values()]
-        self._types = [p.dtype for p in self._learning.values()]
+        self._parts, self._averaging = parts, averaging or {}
+        self._learning = LearningParameters(model)
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
-        self._stepping, self._count = False, 0
-        self._counted: int | None = None  # the optimizer whose step was counted since the last pass
+        self._count = 0
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
-        # Of a step of the loop's own, and how often each weight had been written to before it.
-        self._slowed: SlowedStep | None = None
-        self._begun_at: list[int] = []
+        self._since = _SincePass()
+        self._taken: _TakenStep | None = None
+        self._own: _OwnStep | None = None
         # Steps inside each other: of an optimizer that calls its base class's, or another one's.
         self._depth, self._in_closure = 0, False
-        # Whether an optimizer has moved the weights in `step`; None: no hook has told of any.
-        self._moved: bool | None = None
-        # Ids of the optimizers that have stepped since the last guarded backward pass; None before
-        # the first pass.
-        self._stepped: set[int] | None = None
-        # Whether an optimizer has moved the weights since then; whether any has ever told of a
-        # step; and how often each weight had been written to.
-        self._took, self._tells = False, False
-        self._written: list[int] = []
-        # The buffers as the first pass left them; None before it, and once the second was seen.
-        self._buffers: WrittenBuffers | None = None
-        self._looked = False
+        self._tells = False  # whether any optimizer has ever told of a step
+        self._buffers = _BufferWatch(model)
         _AT_WORK.add(self)
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
@@ -90,6 +76,14 @@ class GuardedStepper:
         """
         self._automatic = anchor
 
+    def remove(self) -> None:
+        """Let every step pass."""
+        _AT_WORK.discard(self)
+        for hook in self._hooks:
+            hook.remove()
+
+    # --- passes -----------------------------------------------------------------------------------
+
     def check(self) -> None:
         """Refuse a model whose parameters are not those that the guard was made with.
 
@@ -98,8 +92,7 @@ class GuardedStepper:
         """
         self._end_broken_step()
         self._stepper.known.check()
-        if structure.learning(self._model).keys() - self._learning.keys():
-            self._refuse_other_parameters()
+        self._learning.refuse_further()
         self._refuse_another_place()
         if at_work := [name for name, module in self._averaging.items() if module.training]:
             raise AegisError(
@@ -119,43 +112,22 @@ class GuardedStepper:
         self._end_broken_step()
         self._refuse_another_guard()
         if not self._sums_late:
-            check_reached(self._learning.values())
-        if not self._looked:
-            self._look_at_buffers()
-        self._stepped, self._counted = set(), None
-        self._took, self._written = False, self._versions()
+            self._learning.refuse_unreached()
+        self._buffers.look()
+        self._since = _SincePass(guarded=True, written=self._learning.versions())
         if not self._in_closure:
             self._depth = 0  # a step that raised an exception has left it as it was
-
-    def _look_at_buffers(self) -> None:
-        """Warn, at the second pass, of what it has written to since the first."""
-        before, self._buffers = self._buffers, None
-        if before is None:
-            self._buffers = WrittenBuffers(self._model)
-            return
-        self._looked = True
-        if not (written := before.modules()):
-            return
-        more = f" and of {len(written) - 1} more modules" if written[1:] else ""
-        warnings.warn(
-            f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm "
-            "averages what it reads: answers change with them, and no method holds them; call "
-            "module.eval() for each of these modules after model.train()",
-            stacklevel=2,
-        )
 
     def _refuse_another_guard(self) -> None:
         """Refuse a second guard of the same kind on a parameter: it would undo what one has held.
 
         One may project gradients, and another one constrain the updates that are made of them.
         """
-        mine = {id(p) for p in self._learning.values()}
         for other in _AT_WORK:
-            used = other is not self and other._stepped is not None
+            used = other is not self and other._since.guarded
             if not used or other._parts.constrains != self._parts.constrains:
                 continue
-            shared = [name for name, p in other._learning.items() if id(p) in mine]
-            if shared:
+            if shared := self._learning.shared_with(other._learning):
                 raise AegisError(
                     f"two guards at work on {len(shared)} parameters, first '{shared[0]}'",
                     "one for each parameter: a second one moves again what the first has held",
@@ -169,7 +141,7 @@ class GuardedStepper:
         Args:
             skips: whether a scaler was there, which skips steps that overflow.
         """
-        if self._took or self._written != self._versions():
+        if self._since.moved or self._since.written != self._learning.versions():
             return True
         # An optimizer that is none of PyTorch's tells nothing, and may write past its count.
         return not (self._tells or skips)
@@ -183,25 +155,11 @@ class GuardedStepper:
         """
         return self._may_shard and self._parts.penalty is None
 
-    def _refuse_unreached(self) -> None:
-        """Raise AegisError where the passes of a step have left no gradient in the model."""
-        if self._sums_late and self._stepped is not None:
-            check_reached(self._learning.values())
-
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
         """Whether every gradient of what learns is finite, in all processes."""
-        largest = nn.utils.get_total_norm(self.gradients(), norm_type=math.inf)
-        return not owners.any(not largest.isfinite())[0]
+        return self._learning.gradients_finite(owners)
 
-    def gradients(self) -> list[Tensor]:
-        """The gradients of what learns, as far as they are there, and of sharded ones the rows."""
-        return [rows_here(p.grad) for p in self._learning.values() if p.grad is not None]
-
-    def remove(self) -> None:
-        """Let every step pass."""
-        _AT_WORK.discard(self)
-        for hook in self._hooks:
-            hook.remove()
+    # --- steps that the guard takes ---------------------------------------------------------------
 
     def step(
         self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]
@@ -215,95 +173,34 @@ class GuardedStepper:
             AegisError: other parameters learn than when the guard was made, or their gradients are
                 those of a plain backward pass.
         """
-        if not self._parts.constrains or not self._guards(optimizer):
+        if not self._parts.constrains or not self._learning.are_in(optimizer):
             _take(optimizer, scaler)
             return
-        self._refuse_other_parameters()
+        self._learning.refuse_others()
         self._refuse_another_place()
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
         self._refuse_unreached()
-        self._stepper.begin(self._by_name(anchor))
+        self._stepper.begin(self._learning.by_name(anchor))
         slowed = SlowedStep(self._parts)
-        versions = self._versions()
-        self._stepping, self._moved = True, None
+        taken = self._taken = _TakenStep(self._learning.versions())
         try:
             _take(optimizer, scaler)
         finally:
-            self._stepping = False
+            self._taken = None
             # A scaler leaves a step out that overflowed, and a trainer's optimizer those in
             # between. What is drawn back in such a step would be so without an update that asked
             # for it. One that raises an exception may have moved some of the weights.
-            if self._has_moved(optimizer, versions):
-                self._count += 1
-                slowed.go_back()
-                self._stepper.end(self._count)
-            else:
-                self._stepper.take_none()
+            self._end(slowed, taken.has_moved(optimizer, self._learning))
 
-    def _has_moved(self, optimizer: Optimizer, versions: Sequence[int]) -> bool:
-        """Whether the weights have moved in `step`.
-
-        Args:
-            versions: of the weights before it.
-        """
-        if self._moved is not None:
-            return self._moved
-        # One that is no optimizer of PyTorch's may write past its count.
-        return not isinstance(optimizer, Optimizer) or versions != self._versions()
-
-    def _versions(self) -> list[int]:
-        """How often each parameter was written to, as PyTorch counts it."""
-        return [p._version for p in self._learning.values()]
-
-    def _refuse_another_place(self) -> None:
-        """Refuse a model that is elsewhere, or of another type, than what constrains it."""
-        devices = [p.device for p in self._learning.values()]
-        if self._parts.constrains and devices != self._devices:
-            moved = zip(self._devices, devices, strict=True)
-            then, now = next((then, now) for then, now in moved if then != now)
-            raise AegisError(
-                f"a model that was on {then} when the guard was made, and is on {now}",
-                "one and the same",
-                f"model.to('{now}') before Guard(...), also where a trainer would do it",
-            )
-        types = [p.dtype for p in self._learning.values()]
-        if self._parts.constrains and types != self._types:
-            place = next(
-                i
-                for i, (now, then) in enumerate(zip(types, self._types, strict=True))
-                if now != then
-            )
-            raise AegisError(
-                f"'{list(self._learning)[place]}', which was in {self._types[place]} when the "
-                f"guard was made, and is in {types[place]}",
-                "one and the same: rounding to half precision is as large as an update",
-                "leave the model as it was, with torch.autocast for fast products; of Lightning, "
-                "precision='bf16-mixed'",
-            )
-
-    def _refuse_second(self, optimizer: Optimizer) -> None:
-        """Refuse a second optimizer's step after one pass, which would constrain twice."""
-        if self._counted not in (None, id(optimizer)):
-            raise AegisError(
-                "two optimizers on guarded parameters, whose updates would be constrained twice",
-                "one, which may have groups with settings of their own",
-                "torch.optim.AdamW([{'params': ..., 'lr': ...}, ...]); an optimizer of parameters "
-                "that the guard does not know may be there besides",
-            )
-        self._counted = id(optimizer)
-
-    def _refuse_other_parameters(self) -> None:
-        if structure.learning(self._model).keys() != self._learning.keys():
-            raise AegisError(
-                "other trainable parameters than when the guard was made",
-                "the same",
-                "freeze and unfreeze before Guard(...)",
-            )
-
-    def _by_name(self, anchor: Mapping[int, Tensor | None]) -> dict[str, Tensor]:
-        named = {name: anchor.get(id(p)) for name, p in self._learning.items()}
-        return {name: a for name, a in named.items() if a is not None}
+    def _end(self, slowed: SlowedStep, moved: bool) -> None:
+        """Constrain a step, if it has moved the weights."""
+        if not moved:
+            self._stepper.take_none()
+            return
+        slowed.go_back()
+        self._count += 1
+        self._stepper.end(self._count)
 
     @property
     def pending(self) -> int:
@@ -315,13 +212,9 @@ class GuardedStepper:
         self._end_broken_step()
         self._stepper.settle()
 
-    def _end_broken_step(self) -> None:
-        """End a step of the loop's own that has raised an exception, if there was one.
-
-        An optimizer that calls its closure goes on with its step after it.
-        """
-        if self._slowed is not None and not self._in_closure:
-            self._end(self._begun_at != self._versions())
+    def is_of_all(self, optimizer: Optimizer) -> bool:
+        """Whether an optimizer has all that learns, and no other one's step belongs to its own."""
+        return self._learning.are_all_in(optimizer)
 
     # --- every optimizer of the process -----------------------------------------------------------
 
@@ -334,9 +227,9 @@ class GuardedStepper:
         Returns:
             What the optimizer is to call in the place of its closure.
         """
-        if not self._guards(optimizer):
+        if not self._learning.are_in(optimizer):
             return closure
-        if self._parts.constrains and not self._stepping and self._automatic is None:
+        if self._parts.constrains and self._taken is None and self._automatic is None:
             raise AegisError(
                 "optimizer.step() on guarded parameters",
                 "guard.step(optimizer), which constrains the update",
@@ -363,15 +256,15 @@ class GuardedStepper:
     def _begin(self, optimizer: Optimizer) -> None:
         """The gradients are there, and the weights are about to move."""
         self._refuse_unguarded(optimizer)
-        by_itself = self._automatic is not None and not self._stepping
-        # An optimizer may call its closure several times in one step.
-        if by_itself and self._parts.constrains and self._slowed is None:
-            assert self._automatic is not None
-            self._refuse_other_parameters()
-            self._refuse_unreached()
-            self._refuse_second(optimizer)
-            self._stepper.begin(self._by_name(self._automatic()))
-            self._slowed, self._begun_at = SlowedStep(self._parts), self._versions()
+        if self._automatic is None or self._taken is not None or not self._parts.constrains:
+            return
+        if self._own is not None:  # an optimizer may call its closure several times in one step
+            return
+        self._learning.refuse_others()
+        self._refuse_unreached()
+        self._refuse_second(optimizer)
+        self._stepper.begin(self._learning.by_name(self._automatic()))
+        self._own = _OwnStep(SlowedStep(self._parts), self._learning.versions())
 
     def after_step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
         """The weights have moved, and go on to move where this step lies inside another one.
@@ -379,48 +272,61 @@ class GuardedStepper:
         Args:
             scaler: what the step was given as `grad_scaler`.
         """
-        if not self._guards(optimizer):
+        if not self._learning.are_in(optimizer):
             return
         moved = not overflowed(optimizer, scaler)
-        self._moved = moved or bool(self._moved)
-        self._took, self._tells = moved or self._took, True
-        if self._stepped is not None:
-            self._stepped.add(id(optimizer))
+        self._tells = True
+        self._since.stepped.add(id(optimizer))
+        self._since.moved = moved or self._since.moved
+        if self._taken is not None:
+            self._taken.told = moved or bool(self._taken.told)
         self._depth = max(0, self._depth - 1)
-        if self._slowed is not None and not self._depth:
-            self._end(moved)
+        if not self._depth:
+            self._end_own(moved)
 
-    def _end(self, moved: bool) -> None:
-        """Constrain a step of the loop's own, if it has moved the weights."""
-        assert self._slowed is not None
-        slowed, self._slowed = self._slowed, None
-        if not moved:
-            self._stepper.take_none()
-            return
-        slowed.go_back()
-        self._count += 1
-        self._stepper.end(self._count)
+    def _end_own(self, moved: bool) -> None:
+        """End the step of the loop's own, if one is under way."""
+        own, self._own = self._own, None
+        if own is not None:
+            self._end(own.slowed, moved)
 
-    def _guards(self, optimizer: Optimizer) -> bool:
-        mine = {id(p) for p in self._learning.values()}
-        return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
+    def _end_broken_step(self) -> None:
+        """End a step of the loop's own that has raised an exception, if there was one.
 
-    def is_of_all(self, optimizer: Optimizer) -> bool:
-        """Whether an optimizer has all that learns, and no other one's step belongs to its own.
-
-        One that is none of PyTorch's does not tell.
+        An optimizer that calls its closure goes on with its step after it.
         """
-        if not isinstance(optimizer, Optimizer):
-            return False
-        mine = {id(p) for p in self._learning.values()}
-        return mine <= {id(p) for group in optimizer.param_groups for p in group["params"]}
+        if self._own is not None and not self._in_closure:
+            self._end_own(self._own.written != self._learning.versions())
+
+    # --- refusals ---------------------------------------------------------------------------------
+
+    def _refuse_another_place(self) -> None:
+        """Refuse a model that is elsewhere, or of another type, than what constrains it."""
+        if self._parts.constrains:
+            self._learning.refuse_another_place()
+
+    def _refuse_unreached(self) -> None:
+        """Raise AegisError where the passes of a step have left no gradient in the model."""
+        if self._sums_late and self._since.guarded:
+            self._learning.refuse_unreached()
+
+    def _refuse_second(self, optimizer: Optimizer) -> None:
+        """Refuse a second optimizer's step after one pass, which would constrain twice."""
+        if self._since.constrained not in (None, id(optimizer)):
+            raise AegisError(
+                "two optimizers on guarded parameters, whose updates would be constrained twice",
+                "one, which may have groups with settings of their own",
+                "torch.optim.AdamW([{'params': ..., 'lr': ...}, ...]); an optimizer of parameters "
+                "that the guard does not know may be there besides",
+            )
+        self._since.constrained = id(optimizer)
 
     def _refuse_unguarded(self, optimizer: Optimizer) -> None:
         """Raise if guarded gradients are those of a plain backward pass."""
-        if self._stepped is not None and id(optimizer) not in self._stepped:
+        if self._since.guarded and id(optimizer) not in self._since.stepped:
             return
         # Some libraries take a step on zeros, to have an optimizer's state made.
-        if any(gradient.any() for gradient in self.gradients()):
+        if any(gradient.any() for gradient in self._learning.gradients()):
             raise AegisError(
                 "a step on guarded parameters without a guard.backward since the last one",
                 "guard.backward(loss) instead of loss.backward(), before every step",
@@ -428,6 +334,85 @@ class GuardedStepper:
                 "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
                 "guard.remove() when done",
             )
+
+
+@dataclass
+class _SincePass:
+    """What optimizers have done since the last guarded backward pass.
+
+    Attributes:
+        guarded: whether there was such a pass.
+        written: how often each weight had been written to at that pass.
+        stepped: ids of the optimizers that have stepped since.
+        moved: whether one of them has moved the weights.
+        constrained: id of the one whose update was constrained; None: none's was.
+    """
+
+    guarded: bool = False
+    written: Sequence[int] = ()
+    stepped: set[int] = field(default_factory=set)
+    moved: bool = False
+    constrained: int | None = None
+
+
+@dataclass
+class _TakenStep:
+    """A step that the guard takes.
+
+    Attributes:
+        written: how often each weight had been written to before it.
+        told: whether an optimizer has moved the weights, by its hook; None: no hook has told.
+    """
+
+    written: Sequence[int]
+    told: bool | None = None
+
+    def has_moved(self, optimizer: Optimizer, learning: LearningParameters) -> bool:
+        """Whether the weights have moved."""
+        if self.told is not None:
+            return self.told
+        # One that is no optimizer of PyTorch's may write past its count.
+        return not isinstance(optimizer, Optimizer) or self.written != learning.versions()
+
+
+@dataclass
+class _OwnStep:
+    """A step that the loop takes by itself.
+
+    Attributes:
+        slowed: goes back to the shares of its update.
+        written: how often each weight had been written to before it.
+    """
+
+    slowed: SlowedStep
+    written: Sequence[int]
+
+
+class _BufferWatch:
+    """Warns, at the second pass, of the buffers that it has written to since the first."""
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model, self._looked = model, False
+        self._first: WrittenBuffers | None = None
+
+    def look(self) -> None:
+        """A pass has ended."""
+        if self._looked:
+            return
+        if self._first is None:
+            self._first = WrittenBuffers(self._model)
+            return
+        written = self._first.modules()
+        self._looked, self._first = True, None
+        if not written:
+            return
+        more = f" and of {len(written) - 1} more modules" if written[1:] else ""
+        warnings.warn(
+            f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm "
+            "averages what it reads: answers change with them, and no method holds them; call "
+            "module.eval() for each of these modules after model.train()",
+            stacklevel=2,
+        )
 
 
 class SlowedStep:

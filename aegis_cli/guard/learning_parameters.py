@@ -1,0 +1,124 @@
+"""The parameters that learn in a guarded model: where they are, what moved them, their gradients.
+
+A guard works on what it found when it was made. It refuses a model in which other parameters learn
+than then, or the same ones in another place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+from torch.optim.optimizer import Optimizer
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.ranks import ALONE, Ranks, rows_here
+from aegis_cli.methods.known_parameters import check_reached
+from aegis_cli.models import structure
+
+
+class LearningParameters:
+    """What learned in a model when a guard was made for it.
+
+    Attributes:
+        named: the parameters by their names in the model.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model = model
+        self.named = structure.learning(model)
+        self._devices = [p.device for p in self.named.values()]
+        self._types = [p.dtype for p in self.named.values()]
+
+    # --- refusals ---------------------------------------------------------------------------------
+
+    def refuse_others(self) -> None:
+        """Raise AegisError where other parameters learn now."""
+        if structure.learning(self._model).keys() != self.named.keys():
+            raise _others()
+
+    def refuse_further(self) -> None:
+        """Raise AegisError where more parameters learn now; some may be frozen meanwhile."""
+        if structure.learning(self._model).keys() - self.named.keys():
+            raise _others()
+
+    def refuse_another_place(self) -> None:
+        """Raise AegisError where they are elsewhere now, or of another type.
+
+        What constrains them stayed where they were.
+        """
+        devices = [p.device for p in self.named.values()]
+        if devices != self._devices:
+            moved = zip(self._devices, devices, strict=True)
+            then, now = next((then, now) for then, now in moved if then != now)
+            raise AegisError(
+                f"a model that was on {then} when the guard was made, and is on {now}",
+                "one and the same",
+                f"model.to('{now}') before Guard(...), also where a trainer would do it",
+            )
+        for (name, parameter), then in zip(self.named.items(), self._types, strict=True):
+            if parameter.dtype != then:
+                raise AegisError(
+                    f"'{name}', which was in {then} when the guard was made, and is in "
+                    f"{parameter.dtype}",
+                    "one and the same: rounding to half precision is as large as an update",
+                    "leave the model as it was, with torch.autocast for fast products; of "
+                    "Lightning, precision='bf16-mixed'",
+                )
+
+    def refuse_unreached(self) -> None:
+        """Raise AegisError where none of them has a gradient."""
+        check_reached(self.named.values())
+
+    # --- gradients and writes ---------------------------------------------------------------------
+
+    def gradients(self) -> list[Tensor]:
+        """Their gradients, as far as they are there, and of sharded ones the rows."""
+        return [rows_here(p.grad) for p in self.named.values() if p.grad is not None]
+
+    def gradients_finite(self, owners: Ranks = ALONE) -> bool:
+        """Whether every gradient is finite, in all processes."""
+        largest = nn.utils.get_total_norm(self.gradients(), norm_type=math.inf)
+        return not owners.any(not largest.isfinite())[0]
+
+    def by_name(self, gradients: Mapping[int, Tensor | None]) -> dict[str, Tensor]:
+        """Gradients that are known by the parameters' ids, by their names."""
+        found = {name: gradients.get(id(p)) for name, p in self.named.items()}
+        return {name: gradient for name, gradient in found.items() if gradient is not None}
+
+    def versions(self) -> list[int]:
+        """How often each was written to, as PyTorch counts it."""
+        return [p._version for p in self.named.values()]
+
+    # --- optimizers -------------------------------------------------------------------------------
+
+    def are_in(self, optimizer: Optimizer) -> bool:
+        """Whether an optimizer has any of them."""
+        mine = self._ids()
+        return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
+
+    def are_all_in(self, optimizer: Optimizer) -> bool:
+        """Whether an optimizer has all of them, and no other one's step belongs to its own.
+
+        One that is none of PyTorch's does not tell.
+        """
+        if not isinstance(optimizer, Optimizer):
+            return False
+        return self._ids() <= {id(p) for group in optimizer.param_groups for p in group["params"]}
+
+    def shared_with(self, other: LearningParameters) -> list[str]:
+        """The other's names of those that it has too."""
+        mine = self._ids()
+        return [name for name, p in other.named.items() if id(p) in mine]
+
+    def _ids(self) -> set[int]:
+        return {id(p) for p in self.named.values()}
+
+
+def _others() -> AegisError:
+    return AegisError(
+        "other trainable parameters than when the guard was made",
+        "the same",
+        "freeze and unfreeze before Guard(...)",
+    )
