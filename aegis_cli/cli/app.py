@@ -628,6 +628,7 @@ def _check_sweep(
         raise AegisError(found, "something that says what to write", fix)
     if plot is not None:
         render.check_plot(plot)
+        files.check_writable(plot)
 
 
 @app.command(short_help="Measure what a model still knows, and its drift.")

@@ -25,7 +25,7 @@ from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
-from aegis_cli.training import checkpoint, folder, track
+from aegis_cli.training import checkpoint, folder, inputs, track
 
 FOLDER = "results"
 OPEN_LOOP = "evaluate"  # what the names of its files begin with
@@ -345,7 +345,7 @@ def _is_asked_for(found: Result, kind: str, recipe: recipes.Recipe) -> bool:
     An earlier recipe of the run may have had more question sets, or other colours.
     """
     if kind == "probe":
-        return _number_of_set(found) <= len(recipe.probe.of_each_set())
+        return _number(found, kind) <= len(recipe.probe.of_each_set())
     colors = found.figures.get("colors") if kind == "rollout" else None
     return colors is None or colors in recipe.rollout.colors
 
@@ -362,17 +362,32 @@ def evaluated_on(figures: Mapping[str, Any]) -> str:
     return said + (f", {len(trained):,} of them trained on" if trained else "")
 
 
+def evaluated_data(run: Path, evaluated: Result) -> str:
+    """Where the demonstrations of an open-loop evaluation lie: an absolute path, or an id.
+
+    `aegis run` names them as its recipe does, which the folder that it was called in has to
+    complete; the run knows them whole.
+    """
+    if "path" in evaluated.settings:
+        return str(evaluated.settings["path"])
+    known, number = inputs.of(run), _number(evaluated, OPEN_LOOP)
+    if known is not None and number <= len(known.demos):
+        return known.demos[number - 1]
+    named = Path(evaluated.figures["data"])
+    return str(named.absolute() if named.exists() else named)
+
+
 def question_set(probed: Result, recipe: recipes.Recipe) -> str:
     """The question set of a probe as somebody named it: its own, or one of the recipe's."""
     if "vqa" in probed.settings:
         return str(probed.settings["vqa"])
-    sets, place = recipe.probe.of_each_set(), _number_of_set(probed) - 1
+    sets, place = recipe.probe.of_each_set(), _number(probed, "probe") - 1
     return str(sets[place if place < len(sets) else 0].vqa)
 
 
-def _number_of_set(probed: Result) -> int:
-    """Which of the recipe's question sets a probe of `aegis run` asked, from 1."""
-    number = probed.name.removeprefix("probe").lstrip("-") or "1"
+def _number(found: Result, kind: str) -> int:
+    """Which of the recipe's sets, from 1, something that `aegis run` has measured is of."""
+    number = found.name.removeprefix(kind).lstrip("-") or "1"
     return int(number) if number.isdigit() else 1
 
 

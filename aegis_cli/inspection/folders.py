@@ -240,5 +240,7 @@ def _merged(run: Path, at: Path) -> dict[str, Any] | None:
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:
     """The latest value of each figure of a run, or of its beginning."""
-    rows = [row for row in folder.read_metrics(path) if until is None or row["step"] <= until]
+    rows = [
+        row for row in folder.read_metrics(path, "step") if until is None or row["step"] <= until
+    ]
     return {name: value for row in rows for name, value in row.items() if value is not None}

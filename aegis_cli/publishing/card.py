@@ -16,12 +16,18 @@ from typing import Any
 from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
-from aegis_cli.evaluation.results import PlayedResult, Result, evaluated_on, told_apart
+from aegis_cli.evaluation.results import (
+    PlayedResult,
+    Result,
+    evaluated_on,
+    question_set,
+    told_apart,
+)
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, freezing
-from aegis_cli.training.card import without_folders
+from aegis_cli.training.card import without_folders, without_places
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
@@ -117,7 +123,7 @@ def text(
     found = _measured(run, at)
     facts = found.facts
     # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
-    options = json.dumps(recipes.options(recipe), sort_keys=True)
+    options = json.dumps(without_places(recipes.options(recipe)), sort_keys=True)
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
@@ -136,11 +142,18 @@ def text(
         options=options,
         frozen=freezing.sentence(recipe.train.freeze, before=" "),
         averaged="" if decay is None else _AVERAGED.format(decay),
-        merged=f" Merged afterwards: `{json.dumps(merge, sort_keys=True)}`." if merge else "",
+        merged=_merged(merge),
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
         use=_use(form, repo, recipe, facts["task"], cameras),
     )
+
+
+def _merged(merge: Mapping[str, Any] | None) -> str:
+    """A sentence on a merge after the training; nothing without one."""
+    if not merge:
+        return ""
+    return f" Merged afterwards: `{json.dumps(without_places(merge), sort_keys=True)}`."
 
 
 def _use(
@@ -223,8 +236,7 @@ def _knowledge(found: InspectReport, recipe: Recipe) -> Iterator[str]:
 
 def _probe_row(result: Result, recipe: Recipe) -> str:
     figures = result.figures
-    first = recipe.probe.of_each_set()[0].vqa  # in probe.json, whose name says no more
-    asked = result.settings.get("vqa", result.name.removeprefix("probe").lstrip("-") or first)
+    asked = question_set(result, recipe)
     drop = "not measured"
     if figures.get("drop_points") is not None:
         low, high = figures["drop_interval"]

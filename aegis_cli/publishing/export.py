@@ -169,7 +169,7 @@ def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:
     """What LeRobot calls the pictures: the policy's own names, or for a single camera `camera`.
 
     Raises:
-        AegisError: a name where the policy has several cameras.
+        AegisError: a name where the policy has several cameras, or one that no feature can have.
     """
     named = list(meta.get("cameras", ())) or [lerobot_folder.CAMERA]
     if camera is None:
@@ -179,6 +179,12 @@ def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:
             f"--camera {camera} for a policy of {', '.join(named)}",
             "a policy of one camera",
             "leave --camera out",
+        )
+    if not camera.strip() or not camera.isprintable() or "/" in camera:
+        raise AegisError(
+            f"--camera {camera!r}",
+            "a camera's name, without '/', which no feature of LeRobot has",
+            "e.g. --camera front",
         )
     return [camera]
 

@@ -21,12 +21,11 @@ from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
-from aegis_cli.training.card import without_folders
+from aegis_cli.training.card import without_places
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-_PLACES = {"backbone", "path", "vqa", "start"}  # recipes' keys of models and data
 RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 _REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
 # What lies in `backbone/` after a push: the model's files and its card, and what transformers calls
@@ -152,16 +151,8 @@ def _check_name(repo: str) -> None:
 
 def _recipe(home: Path) -> str:
     """The recipe of the training, without the folders in which models and data lie here."""
-
-    def told(key: str, value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: told(name, inner) for name, inner in value.items()}
-        if isinstance(value, list):
-            return [told(key, inner) for inner in value]
-        return without_folders(value) if key in _PLACES and isinstance(value, str) else value
-
     kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
-    return dump(told("", kept))
+    return dump(without_places(kept))
 
 
 def _files(folder: Path) -> dict[str, Path]:

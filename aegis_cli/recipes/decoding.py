@@ -102,7 +102,7 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     limits = [] if check and check.choices and phrase == "text" else [phrase]
     expected = f"{dotted}: " + ", ".join(limits + ([check.expected] if check else []))
     listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
-    fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check)
+    fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check, phrase)
     return Problem(f"{dotted}: {_quote(raw)}", expected, fix)
 
 
@@ -114,13 +114,18 @@ def _as_list(raw: str | int, dotted: str, check: Check | None) -> str:
     return f"write '{dotted}: [{meant}]', or --set '{dotted}=[{meant}]'"
 
 
-def _fix(field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None) -> str:
+def _fix(
+    field: dataclasses.Field[Any], raw: Any, dotted: str, check: Check | None, phrase: str
+) -> str:
     choices = check.choices if check else ()
     words = [str(item) for item in (raw if isinstance(raw, list) else [raw])]
     wrong = next((word for word in words if word not in choices), "")
     near = did_you_mean(wrong, choices)
     if near:
         return f"did you mean '{near}'?"
+    if phrase == "text" and not choices and not isinstance(raw, bool | list | None):
+        meant = raw if isinstance(raw, int | float) else "..."
+        return f"put the text in quotes: {dotted}: '{meant}', or --set \"{dotted}='{meant}'\""
     if field.default is dataclasses.MISSING:
         return f"change '{dotted}'"
     if field.default is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import difflib
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -181,7 +182,7 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
             return None, loader.problems
         if _size(node, {}) > _LARGEST:
             raise ValueError(f"more than {_LARGEST} values, counted as often as they are named")
-        return loader.construct_document(node), loader.problems
+        return _each_its_own(loader.construct_document(node)), loader.problems
     except (yaml.YAMLError, *_DAMAGED) as e:
         mark = getattr(e, "problem_mark", None)
         where = f" line {mark.line + 1}, column {mark.column + 1}:" if mark else ""
@@ -192,6 +193,15 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def _each_its_own(value: Any) -> Any:
+    """The same value, in which what an alias names is a copy: to change one leaves the other."""
+    if isinstance(value, _Lines):
+        copied = _Lines((name, _each_its_own(inner)) for name, inner in value.items())
+        copied.lines = value.lines
+        return copied
+    return [_each_its_own(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _why(error: Exception) -> str:
@@ -218,6 +228,11 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
     return known[id(node)]
 
 
+def _quoted(text: str) -> str:
+    """A text in YAML's quotes, and in a shell's."""
+    return shlex.quote("'" + text.strip().replace("'", "''") + "'")
+
+
 def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says.
 
@@ -231,7 +246,11 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
     if text.startswith("{}") and text.strip() != "{}":
         value, problems = text, list[Problem]()
     else:
-        value, problems = parse(text, f"--set '{setting}'")
+        try:
+            value, problems = parse(text, f"--set '{setting}'")
+        except AegisError as error:
+            fix = f"of a text, put it in quotes: --set {dotted}={_quoted(text)}"
+            return [Problem(error.found, "a value as in YAML", fix)]
     in_the_way = put(raw, dotted, plain(value))
     if in_the_way:
         found = f"--set '{setting}', but '{in_the_way}' has no keys below it"

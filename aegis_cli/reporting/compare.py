@@ -64,19 +64,27 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The runs, in the order given; and whether all open-loop errors are of the same frames.
+    """The runs, in the order given.
 
+    `same_open_loop` says whether all open-loop errors are of the same frames, `same_episodes`
+    whether all rollouts of the same colours played the same episodes.
     `differs` has what the runs do not share beside their methods, with each run's value.
     """
 
     rows: list[ComparedRun]
     same_open_loop: bool = True
+    same_episodes: bool = True
     differs: dict[str, list[differences.Value]] = field(default_factory=dict)
 
     @property
     def same_validation(self) -> bool:
         """Whether all validation losses are of the same held-out frames."""
         return differences.same_validation(self.differs)
+
+    @property
+    def same_questions(self) -> bool:
+        """Whether the figures of VQA are of the same questions."""
+        return "questions" not in self.differs
 
     @property
     def question_sets(self) -> list[str]:
@@ -99,7 +107,7 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     """
     found = [(path, _inspected(path)) for given in paths for path in _runs(Path(given))]
     probed = _one_of_each([_by_set(path, one) for path, one in found])
-    evaluated = _one_of_each([_by_episodes(one) for _, one in found])
+    evaluated = _one_of_each([_by_episodes(path, one) for path, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
     _warn_of_unfinished(found, on_event)
     _warn_of_merges(found, on_event)
@@ -108,7 +116,8 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
         for (path, one), row, asked in zip(found, rows, probed, strict=True)
     ]
     same_frames = len({own[0] for own in evaluated if own is not None}) < 2
-    made = Comparison(rows, same_frames, differences.between(facts))
+    same_episodes = _same_episodes([_by_colors(one) for _, one in found])
+    made = Comparison(rows, same_frames, same_episodes, differences.between(facts))
     if made.differs:
         text = f"the runs differ in {differences.said(made.differs)}"
         on_event(Warned("compare", f"{text}: their figures tell more than their methods"))
@@ -178,11 +187,22 @@ def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
     return {result.figures.get("colors"): result for result in reversed(found.rollouts)}
 
 
-def _by_episodes(found: InspectReport) -> dict[Any, results.Result]:
+def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) -> bool:
+    """Whether all rollouts of the same colours played the same episodes, in whatever way."""
+    known = dict[str | None, tuple[Any, ...]]()
+    for rollouts in each:
+        for colors, one in rollouts.items():
+            episodes = one.figures.get("task"), one.figures["episodes"], one.played.seed
+            if known.setdefault(colors, episodes) != episodes:
+                return False
+    return True
+
+
+def _by_episodes(path: Path, found: InspectReport) -> dict[Any, results.Result]:
     """The run's open-loop evaluations by what has to be the same for them to be compared."""
     named = ("episodes", "trained_on", "frames", "seed")
     return {
-        (one.settings.get("path"), *(str(one.figures[name]) for name in named)): one
+        (results.evaluated_data(path, one), *(str(one.figures[name]) for name in named)): one
         for one in found.open_loops
     }
 

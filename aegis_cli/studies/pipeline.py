@@ -125,19 +125,20 @@ def _percent(share: float | None) -> float | None:
 def verdict(rows: Sequence[PolicyFigures]) -> str:
     """A sentence on the method that acts best among those that keep VQA.
 
-    To keep it means to lose at most half of what naive loses. Who acts best succeeds most often,
-    or, where nothing can be rolled out, has the least open-loop error.
+    To keep it means to lose at most half of what naive loses; of several sets of questions, each
+    counts by the one that it lost most of. Who acts best succeeds most often, or, where nothing can
+    be rolled out, has the least open-loop error.
     """
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
         return ""
-    lost = f"{naive.drop_points:.1f} points of VQA"
-    if naive.drop_points < _LEAST_DROP:
+    lost = f"{max(_drops(naive)):.1f} points of VQA"
+    if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."
     kept = [
         row
         for row in rows
-        if row.method != "naive" and row.drop_points <= naive.drop_points * _KEPT_SHARE
+        if row.method != "naive" and max(_drops(row)) <= max(_drops(naive)) * _KEPT_SHARE
     ]
     if not kept:
         return (
@@ -150,10 +151,16 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     else:
         at = f"{_percent(best.success_seen):.1f} % success where naive has "
         at += f"{_percent(naive.success_seen):.1f} %"
+    of = ", each of the questions that it lost most of" if naive.others else ""
     return (
-        f"{best.method} lost {best.drop_points:.1f} points of VQA where naive lost "
-        f"{naive.drop_points:.1f}, at {at} (one seed)."
+        f"{best.method} lost {max(_drops(best)):.1f} points of VQA where naive lost "
+        f"{max(_drops(naive)):.1f}{of}, at {at} (one seed)."
     )
+
+
+def _drops(row: PolicyFigures) -> list[float]:
+    """The points lost of each set of questions."""
+    return [row.drop_points, *(other.drop_points for other in row.others.values())]
 
 
 def _acts(row: PolicyFigures) -> float | None:
@@ -165,8 +172,7 @@ def _acts(row: PolicyFigures) -> float | None:
 
 def _past(row: PolicyFigures, limit: float) -> bool:
     """Whether a method lost more than the gate lets pass on any of its sets of questions."""
-    drops = [row.drop_points, *(other.drop_points for other in row.others.values())]
-    return not all(results.within(drop, limit) for drop in drops)
+    return not all(results.within(drop, limit) for drop in _drops(row))
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:

@@ -15,6 +15,8 @@ from aegis_cli.methods.base import Method
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import freezing
 
+_PLACES = {"backbone", "base", "path", "start", "vqa"}  # keys of models and data
+
 _CARD = """---
 library_name: transformers
 pipeline_tag: image-text-to-text
@@ -99,7 +101,7 @@ def text(
         backbone=without_folders(recipe.backbone),
         version=__version__,
         summary=method.summary,
-        options=json.dumps(options, sort_keys=True),
+        options=json.dumps(without_places(options), sort_keys=True),
         planned=settings.steps,
         batch=settings.batch_size,
         backbone_lr=settings.backbone_lr,
@@ -120,6 +122,19 @@ def text(
 def without_folders(name: str) -> str:
     """What a card calls a model or a file of questions: it tells nobody where these lie."""
     return Path(name).name if Path(name).is_absolute() else name
+
+
+def without_places(value: Any, key: str = "") -> Any:
+    """A recipe or a part of it, in which no model, data or questions say in what folder they lie.
+
+    Args:
+        key: whose value it is.
+    """
+    if isinstance(value, Mapping):
+        return {name: without_places(inner, name) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_places(inner, key) for inner in value]
+    return without_folders(value) if key in _PLACES and isinstance(value, str) else value
 
 
 def _drift(ledger: Mapping[str, Any]) -> str:

@@ -52,6 +52,14 @@ def test_the_axis_says_its_name_beside_its_ticks(seed: int) -> None:
     assert min(lefts) >= 15  # the name is turned around x = 12
 
 
+@pytest.mark.parametrize("highest", [2e-4, 2e-5, 1.7e-3, 200_000, 3e7, 40, 0.3])
+@pytest.mark.parametrize("log", [False, True])
+def test_ticks_say_the_values_that_they_stand_at(highest: float, log: bool) -> None:
+    scale = charts.spanning([highest / 30, highest], 0, 1, log)
+    for tick in scale.ticks():
+        assert float(charts.label(tick)) == pytest.approx(tick, rel=1e-6, abs=1e-12)
+
+
 def spots(seed: int) -> list[Spot]:
     """Three means with intervals that reach past 100 %."""
     values = draw(seed, 3, 4)

@@ -98,6 +98,17 @@ def test_a_frontier_without_tuning_shows_the_means() -> None:
     assert set(texts(figure)) == {"a", "x", "better"}
 
 
+def test_a_frontier_names_the_task_of_what_it_shows() -> None:
+    """Where what was tuned is none of the tasks that are compared, it has marks of both."""
+    report = found(("naive", "a", "x"))
+    elsewhere = dataclasses.replace(report, tuning_task="point")
+    untuned = dataclasses.replace(report, tuning=[], tuning_task=None)
+    tried = dataclasses.replace(elsewhere, tasks=[])
+    assert frontier.shown_tasks(report) == frontier.shown_tasks(untuned) == "task reach"
+    assert frontier.shown_tasks(elsewhere) == "task reach (values tried on point)"
+    assert frontier.shown_tasks(tried) == "task point"
+
+
 def test_success_of_a_task_without_held_out_colours_is_of_no_colours() -> None:
     report = found(("a", "x"))
     (task,) = report.tasks
@@ -224,6 +235,16 @@ def test_a_stream_of_any_length_has_a_panel_a_task(count: int) -> None:
     figure = plots._routing(SimpleNamespace(tasks=tasks, records=records), "runs/s")
     figure.draw_without_rendering()
     assert sum(bool(axes.get_title()) and axes.get_visible() for axes in figure.axes) == count
+
+
+@pytest.mark.parametrize("name", ["runs/$x\\frac$/y", "a$b", "plain"])
+def test_a_path_is_drawn_as_it_is_and_not_as_mathematics(name: str) -> None:
+    report = energies([[0.5, 0.25]])
+    report.path = name
+    figure = plots._energy(report)
+    figure.draw_without_rendering()
+    title = figure.axes[0].get_title(loc="left")
+    assert title.replace(r"\$", "$").startswith(f"{name};")
 
 
 # --- predicted and recorded actions ---------------------------------------------------------------

@@ -21,10 +21,10 @@ from samples.studies import found
 
 from aegis_cli.cli import render
 from aegis_cli.cli.render import frontier
-from aegis_cli.cli.render.layout import marked, number, plain_table
+from aegis_cli.cli.render.layout import fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
-from aegis_cli.cli.render.progress import Lines, Live
+from aegis_cli.cli.render.progress import Lines, Live, _warning
 from aegis_cli.cli.render.studies import study
 from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
@@ -150,6 +150,10 @@ def test_a_warning_is_shown_whole_and_progress_goes_on():
         live(warned)
         assert [task.description for task in bars.tasks] == ["anchor"]
     assert f"warning: anchor: {warned.text}" in file.getvalue()
+
+
+def test_a_warning_moves_no_cursor() -> None:
+    assert _warning(Warned("x", "run \x1b]0;title\x07")) == (r"warning: x: run \x1b]0;title\x07")
 
 
 def test_a_narrow_terminal_cuts_the_figures_and_not_the_name():
@@ -456,6 +460,12 @@ def test_the_best_and_the_worst_of_a_column_are_marked(
 ) -> None:
     cells = ["-" if value is None else f"{value:.1f}" for value in values]
     assert plain(marked(cells, values, more_is_better)) == expected
+
+
+def test_what_rounds_to_nothing_has_no_sign() -> None:
+    values = [-3e-16, 0.0, 1.0]
+    assert plain(marked([fixed(v, 2) for v in values], values, False)) == ["*0.00", "*0.00", "1.00"]
+    assert [fixed(-0.004, 2), fixed(-0.006, 2), percent(-1e-9)] == ["0.00", "-0.01", "0.0"]
 
 
 def test_the_best_of_a_column_is_bold_in_markdown() -> None:

@@ -251,6 +251,38 @@ def test_a_large_film_is_linked(aegis, job: Path) -> None:
     assert (job / "report.html").stat().st_size < 1_000_000
 
 
+def test_a_page_elsewhere_links_the_film_where_it_lies(aegis, job: Path, tmp_path: Path) -> None:
+    with open(job / "film.mp4", "wb") as film:
+        film.truncate(9_000_000)
+    (tmp_path / "elsewhere").mkdir()
+    aegis("report", job, "--out", tmp_path / "elsewhere" / "x.html")
+    text = (tmp_path / "elsewhere" / "x.html").read_text(encoding="utf-8")
+    (link,) = re.findall(r'href="([^"]*film.mp4)"', text)
+    assert (tmp_path / "elsewhere" / link).resolve() == (job / "film.mp4").resolve()
+
+
+def test_what_only_a_later_probe_has_is_on_the_page(aegis, job: Path) -> None:
+    """The first one was measured without an anchor, and of other questions."""
+    run = job / "naive"
+    (run / "probe.json").unlink()
+    less = probe("shape") | {"layers": [], "wrong": []}
+    results.keep(run, "probe-a", less, {"vqa": "a"})
+    results.keep(run, "probe-b", probe("color"), {"vqa": "b"})
+    page, _ = reported(aegis, run)
+    assert "Drift per layer" in page.said and "Wrong answers" in page.said
+    assert "VQA accuracy on a" in page.said
+
+
+@pytest.mark.parametrize("missing", ["layers", "families", "baseline_accuracy", "drop_points"])
+def test_what_an_older_version_did_not_write_is_left_out(aegis, job: Path, missing: str) -> None:
+    path = job / "naive" / "probe.json"
+    left = {name: value for name, value in files.load_json(path).items() if name != missing}
+    files.save_json(path, left | {"drop_interval": None})
+    for command in ("inspect", "report"):
+        assert aegis(command, job / "naive")[0] == 0
+    assert aegis("compare", job)[0] == 0
+
+
 def test_out_names_the_page(aegis, job: Path, tmp_path: Path) -> None:
     code, out, err = aegis("report", job, "--out", tmp_path / "x.html")
     assert (code, out) == (0, "") and "x.html" in err

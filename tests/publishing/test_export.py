@@ -155,6 +155,15 @@ def test_a_camera_that_a_dataset_names_otherwise_keeps_its_name(
     assert whole.pictures == ("observation.images.wrist",)
 
 
+@pytest.mark.parametrize("name", ["", " ", "a/b", "../x", "top\nx"])
+def test_a_camera_that_no_feature_can_be_called_is_refused(
+    name: str, run_folder: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(AegisError, match="a camera's name"):
+        export.run(run_folder, tmp_path / "x", camera=name)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_card_names_a_picture_that_is_not_the_tasks_own(
     run_folder: Path, exported: Path, tmp_path: Path
 ) -> None:

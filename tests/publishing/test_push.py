@@ -25,7 +25,9 @@ from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.evaluation.results import Played, PlayedResult, Result
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export, push
+from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.training import checkpoint, train
+from aegis_cli.training.card import without_places
 
 Aegis = Callable[..., tuple[int, str, str]]
 REPO = "somebody/reach-naive"
@@ -191,6 +193,26 @@ def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
     assert f"aegis probe {REPO} --baseline" in body and "hf download" not in body
     # Where the backbone lies here is nothing to others.
     assert "--baseline /" not in body and "model `/" not in body
+
+
+def test_a_card_tells_nobody_in_what_folders_things_lie() -> None:
+    """Neither in the options of a method nor in what was merged."""
+    raw = {"method": "cotrain", "vqa": ["/home/me/secret/q.jsonl", "scenes"], "weight": 0.5}
+    raw |= {"inner": {"base": "/home/me/secret/vlm", "path": "ORG/NAME", "ask": "/say {}"}}
+    told = without_places(raw)
+    assert told["vqa"] == ["q.jsonl", "scenes"] and told["weight"] == 0.5
+    assert told["inner"] == {"base": "vlm", "path": "ORG/NAME", "ask": "/say {}"}
+    merge = {"method": "linear", "base": "/home/me/secret/vlm", "strength": 0.5}
+    assert "secret" not in card._merged(merge) and '"base": "vlm"' in card._merged(merge)
+
+
+def test_a_card_names_the_set_of_each_probe() -> None:
+    recipe = Recipe(name="x", probe=Probe(vqa=("scenes", "easy-vqa")))
+    figures = {"accuracy": 0.9, "interval": [0.8, 1.0], "questions": 40}
+    rows = [
+        card._probe_row(results.Result(name, figures, {}), recipe) for name in ("probe", "probe-2")
+    ]
+    assert [row.split("`")[1] for row in rows] == ["scenes", "easy-vqa"]
 
 
 @pytest.mark.parametrize("hosted", [True, False])

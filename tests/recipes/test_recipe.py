@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +41,7 @@ from aegis_cli.recipes import (
     name_of,
     options,
     recorded,
+    strict_yaml,
     study_cells,
     to_yaml,
     training_part,
@@ -315,6 +317,35 @@ def test_broken_yaml_is_refused_with_its_line(text, tmp_path):
 
 def test_an_override_that_is_no_yaml_is_refused(tmp_path):
     assert "--set 'methods=[aegis'" in refusal(tmp_path, "name: x", "methods=[aegis").found
+
+
+@pytest.mark.parametrize(
+    ("setting", "fix"),
+    [
+        ("demos.only=2", "--set \"demos.only='2'\""),
+        ("name=2024", "--set \"name='2024'\""),
+        ("probe.ask=Question: {}", "put the text in quotes: probe.ask: '...'"),
+        ("probe.ask=Q: it's {} A: x", "--set probe.ask='"),
+    ],
+)
+def test_a_text_that_yaml_takes_for_something_else_is_told_to_be_quoted(setting, fix, tmp_path):
+    assert fix in refusal(tmp_path, "name: x", setting).fix
+
+
+@pytest.mark.parametrize("text", ["Question: {} Answer:", "it's {}: what", "a: {}", "{} 'x'"])
+def test_the_quotes_that_are_advised_give_the_text(text, tmp_path):
+    (quoted,) = shlex.split(strict_yaml._quoted(text))
+    recipe = load(write(tmp_path, "name: x"), (f"probe.ask={quoted}",))
+    assert recipe.probe.ask == text
+
+
+def test_what_an_alias_names_is_its_own(tmp_path):
+    text = "kind: study\nname: x\ntasks: [reach]\nseeds: [0]\nvariants:\n  naive: {method: naive}\n"
+    text += "  a: &v {method: lora, set: {train.steps: 9}}\n  b: *v\n"
+    overrides = ("variants.a.method=l2sp", "variants.b.set={train.steps: 4}")
+    loaded = study_cells.load(write(tmp_path, text), overrides).variants
+    assert [loaded[name].method for name in "ab"] == ["l2sp", "lora"]
+    assert [dict(loaded[name].set) for name in "ab"] == [{"train.steps": 9}, {"train.steps": 4}]
 
 
 def test_a_missing_file_names_its_neighbour(tmp_path):

@@ -15,6 +15,7 @@ from aegis_cli.common.events import Event, Warned
 from aegis_cli.evaluation import results
 from aegis_cli.recipes import Probe
 from aegis_cli.reporting import compare
+from aegis_cli.training import inputs
 
 
 @pytest.fixture
@@ -150,6 +151,48 @@ def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
     _, out, err = aegis("compare", "naive", "aegis")
     assert "0.250" in out and "*0.250" not in out and "!0.500" not in out
     assert "not of the same frames: naive, 1 held-out episode of datasets/arm" in err
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_what_aegis_run_has_evaluated_is_told_apart_by_where_its_data_lies(
+    same: bool, job: Path, tmp_path: Path
+) -> None:
+    """Its figures name the data as the recipe does, which may be any folder's `arm`."""
+    places = [tmp_path / "a" / "arm"] * 2 if same else [tmp_path / "a/arm", tmp_path / "b/arm"]
+    for name, place in zip(("naive", "aegis"), places):
+        files.save_json(job / name / "evaluate.json", open_loop(1))
+        inputs.keep(job / name, inputs.Inputs((str(place),), None))
+    assert compare.run([job]).same_open_loop is same
+    by_hand = open_loop(1)
+    results.keep(job / "aegis", "evaluate-validation-arm", by_hand, {"path": str(places[1])})
+    (job / "aegis" / "evaluate.json").unlink()
+    assert compare.run([job]).same_open_loop is same
+
+
+@pytest.mark.parametrize(
+    ("changed", "same"),
+    [({"task": "point"}, False), ({"episodes": 7}, False), ({"wrong_target": 0.5}, True)],
+)
+def test_success_in_other_episodes_is_shown_without_a_mark(
+    changed: dict[str, object], same: bool, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    path = job / "aegis" / "rollout-seen.json"
+    files.save_json(path, files.load_json(path) | {"success": 1.0} | changed)
+    assert compare.run([job]).same_episodes is same
+    out = aegis("compare", "naive", "aegis")[1]
+    assert "100.0" in out and ("*100.0" in out) is same
+
+
+@pytest.mark.parametrize("questions", [40, 41])
+def test_answers_to_other_questions_are_shown_without_a_mark(
+    questions: int, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(job)
+    path = job / "aegis" / "probe.json"
+    files.save_json(path, files.load_json(path) | {"questions": questions})
+    out = aegis("compare", "naive", "aegis")[1]
+    assert "80.0" in out and ("*80.0" in out) == (questions == 40)
 
 
 def test_without_an_evaluation_there_is_no_column_of_it(

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -670,6 +671,30 @@ def opened(**of: tuple[float, float]) -> list[Any]:
 def test_the_verdict_says_what_the_table_does(rows: list[Any], says: str) -> None:
     found = pipeline.verdict(rows)
     assert says in found and bool(says) == bool(found)
+
+
+def asked_twice(rows: list[Any], **others: float) -> list[Any]:
+    """The same rows, which were also asked other questions and lost these points of them."""
+    again = {name.replace("_", "-"): drop for name, drop in others.items()}
+    return [
+        replace(row, others={"other": SimpleNamespace(drop_points=again[row.method])})
+        for row in rows
+    ]
+
+
+@pytest.mark.parametrize(
+    ("others", "says"),
+    [
+        ({"naive": 40, "kfac": 38}, "No method here kept VQA: naive lost 40.0 points"),
+        ({"naive": 40, "kfac": 2}, "kfac lost 2.0 points of VQA where naive lost 40.0, each of"),
+        ({"naive": 0, "kfac": 0}, "little to protect"),
+    ],
+)
+def test_the_verdict_is_on_the_questions_that_most_was_lost_of(
+    others: dict[str, float], says: str
+) -> None:
+    rows = asked_twice(figured(naive=(0, 0.95), kfac=(0, 0.9)), **others)
+    assert says in pipeline.verdict(rows)
 
 
 def test_an_anchor_of_answers_that_the_backbone_is_sure_of_is_warned_of(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,19 +19,24 @@ _TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
 _EMBEDDED_BYTES = 8_000_000  # of a film; larger ones are linked
 
 
-def videos(found: At, folder: Path) -> Markup | None:
-    """The films of a folder, inside the page where they are small."""
+def videos(found: At, folder: Path, page: Path) -> Markup | None:
+    """The films of a folder, inside the page where they are small.
+
+    Args:
+        page: the folder that the page lies in, from which large films are linked.
+    """
     if not found:
         return None
-    return section("Videos", *(_film(video, folder) for video in found))
+    return section("Videos", *(_film(video, folder, page) for video in found))
 
 
-def _film(video: At, folder: Path) -> Markup:
+def _film(video: At, folder: Path, page: Path) -> Markup:
     name = str(video["name"])
     kind = _TYPES[Path(name).suffix.lower()]
     if video["size_bytes"].value > _EMBEDDED_BYTES:
-        link = element("a", name, href=quote(name))
-        return note(link, " is too large to be part of this page, and lies beside it.")
+        place = Path(os.path.relpath(folder / name, page)).as_posix()
+        link = element("a", place, href=quote(place))
+        return note(link, " is too large to be part of this page, which only links it.")
     source = f"data:{kind};base64,{base64.b64encode((folder / name).read_bytes()).decode()}"
     if kind.startswith("video"):
         film = element("video", src=source, controls="", muted="", loop="", playsinline="")

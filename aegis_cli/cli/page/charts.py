@@ -93,7 +93,8 @@ def spanning(values: Sequence[float], start: float, end: float, log: bool = Fals
 def label(value: float) -> str:
     """A tick's number, short."""
     if value and (abs(value) >= 1e5 or abs(value) < 1e-3):
-        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+        digits, power = f"{value:.2e}".split("e")
+        return f"{float(digits):g}e{int(power)}"
     return f"{value:g}"
 
 

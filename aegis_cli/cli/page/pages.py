@@ -25,13 +25,17 @@ _POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe
 
 def save(report: Any, path: Path) -> None:
     """Write the page of what `reporting.gather` found."""
-    files.write_text(path, page(report))
+    files.write_text(path, page(report, path.parent))
 
 
-def page(report: Any) -> Markup:
-    """The page as a whole."""
+def page(report: Any, folder: Path) -> Markup:
+    """The page as a whole.
+
+    Args:
+        folder: where it is going to lie.
+    """
     found = At(document(report))
-    title, parts = _PAGES[report.kind](found, report)
+    title, parts = _PAGES[report.kind](found, report, folder)
     style = resources.files("aegis_cli.cli.page").joinpath("page.css").read_text("utf-8")
     head = element(
         "head",
@@ -58,7 +62,7 @@ def _header(kind: str, title: str, lead: Child, *further: Child) -> Markup:
 # --- a run ----------------------------------------------------------------------------------------
 
 
-def _run(found: At, report: Any) -> tuple[str, list[Child]]:
+def _run(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
     title = f"{found['facts']['recipe']}: {found['label']}"
     lead = f"Method {found['method']} fine-tuned {found['backbone']} on {_task(found)}, "
     lead += f"{_steps(found)} steps, seed {found['facts']['seed']}."
@@ -66,7 +70,7 @@ def _run(found: At, report: Any) -> tuple[str, list[Child]]:
         _header("Run", title, lead, runs.at_a_glance(found)),
         _trained(found, _anchor([found])),
         *_measured([found]),
-        about.videos(found["videos"], Path(report.path)),
+        about.videos(found["videos"], Path(report.path), folder),
         about.commands(found),
         about.machine([found]),
         about.recipe(found),
@@ -154,7 +158,7 @@ def _measured(found: Sequence[At]) -> list[Child]:
 # --- a job ----------------------------------------------------------------------------------------
 
 
-def _job(found: At, report: Any) -> tuple[str, list[Child]]:
+def _job(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
     own, compared = list(found["runs"]), found["table"]
     title = str(compared["name"])
     first = own[0]
@@ -166,7 +170,7 @@ def _job(found: At, report: Any) -> tuple[str, list[Child]]:
         _trained(first, _anchor(own)),
         _comparison(found, own),
         *_measured(own),
-        about.videos(found["videos"], Path(report.path)),
+        about.videos(found["videos"], Path(report.path), folder),
         about.commands(found),
         about.machine(own),
         about.recipe(first),
@@ -286,7 +290,7 @@ def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
 # --- studies and streams --------------------------------------------------------------------------
 
 
-def _study(found: At, report: Any) -> tuple[str, list[Child]]:
+def _study(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
     compared = found["table"]
     title = str(compared["name"])
     tasks = list(dict.fromkeys(str(task["task"]) for task in compared["tasks"]))
@@ -308,7 +312,7 @@ def _seeds(compared: At) -> str:
     return ", ".join(map(str, compared["seeds"].value))
 
 
-def _stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
+def _stream_study(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
     compared = found["table"]
     title = str(compared["name"])
     streams = ", ".join(compared["streams"].value)
@@ -322,7 +326,7 @@ def _stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
     return title, parts
 
 
-def _robot_stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
+def _robot_stream_study(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
     compared = found["table"]
     title = str(compared["name"])
     tasks = ", ".join(compared["tasks"].value)
@@ -336,7 +340,7 @@ def _robot_stream_study(found: At, report: Any) -> tuple[str, list[Child]]:
     return title, parts
 
 
-def _stream(found: At, report: Any) -> tuple[str, list[Child]]:
+def _stream(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
     stream = found["report"]
     title = Path(report.path).resolve().name
     lead = f"A stream of {len(stream['tasks'].value)} tasks, learned one after the other."

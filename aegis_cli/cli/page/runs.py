@@ -36,9 +36,10 @@ def note(*children: Child) -> Markup:
 # --- how well, and what was lost ------------------------------------------------------------------
 
 
-def probe(run: At) -> At:
-    """The figures of the run's first probe; nothing where none was made."""
-    return run["probes"][0]["figures"] if run["probes"] else At(None)
+def probe(run: At, having: str = "accuracy") -> At:
+    """The figures of the run's first probe that has some; nothing where none has."""
+    each = [result["figures"] for result in run["probes"]]
+    return next((figures for figures in each if figures[having]), At(None))
 
 
 def rollout(run: At, colors: str) -> At:
@@ -57,10 +58,12 @@ def at_a_glance(run: At) -> Markup:
         accuracy = [share(vqa["accuracy"]), " %"]
         if vqa["baseline_accuracy"]:
             accuracy.append(element("small", "before: ", share(vqa["baseline_accuracy"]), " %"))
-        shown.append(("VQA accuracy", accuracy))
+        several = len(set(run["question_sets"].value)) > 1
+        asked = f" on {run['question_sets'][0]}" if several else ""
+        shown.append((f"VQA accuracy{asked}", accuracy))
         if vqa["drop_points"].value is not None:
             ends = between(vqa["drop_interval"], decimal)
-            shown.append(("VQA accuracy lost, points", [decimal(vqa["drop_points"]), ends]))
+            shown.append((f"VQA accuracy lost{asked}, points", [decimal(vqa["drop_points"]), ends]))
     shown += _acted_apart(run["rollouts"])
     for result in run["open_loops"]:
         on = evaluated_on(result["figures"].value)
@@ -190,7 +193,7 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
     by_questions = _by_questions(runs)
     for (name, count, again), found in by_questions.items():
         asked, probes = list(found), list(found.values())
-        names = list(dict.fromkeys(name for p in probes for name in p["families"].value))
+        names = list(dict.fromkeys(name for p in probes for name in p["families"].value or ()))
         header = ["Family", "Questions", "Always the commonest %", "Before %"]
         header += asked
         rows = [_family(name, probes) for name in names]
@@ -259,8 +262,7 @@ def wrong_answers(runs: Sequence[At]) -> Markup | None:
     """Some wrong answers of each run with their images."""
     parts: list[Child] = []
     for run in runs:
-        examples = probe(run)["wrong"] if probe(run) else At(None)
-        if examples:
+        if examples := probe(run, "wrong")["wrong"]:
             parts.append(element("h3", run["label"]) if len(runs) > 1 else None)
             parts.append(element("div", *map(_wrong, examples), class_="wrong"))
     if not parts:
@@ -321,8 +323,7 @@ def drift(runs: Sequence[At]) -> Markup | None:
     """Squared W2 distance of each layer's activations to the anchor's."""
     series, rows, names = [], [], []
     for number, run in enumerate(runs):
-        layers = probe(run)["layers"] if probe(run) else At(None)
-        if not layers:
+        if not (layers := probe(run, "layers")["layers"]):
             continue
         w2 = [layer["w2"] for layer in layers]
         points = [(k, at.value) for k, at in enumerate(w2) if is_number(at.value)]

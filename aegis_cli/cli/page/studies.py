@@ -11,7 +11,12 @@ from aegis_cli.cli.page.cursor import At, between, decimal, farthest, share, sho
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.runs import figure, note, section
 from aegis_cli.cli.page.tables import table, verdict
-from aegis_cli.cli.render.frontier import acting_axis, chosen_task, coloured_methods
+from aegis_cli.cli.render.frontier import (
+    acting_axis,
+    chosen_task,
+    coloured_methods,
+    shown_tasks,
+)
 from aegis_cli.cli.render.studies import knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns
@@ -33,7 +38,6 @@ def frontier(compared: At, report: Any) -> Markup | None:
     tried, curves = _tried(compared, number)
     if not spots and not tried:
         return None
-    where = report.tuning_task if report.tuning else chosen.task
     chart = charts.frontier(
         [*tried, *spots],
         curves,
@@ -41,8 +45,12 @@ def frontier(compared: At, report: Any) -> Markup | None:
         _DECLARED[_LOST].axis or "",
         "VQA accuracy lost over success",
     )
-    said = f"Task {where}; better is to the upper right. Large marks: means over seeds with 95 % "
-    said += "intervals. Small marks: values tried on validation data, filled where chosen."
+    where = shown_tasks(report)
+    said = (
+        f"{where[0].upper()}{where[1:]}; better is to the upper right. Large marks: means over "
+        "seeds with 95 % intervals. Small marks: values tried on validation data, filled where "
+        "chosen."
+    )
     return section("Frontier", figure(chart, said, wide=True))
 
 

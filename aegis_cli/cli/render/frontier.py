@@ -90,6 +90,16 @@ def chosen_task(report: Any) -> Any:
     )
 
 
+def shown_tasks(report: Any) -> str:
+    """The task of the means, and that of the values tried where it is another."""
+    tried, means = report.tuning_task, chosen_task(report) if _compared(report) else None
+    if means is None or (_tried(report) and means.task == tried):
+        return f"task {tried}"
+    if not _tried(report):
+        return f"task {means.task}"
+    return f"task {means.task} (values tried on {tried})"
+
+
 def acting_axis(report: Any) -> str:
     """What the frontier's axis of success says; of a task without held-out colours, no colours."""
     acting = next(map(_acting, _compared(report)), "success_seen")
@@ -220,8 +230,7 @@ def _scale(axis: Any, report: Any) -> None:
     axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)  # ticks widened it
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
-    task = report.tuning_task if report.tuning else report.tasks[0].task
-    title = f"{report.name}: VQA accuracy lost against success, task {task}"
+    title = f"{report.name}: VQA accuracy lost against success, {shown_tasks(report)}"
     axis.set_title(title, loc="left", fontsize=11)
 
 

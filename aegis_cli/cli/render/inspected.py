@@ -141,15 +141,15 @@ def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
     rows = []
     for result, asked in zip(probes, question_sets, strict=True):
         found = result.figures
-        drifts = [layer["w2"] for layer in found["layers"]]
+        drifts = [layer["w2"] for layer in found.get("layers") or ()]
         rows.append(
             (
                 asked,
                 f"{found.get('questions', 0):,}",
                 percent(found["accuracy"]),
-                percent(found["baseline_accuracy"]),
-                fixed(found["drop_points"], 2),
-                _ends(found["drop_interval"], lambda points: fixed(points, 2)),
+                percent(found.get("baseline_accuracy")),
+                fixed(found.get("drop_points"), 2),
+                _ends(found.get("drop_interval"), lambda points: fixed(points, 2)),
                 number(max(drifts, default=None)),
             )
         )
@@ -220,6 +220,7 @@ def _steps(first: int, last: int) -> str:
 
 
 _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
+_OF_EPISODES = ("Success seen %", "Success held-out %", "Return % of highest")
 _OPEN_LOOP = "Open-loop error"
 _VALIDATION = "Validation loss"
 # The columns in which the best and the worst are marked: the figure, and whether more is better.
@@ -268,8 +269,12 @@ def _shown_columns(report: Any) -> dict[str, list[Cell]]:
 
 
 def _not_compared(report: Any) -> set[str]:
-    """The columns whose figures were measured on other questions or frames of each run."""
-    apart = set(_OF_QUESTIONS) if len(report.question_sets) > 1 else set[str]()
+    """The columns whose figures are of other questions, episodes or frames with each run."""
+    apart = set[str]()
+    if len(report.question_sets) > 1 or not report.same_questions:
+        apart |= {*_OF_QUESTIONS}
+    if not report.same_episodes:
+        apart |= {*_OF_EPISODES}
     if not report.same_open_loop:
         apart.add(_OPEN_LOOP)
     if not report.same_validation:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from aegis_cli.cli.render.plots import literal
+
 _REACHES = (7, 13, 20, 30, 42)  # pixels at 100 a inch from the mark to the nearest side of a label
 _ANGLES = 16
 _LEADER = 18  # from this distance on, a thin line leads from the label to its mark
@@ -55,7 +57,7 @@ def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float
         text = axis.text(
             label.x,
             label.y,
-            label.text,
+            literal(label.text),
             color=label.color,
             fontsize=label.size,
             fontweight="bold" if label.bold else "normal",

@@ -74,11 +74,12 @@ def plain_table(
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None else f"{100 * value:.{digits}f}"
+    return fixed(None if value is None else 100 * value, digits)
 
 
 def fixed(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    """A number with that many digits after its point; what rounds to 0 has no sign."""
+    return "-" if value is None else f"{value:z.{digits}f}"
 
 
 def number(value: float | None, significant: int = 4) -> str:

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import fixed, number, plain_table
-from aegis_cli.cli.render.plots import figure, save_figure
+from aegis_cli.cli.render.plots import figure, literal, save_figure
 from aegis_cli.cli.render.tables import pairs
 
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
@@ -132,7 +132,7 @@ def _drawn(report: Any) -> Any:
             _draw_trace(axis, trace, row)
             if column == 0:
                 unit = f"\n({dimension.unit})" if dimension.unit else ""
-                axis.set_ylabel(f"{dimension.name}{unit}", fontsize=8)
+                axis.set_ylabel(f"{literal(dimension.name)}{literal(unit)}", fontsize=8)
         panels[0][column].set_title(_titled(report, trace), fontsize=9)
         panels[-1][column].set_xlabel("frame", fontsize=8)
     finding = textwrap.fill(_finding(report), _TITLE_CHARACTERS * columns)

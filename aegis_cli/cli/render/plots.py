@@ -61,6 +61,11 @@ def check_plot(path: Path) -> None:
         )
 
 
+def literal(text: str) -> str:
+    """A name or a path as it is: matplotlib takes what lies between two $ for maths."""
+    return text.replace("$", r"\$")
+
+
 def figure(**options: Any) -> Any:
     """An empty figure of matplotlib's Agg canvas: no pyplot, no display, no global state."""
     from matplotlib.figure import Figure
@@ -107,7 +112,7 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
     means = axes.secondary_yaxis("right")
     means.set_yticks(rows, [_percent(x.energy_shed) for x in report.layers], fontsize=size)
     means.tick_params(length=0)
-    title = f"{report.path}; on the right each group's mean; grey: nothing shed"
+    title = f"{literal(report.path)}; on the right each group's mean; grey: nothing shed"
     axes.set_title(title, loc="left", fontsize=9)
     return heat, least
 
@@ -205,7 +210,7 @@ def _routing(report: Any, path: str) -> Any:
     for task, (axes, record) in enumerate(zip(panels, report.records, strict=False)):
         routed = {site.site: site for site in record.sites}
         heat = _task_routing(axes, task, [routed.get(name) for name in sites], count)
-        axes.set_title(f"{task + 1}. {record.task}", fontsize=9)
+        axes.set_title(f"{task + 1}. {literal(record.task)}", fontsize=9)
         axes.tick_params(length=0, labelsize=8)
         axes.spines[:].set_visible(False)
     for axes in panels[len(report.records) :]:
@@ -214,7 +219,7 @@ def _routing(report: Any, path: str) -> Any:
     panels[0].set_xticks([i + 0.5 for i in range(count)], range(1, count + 1))
     panels[0].invert_yaxis()
     title = "Routing mass (%) after each task; a column holds the experts that one task brought"
-    drawn.suptitle(f"{title}\n{path}", x=0.01, ha="left", fontsize=11)
+    drawn.suptitle(f"{title}\n{literal(path)}", x=0.01, ha="left", fontsize=11)
     drawn.colorbar(heat, ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
     _explain_routing(drawn)
     return drawn

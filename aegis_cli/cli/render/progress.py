@@ -14,7 +14,7 @@ from rich.progress import Progress as Bars
 from rich.table import Column
 from rich.text import Text
 
-from aegis_cli.cli.render.output import Terminal
+from aegis_cli.cli.render.output import Terminal, visible
 from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 
 EVERY_S = 10.0  # a line at least this often,
@@ -149,7 +149,7 @@ class Live:
 
 
 def _warning(event: Warned) -> str:
-    return f"warning: {event.stage}: {event.text}"
+    return visible(f"warning: {event.stage}: {event.text}")
 
 
 def _restarts(last: Progress, event: Progress) -> bool:
