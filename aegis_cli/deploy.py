@@ -265,6 +265,12 @@ class DeployedPolicy:
                 "finite numbers",
                 "give the actions as the policy predicted them",
             )
+        if previous is None and delay:
+            raise AegisError(
+                f"a delay of {delay} actions, and no previous actions",
+                "what is left of the last chunk, where actions of it are executed meanwhile",
+                "give previous=, or of a message to aegis serve previous_actions",
+            )
         if not isinstance(delay, int | np.integer) or not 0 <= delay <= len(left):
             raise AegisError(
                 f"a delay of {delay} actions, where {len(left)} are left of the last chunk",

@@ -182,7 +182,7 @@ def test_a_chunk_continues_what_the_robot_executes_meanwhile(run_folder: Path) -
         ({"previous": np.zeros((2, 2)), "delay": 3}, "a delay of 3 actions, where 2 are left"),
         ({"previous": np.zeros((2, 2)), "delay": -1}, "a delay of -1"),
         ({"previous": np.zeros((2, 2)), "delay": 0.5}, "a delay of 0.5"),
-        ({"delay": 1}, "where 0 are left"),
+        ({"delay": 1}, "and no previous actions"),
     ],
 )
 def test_what_no_chunk_can_continue_is_refused(changes: dict[str, Any], said: str) -> None:

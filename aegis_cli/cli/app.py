@@ -716,7 +716,7 @@ def probe(
         fix = "add --max-drop POINTS, or leave --gate out"
         raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
     if baseline is None and (max_drop is not None or anchor is not None):
-        baseline = question_sets.baseline(target)
+        baseline = question_sets.baseline(target, anchor)
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")

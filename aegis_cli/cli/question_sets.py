@@ -41,19 +41,27 @@ def chosen(
     )
 
 
-def baseline(model: str) -> str | None:
-    """What a drop of a run is measured against where nothing else is said: where it began from.
+def baseline(model: str, anchor: Path | None = None) -> str | None:
+    """What a drop of a run is measured against where nothing else is said.
 
-    None of a model without a run.
+    It is the pre-trained VLM that the run began from, if need be by way of other runs, or the one
+    of these that the anchor was measured on. None of a model without a run.
     """
+    from aegis_cli.common import artifacts
     from aegis_cli.evaluation import results
 
     run = results.run_of(Path(model))
     if run is None:
         return None
-    began_from = results.recipe_of(run).backbone
+    origins = results.origins(run)
+    if anchor is not None:
+        measured = artifacts.read_header(anchor, "anchor").fingerprint
+        known = [number for number, origin in enumerate(origins) if origin.digest == measured]
+        origins = origins[: known[0] + 1] if known else origins
+    *between, began_from = (origin.name for origin in origins)
     if launch.rank() == 0:
-        render.note(f"the baseline is '{began_from}', the model that the run began from")
+        by_way = f" by way of {', '.join(between)}" if between else ""
+        render.note(f"the baseline is '{began_from}', the model that the run began from{by_way}")
     return began_from
 
 

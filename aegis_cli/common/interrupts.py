@@ -79,6 +79,24 @@ def listening() -> Iterator[None]:
 
 
 @contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Let a signal that would raise Stopped end the process at once inside the block.
+
+    A handler of Python's runs only when a call into C has come back, which one that waits for
+    others may never do. The block must leave nothing half-done.
+    """
+    numbers = (signal.SIGINT, *_ENDING) if _in_main() else ()
+    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) is stop}
+    for number in before:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def _sending_again() -> Iterator[None]:
     """Send a signal again whose exception was dropped inside the block.
 

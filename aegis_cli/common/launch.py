@@ -9,6 +9,8 @@ import os
 
 from aegis_cli.common.errors import AegisError
 
+_MEETING = ("RANK", "MASTER_ADDR", "MASTER_PORT")  # by which several processes find each other
+
 
 def world_size() -> int:
     """How many processes were started together; 1 without a launcher."""
@@ -44,6 +46,28 @@ def check_one() -> None:
             "start it without torchrun, or unset WORLD_SIZE; a "
             "study measures several cells at a time with --workers N",
         )
+
+
+def check_meeting() -> None:
+    """Refuse an environment by which this process could not meet the others.
+
+    Raises:
+        AegisError: something that a launcher says is missing, or contradicts the rest.
+    """
+    count = world_size()
+    missing = [name for name in _MEETING if not os.environ.get(name)]
+    if missing:
+        found = f"WORLD_SIZE={count} in the environment, without {' and '.join(missing)}"
+    elif not os.environ["RANK"].isdecimal() or rank() >= count:
+        found = f"RANK={os.environ['RANK']} in the environment, of WORLD_SIZE={count} processes"
+    else:
+        return
+    raise AegisError(
+        found,
+        "all that a launcher says to each of its processes, or nothing of it",
+        "start them with torchrun --nproc-per-node N -m aegis_cli ...; for one process alone: "
+        "unset WORLD_SIZE",
+    )
 
 
 def _number(name: str, default: int) -> int:

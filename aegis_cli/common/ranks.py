@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
-from aegis_cli.common import devices, launch
+from aegis_cli.common import devices, interrupts, launch
 from aegis_cli.common.errors import PeerLost
 
 T = TypeVar("T")
@@ -122,15 +122,18 @@ def joined() -> Iterator[Ranks]:
     Who is inside such a block already finds the same processes there.
 
     Raises:
+        AegisError: an environment by which they cannot be met.
         PeerLost: one of them has ended.
     """
     if _met is not None or launch.world_size() == 1:
         yield _met or ALONE
         return
+    launch.check_meeting()
     on_gpu = devices.on_gpu()
     if on_gpu:
         torch.cuda.set_device(launch.local_rank())
-    dist.init_process_group("nccl" if on_gpu else "gloo")
+    with interrupts.ending_at_once():
+        dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
         patient = dist.new_group(backend="gloo", timeout=_PATIENCE)
         ranks = Ranks(dist.get_rank(), dist.get_world_size(), patient=patient)

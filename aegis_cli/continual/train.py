@@ -65,7 +65,7 @@ def _run(
     overwrite: bool,
     on_event: OnEvent,
 ) -> StreamReport:
-    folder.check(out, recipe, resume, overwrite)
+    folder.check(out, recipe, resume, overwrite, _read(recipe))
     if files.is_done(out) and not overwrite:
         _check_same_recording(out, recipe)
         return files.read(out)
@@ -84,6 +84,13 @@ def _run(
     files.write(built, report)
     (out / state.STATE).unlink(missing_ok=True)
     return report
+
+
+def _read(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
+    """The model and the data that a stream is made from."""
+    if isinstance(recipe, StreamRecipe):
+        return (recipe.encoder, recipe.path)
+    return (recipe.backbone, *(recipe.demos.paths or ()))
 
 
 def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> None:

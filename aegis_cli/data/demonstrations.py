@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -289,6 +289,7 @@ def load(
     workers: int | None = None,
     on_event: OnEvent = ignore,
     cache: bool = True,
+    check_text: Callable[[str], None] | None = None,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot dataset, and split them by episode.
 
@@ -302,6 +303,8 @@ def load(
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
         cache: whether all frames of a LeRobot folder's videos are decoded first, into a cache.
             Otherwise each is decoded when it is asked for, unless the cache has them already.
+        check_text: is called with each instruction of a LeRobot folder before its videos are
+            decoded, which may take hours, and raises AegisError for one that cannot be read.
 
     Raises:
         AegisError: demonstrations that are not sound, or too few episodes to hold one out.
@@ -309,7 +312,9 @@ def load(
     here = locate(path, selection)
     split = (validation_share, seed, selection.only)
     if here.is_dir():
-        found = _load_folder(here, split, selection, image_size, workers, cache, on_event)
+        found = _load_folder(
+            here, split, selection, image_size, workers, cache, on_event, check_text
+        )
         return found if here == path else replace(found, datasets=(str(path),))
     artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
     selection.check_file(here)
@@ -402,6 +407,7 @@ def _load_folder(
     workers: int | None,
     cache: bool,
     on_event: OnEvent,
+    check_text: Callable[[str], None] | None,
 ) -> Demonstrations:
     found = dataset.load(path, selection.rename)
     cameras = found.cameras(selection.camera)
@@ -412,6 +418,9 @@ def _load_folder(
     proprio, proprio_names = _vectors(source, selection.state)
     actions, action_names = _vectors(source, selection.action)
     digests = sources.digests(source, cameras)
+    if check_text is not None:
+        for number in np.unique(index.task[torch.cat([train, validation]).numpy()]).tolist():
+            check_text(found.tasks[number])
     frames: list[Frames] = []
     mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):

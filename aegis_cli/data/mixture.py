@@ -8,7 +8,7 @@ that of all training frames.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -54,6 +54,7 @@ def load(
     workers: int | None = None,
     on_event: OnEvent = ignore,
     cache: bool = True,
+    check_text: Callable[[str], None] | None = None,
 ) -> Demonstrations:
     """Read one set of demonstrations as `demonstrations.load` does, or several and join them.
 
@@ -69,7 +70,15 @@ def load(
         _check_alike(chosen, selection)
     found = [
         demonstrations.load(
-            path, validation_share, seed, selection, image_size, workers, on_event, cache
+            path,
+            validation_share,
+            seed,
+            selection,
+            image_size,
+            workers,
+            on_event,
+            cache,
+            check_text,
         )
         for path in chosen
     ]

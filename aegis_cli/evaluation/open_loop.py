@@ -201,6 +201,7 @@ def run(
         seed=seed,
         traces=_traces(policy, meta, shown, chosen, seed, batch_size) if traced else [],
     )
+    _warn_of_standing_still(report, on_event)
     if keep:
         asked = {"episodes": None if episodes is None else list(episodes), "frames": frames}
         asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
@@ -208,6 +209,17 @@ def run(
         name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
         results.keep_if_possible(run, name, report.kept(), asked, on_event)
     return report
+
+
+def _warn_of_standing_still(report: OpenLoopReport, on_event: OnEvent) -> None:
+    """Warn of a policy that is no nearer to what was done than a robot that stays where it is."""
+    error, hold = report.relative_error, report.hold_error
+    if error is not None and hold is not None and error >= hold:
+        text = (
+            f"the policy's error of {error:.3f} is not below {hold:.3f}, which the current "
+            "position has if it is repeated: it predicts the motion no better than standing still"
+        )
+        on_event(Warned("evaluate", text))
 
 
 # --- which episodes -------------------------------------------------------------------------------

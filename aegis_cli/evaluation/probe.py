@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +69,7 @@ class ProbeReport:
     The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
     questions left out. `w2_between` names what the anchor was measured on, another question set or
     robot frames, and the probe's questions, where these are two: then part of W2 is their own.
+    `asked` is what the command was to measure, and how.
     """
 
     accuracy: float
@@ -87,6 +89,7 @@ class ProbeReport:
     baseline_soft_accuracy: float | None = None
     skipped: int = 0
     w2_between: str | None = None
+    asked: dict[str, Any] | None = field(default=None, compare=False)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -155,8 +158,14 @@ def run(
         if before is not None:
             reference, then = _answered(before, asked, measured, batch_size, ranks, on_event)
     layers = _layers(now, then)
-    between = None if anchor is None else two_sets(anchor, source.name)
+    between = None if anchor is None else two_sets(anchor, source.name, ask)
+    if between is not None and anchor is not None and layers:
+        _warn_of_another_prompt(anchor, source.name, ask, on_event)
+    settings = {"vqa": vqa, "ask": ask, "questions": questions, "seed": seed}
+    settings |= {"baseline": baseline, "max_drop": max_drop, "gate": gate}
     report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
+    told = {"target": target, **settings, "anchor": None if anchor is None else str(anchor)}
+    report = replace(report, asked=told)
     _warn_of_little_knowledge(report, target if baseline is None else baseline, on_event)
     warn_of_few_questions(report, max_drop, on_event)
     if predictions is not None and ranks.first:
@@ -164,12 +173,9 @@ def run(
         files.write_text(predictions, "".join(lines))
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
-        settings = {"vqa": vqa, "ask": ask, "questions": questions, "seed": seed}
-        settings |= {"baseline": baseline}
-        settings |= {"max_drop": max_drop, "gate": gate}
-        settings |= _path_of(vqa)
         name = f"probe-{source.name}"
-        figures = report.to_json() | wrong
+        figures = replace(report, asked=None).to_json() | wrong
+        settings |= _path_of(vqa)
         results.keep_if_possible(Path(target), name, figures, settings, on_event)
     return report
 
@@ -237,21 +243,25 @@ def warn_of_few_questions(report: ProbeReport, max_drop: float | None, on_event:
 def _warn_of_another_start(
     target: str, baseline: str | None, before: Backbone, on_event: OnEvent
 ) -> None:
-    """Warn where a run is compared with another model than the one that it began from.
-
-    That may be wanted: the run may be the last of several.
-    """
+    """Warn where a run is compared with a model that neither it nor a run before it began from."""
     folder = Path(target)
     if not folder.is_dir() or not (checkpoint.is_one(folder) or checkpoint.begun(folder)):
         return
-    header = artifacts.read_header(checkpoint.chosen(folder) / checkpoint.EXPERT)
     # Only now: of billions of weights a digest takes as long as many answers.
-    if header.inputs.get("backbone") != before.fingerprint():
+    if before.fingerprint() not in _begun_from(folder):
         text = (
             f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
             "difference between two models, and not what this training has cost"
         )
         on_event(Warned("probe", text))
+
+
+def _begun_from(folder: Path) -> set[str | None]:
+    """Digests of the models that a run or a checkpoint began from, and the runs before it."""
+    header = artifacts.read_header(checkpoint.chosen(folder) / checkpoint.EXPERT)
+    run = results.run_of(folder)
+    before = [] if run is None else results.origins(run)
+    return {header.inputs.get("backbone"), *(origin.digest for origin in before)}
 
 
 class Answers(NamedTuple):
@@ -311,15 +321,36 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
     return measured
 
 
-def two_sets(anchor: Path, asked: str) -> str | None:
+def two_sets(anchor: Path, asked: str, prompt: str = sets.PLAIN) -> str | None:
     """What an anchor was measured on and the question set of a probe, if these are two.
 
-    None stands for one and the same set, and for an anchor that names none.
+    None stands for one and the same set that is asked in the same way, and for an anchor that names
+    none.
+
+    Args:
+        prompt: what a question of the probe becomes before a model reads it.
     """
     meta = artifacts.read_header(anchor).meta
     frames = meta.get("demos")
     measured = meta.get("vqa", asked) if frames is None else f"robot frames of {frames}"
-    return None if measured == asked else f"{measured} and {asked}"
+    if measured != asked:
+        return f"{measured} and {asked}"
+    measured_as = meta.get("ask", sets.PLAIN)
+    if frames is not None or "vqa" not in meta or measured_as == prompt:
+        return None
+    return f"{asked} as '{measured_as}' and as '{prompt}'"
+
+
+def _warn_of_another_prompt(anchor: Path, asked: str, prompt: str, on_event: OnEvent) -> None:
+    """Warn of an anchor of the same questions that were asked in another way."""
+    meta = artifacts.read_header(anchor).meta
+    measured_as = meta.get("ask", sets.PLAIN)
+    if meta.get("vqa") == asked and measured_as != prompt:
+        text = (
+            f"the questions of '{anchor}' were asked as '{measured_as}', and these as '{prompt}': "
+            f"part of W2 is the prompt's own; probe with --ask {shlex.quote(measured_as)}"
+        )
+        on_event(Warned("probe", text))
 
 
 def ask(

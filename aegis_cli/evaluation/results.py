@@ -16,15 +16,16 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from aegis_cli import recipes
-from aegis_cli.common import files, locks
+from aegis_cli.common import artifacts, files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.evaluation import kept_figures
 from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
+from aegis_cli.models import backbones
 from aegis_cli.training import checkpoint, folder, inputs, track
 
 FOLDER = "results"
@@ -32,6 +33,7 @@ OPEN_LOOP = "evaluate"  # what the names of its files begin with
 # Which episodes an open-loop evaluation is of.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 _PATIENCE_S = 5.0  # with others who write there
+_LONGEST_CHAIN = 100  # runs that begin from each other
 # What one probe of a checkpoint tells and another of the same questions may not.
 _TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
 
@@ -179,6 +181,36 @@ def run_of(target: Path) -> Path | None:
 def recipe_of(run: Path) -> recipes.Recipe:
     """The recipe that a run of one policy was trained by."""
     return recipes.load(run / "recipe.yaml")
+
+
+class Origin(NamedTuple):
+    """A model that a run began from.
+
+    Attributes:
+        name: as a recipe has it.
+        digest: of its weights; None where the run has no checkpoint that tells.
+    """
+
+    name: str
+    digest: str | None
+
+
+def origins(run: Path) -> list[Origin]:
+    """The models that a run began from: its own backbone, and that one's own where it is a run.
+
+    The last of them is the VLM that nothing of ours has trained.
+    """
+    found: list[Origin] = []
+    while True:
+        expert = run / "checkpoints" / checkpoint.LAST / checkpoint.EXPERT
+        header = artifacts.read_header(expert) if expert.is_file() else None
+        digest = None if header is None else header.inputs.get("backbone")
+        found.append(Origin(recipe_of(run).backbone, digest))
+        before = run_of(Path(backbones.divided(found[-1].name)[0]))
+        # A run that was copied to where it began from would begin from itself.
+        if before is None or len(found) > _LONGEST_CHAIN:
+            return found
+        run = before
 
 
 def _run_and_step(target: Path) -> tuple[Path, int | None] | None:

@@ -141,7 +141,13 @@ def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None
     if marked is None:
         return False
     gradient, (known, written) = parameter.grad, marked
-    return gradient is known and (gradient is None or gradient._version == written)
+    if gradient is None or known is None:
+        return gradient is known
+    if known._version != written:
+        return False
+    # DistributedDataParallel with gradient_as_bucket_view puts gradients into buckets that it makes
+    # anew before the second forward pass: other tensors of the same values.
+    return gradient is known or torch.equal(rows_here(gradient), rows_here(known))
 
 
 def take_back(total: Accumulation, groups: Groups) -> None:

@@ -30,6 +30,7 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, folder
+from aegis_cli.training.up_to_date import refuse_unfinished
 
 # What a merged checkpoint and a report of `aegis run` tell alike.
 _TOLD_OF_MERGES = ("method", "strength", "damping", "base", "kept", "validation_loss")
@@ -63,6 +64,7 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
             return _hub_model(inside)
         if (inside / "model.safetensors").is_file():
             return file.inspect(inside / "model.safetensors")
+    refuse_unfinished(path, "inspect")
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
@@ -182,6 +184,7 @@ def _run_facts(
         "method": header.meta.get("method"),
         "task": header.meta.get("task", settings.task),
         "recipe": settings.name,
+        "backbone": settings.backbone,
         "seed": settings.seed,
         "steps": _steps(path, metrics) if until is None else until,
         "planned_steps": settings.train.steps,
@@ -199,8 +202,8 @@ def _data_facts(header: Header, demos: Demos) -> dict[str, Any]:
         facts["cameras"] = cameras
     if dataset_id := header.meta.get("dataset"):
         facts["dataset"] = dataset_id
-    if isinstance(demos.path, tuple):
-        facts["demos"] = list(demos.path)
+    if demos.path is not None:
+        facts["demos"] = demos.path if isinstance(demos.path, str) else list(demos.path)
     if demos.rename is not None:
         facts["rename"] = dict(demos.rename)
     if demos.weights is not None:

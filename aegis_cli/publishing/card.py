@@ -284,10 +284,14 @@ def _evaluated(open_loops: Sequence[Result]) -> Iterator[str]:
         cell = "actions did not vary" if error is None else f"{error:.3f}"
         if interval is not None:
             cell += f" ({interval[0]:.3f} to {interval[1]:.3f})"
+        if figures.get("hold_error") is not None:
+            cell += f"; hold's {figures['hold_error']:.3f}"
         yield f"| {evaluated_on(figures)} | {figures['frames']:,} | {cell} |"
     yield ""
     yield "Open loop: each prediction begins at a recorded frame, and nothing is executed. The"
     yield "error is squared, over the variance of the training's actions: their mean has 1."
+    if any(result.figures.get("hold_error") is not None for result in open_loops):
+        yield "Hold is the current position, repeated."
 
 
 def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:

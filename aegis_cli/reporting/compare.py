@@ -54,6 +54,7 @@ class ComparedRun:
     open_loop_on: str | None
     open_loop_error: float | None
     open_loop_interval: Interval
+    hold_error: float | None
     w2: float | None
     energy_shed: float | None
     loss: float | None
@@ -270,6 +271,7 @@ def _compared(
         open_loop_on=None if evaluated is None else results.evaluated_on(open_loop),
         open_loop_error=open_loop.get("relative_error"),
         open_loop_interval=open_loop.get("relative_interval"),
+        hold_error=open_loop.get("hold_error"),
         w2=statistics.fmean(layers) if layers else None,
         energy_shed=found.energy_shed_mean,
         loss=found.loss,

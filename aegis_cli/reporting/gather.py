@@ -247,11 +247,19 @@ def _anchor(
     if _jobs_report(path).is_file():  # by `aegis run`, which measures the recipe's own
         asked = f"questions of {recipe.anchor.vqa}"
         what = "robot frames" if recipe.anchor.source == "demos" else asked
-        return AnchorUse(f"{recipe.anchor.samples} {what}", read)
+        return AnchorUse(f"{_samples(path, recipe):,} {what}", read)
     if not read:
         return AnchorUse("a file given to aegis probe", read)
     digest = artifacts.read_header(path / "ledger.safetensors").inputs.get("anchor", "unknown")
     return AnchorUse(f"a file with sha256 {digest[:12]}", read)
+
+
+def _samples(path: Path, recipe: recipes.Recipe) -> int:
+    """How many the anchor of a job was measured on; a set may have fewer than the recipe asks."""
+    file = path.parent / "anchor.safetensors"
+    header = artifacts.read_header(file) if file.is_file() else None
+    found = None if header is None else header.meta.get("samples")
+    return found if isinstance(found, int) else recipe.anchor.samples
 
 
 def _commands(

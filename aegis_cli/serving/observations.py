@@ -123,8 +123,14 @@ class Reader:
         return self._finite(f"'{STATE}'", self._array(STATE, state))
 
     def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
-        if found.dtype.kind not in "iuf" or not np.isfinite(found).all():
-            raise self._wrong(f"{what} of type {found.dtype} that holds no finite numbers")
+        if found.dtype.kind not in "iuf":
+            raise self._wrong(f"{what} of type {found.dtype}, which is no number's")
+        if not np.isfinite(found).all():
+            raise AegisError(
+                f"{what} with {found[~np.isfinite(found)].flat[0]}",
+                "finite numbers",
+                "read the robot's state again before it is sent",
+            )
         return found.astype(np.float32)
 
     def _array(self, key: str, value: Any) -> np.ndarray:

@@ -132,6 +132,14 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
         return ""
+    sets = [naive, *naive.others.values()]
+    if all(asked.baseline_accuracy <= asked.majority_accuracy for asked in sets):
+        before, common = 100 * naive.baseline_accuracy, 100 * naive.majority_accuracy
+        return (
+            f"The VLM answered {before:.1f} % of the questions before training, where always the "
+            f"commonest answer has {common:.1f} %: these questions cannot show what was lost. See "
+            "anchor.ask and probe.ask."
+        )
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."

@@ -642,7 +642,11 @@ class PolicyRunner:
             anchor,
             on_event=on_event,
         )
-        between = probe.two_sets(measured.path, self.source(settings).name) if layers else None
+        between = (
+            probe.two_sets(measured.path, self.source(settings).name, settings.ask)
+            if layers
+            else None
+        )
         report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
         probe.check_trained(report, recipe.train.steps)
         probe.warn_of_few_questions(report, settings.max_drop, on_event)

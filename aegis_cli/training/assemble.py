@@ -322,12 +322,13 @@ def _read(
     device = devices.pick()
     # What is to be cut stays on the CPU: a GPU may have room for its share alone.
     backbone = backbones.load(recipe.backbone).to("cpu" if _shards(recipe.train, ranks) else device)
-    recorded = _loaded(recipe, backbone, demos, on_event, ranks)
-    _warn_of_no_instruction(demos, recorded, on_event)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
     _check_parts(method, measured, recipe)
+    # Last, since it may decode hours of video.
+    recorded = _loaded(recipe, backbone, demos, on_event, ranks)
+    _warn_of_no_instruction(demos, recorded, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -446,6 +447,7 @@ def load_demonstrations(
         backbone.image_size,
         on_event=on_event,
         cache=recipe.demos.cache,
+        check_text=backbone.check_prompt,
     )
     if found.task not in (None, recipe.task):
         raise AegisError(

@@ -28,6 +28,7 @@ from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import (
     assemble,
     checkpoint,
+    inputs,
     longer,
     optimizers,
     parallel,
@@ -139,7 +140,8 @@ def run(
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
-            longer.check(out, recipe, resume, overwrite, on_event)
+            places = inputs.Inputs.given(demos, anchor)
+            longer.check(out, recipe, resume, overwrite, places, on_event)
         return _planned(recipe, demos, anchor, out, overwrite, on_event, ranks)
 
 

@@ -8,7 +8,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ MERGE_REPORT = "merge.json"  # in the merged run; an earlier Aegis wrote it into
 _FILES = (
     "recipe.yaml",
     METRICS,
-    "*.safetensors",
+    *(f"{name}.safetensors" for name in ("ledger", "state", "expert", "experts", "routing")),
     *(JOBS_REPORT, MERGE_REPORT, "probe*.json", "rollout*.json", "evaluate*.json"),
     *(machine.NAME, inputs.NAME, "report.html"),
     *("*_matrix.json", "parameters.json", "stream.json"),
@@ -38,10 +38,20 @@ _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
 
 
-def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> None:
+def check(
+    out: Path,
+    recipe: Trained,
+    resume: bool,
+    overwrite: bool = False,
+    read: Iterable[str | Path | None] = (),
+) -> None:
     """Refuse an existing run unless it is to be continued, and with the recipe it began with.
 
-    With `overwrite` any run may be there, if it holds nothing but what Aegis has written.
+    With `overwrite` any run may be there, if it holds nothing but what Aegis has written, and
+    nothing that the new one is made from.
+
+    Args:
+        read: models and data that the new one is made from.
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -53,6 +63,7 @@ def check(out: Path, recipe: Trained, resume: bool, overwrite: bool = False) -> 
             )
         return
     if overwrite:
+        _check_read(out, read)
         _check_own(out)
         return
     if not resume:
@@ -187,6 +198,20 @@ def _check_own(out: Path) -> None:
             "a run without files of somebody else",
             f"move it: mv '{foreign}' ELSEWHERE; or choose another --out",
         )
+
+
+def _check_read(out: Path, read: Iterable[str | Path | None]) -> None:
+    """Raise AegisError where what is read lies in the run that is to be overwritten."""
+    run = out.resolve()
+    for place in read:
+        if place is None or not (path := Path(place)).exists():
+            continue  # what ships, and what lies on the hub
+        if path.resolve().is_relative_to(run):
+            raise AegisError(
+                f"'{place}' in the run '{out}', which is to be overwritten",
+                "models and data that lie elsewhere",
+                "choose another --out; or copy it to another place first, and name that",
+            )
 
 
 def remove(out: Path) -> None:

@@ -12,8 +12,9 @@ from pathlib import Path
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
+from aegis_cli.models import backbones
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import checkpoint, folder
+from aegis_cli.training import checkpoint, folder, inputs
 from aegis_cli.training.schedule import rate_factor
 
 
@@ -36,16 +37,26 @@ def plan(out: Path, recipe: Recipe) -> Recipe:
     return planned if folder.continues(out, planned) or lengthens(out, planned) else recipe
 
 
-def check(out: Path, recipe: Recipe, resume: bool, overwrite: bool, on_event: OnEvent) -> None:
+def check(
+    out: Path,
+    recipe: Recipe,
+    resume: bool,
+    overwrite: bool,
+    places: inputs.Inputs,
+    on_event: OnEvent,
+) -> None:
     """Refuse an existing run as `folder.check` does, but for one that has ended and goes on.
 
     Args:
         recipe: by which it goes on, as `plan` says.
+        places: of what it learns from.
     """
     if resume and lengthens(out, recipe):
         _check_ended(out, recipe, on_event)
     else:
-        folder.check(out, recipe, resume, overwrite)
+        models = (backbones.divided(recipe.backbone)[0], recipe.expert.start)
+        read = (*models, *places.demos, places.anchor)
+        folder.check(out, recipe, resume, overwrite, read)
 
 
 def lengthens(out: Path, recipe: Recipe) -> bool:

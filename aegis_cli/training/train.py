@@ -122,7 +122,7 @@ def run(
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
-            longer.check(out, recipe, resume, overwrite, on_event)
+            longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:

@@ -571,11 +571,12 @@ def test_a_single_episode_is_no_number_of_episodes() -> None:
 
 def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
     shown = text_of(open_loop(open_loop_report()))
-    assert re.search(r"relative error +0\.360 \(0\.300 to 0\.420\)", shown)
+    assert re.search(r"relative error +0\.360 \(0\.300 to 0\.420\); hold's 0\.\d+", shown)
     assert re.search(r"trained on +4\b", shown) and "Hold's RMSE" in shown
     assert re.search(r"pan +0\.5 +0\.75 +1\.25 +0\.360 +0\.875", shown)
     steps = [int(m[1]) for m in re.finditer(r"^ +(\d+) +\d+ +\d\.\d+ +\d\.\d+ *$", shown, re.M)]
-    assert len(steps) == 8 and (steps[0], steps[-1]) == (1, 30)
+    assert len(steps) == 16 and (steps[0], steps[-1]) == (1, 30)
+    assert "16 of 30 steps ahead" in shown
 
 
 def instruction_errors(count: int) -> list[InstructionError]:

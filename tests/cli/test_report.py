@@ -210,7 +210,7 @@ def test_an_anchor_that_no_training_read_is_what_the_drift_is_measured_against(
     assert "--anchor" in document["commands"][0]
     files.save_json(naive / "train.json", {"method": "naive"})
     _, document = reported(aegis, naive)
-    assert document["anchor"]["measured_on"] == "3000 questions of scenes"
+    assert document["anchor"]["measured_on"] == "3,000 questions of scenes"
 
 
 def test_an_anchor_that_nothing_used_is_not_told(aegis, job: Path) -> None:
@@ -309,7 +309,7 @@ def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
 def test_a_job_that_is_not_finished_says_so(aegis, job: Path) -> None:
     (job / "table.json").unlink()
     (job / "stages.json").write_text("{}")
-    for command in ("report", "compare"):
+    for command in ("report", "compare", "inspect"):
         said = refused(aegis(command, job))
         assert "has not finished" in said and "call the same aegis run again" in said
         assert f"aegis {command} {job / 'aegis'}" in said

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from aegis_cli.common import interrupts
-from aegis_cli.common.interrupts import Stopped, deferred, listening
+from aegis_cli.common.interrupts import Stopped, deferred, ending_at_once, listening
 
 ENDING = [signal.SIGTERM, signal.SIGHUP]
 
@@ -42,6 +42,18 @@ def test_a_signal_from_outside_is_an_interruption(number: int) -> None:
         send(number)
     assert caught.value.number == number and isinstance(caught.value, KeyboardInterrupt)
     assert signal.getsignal(number) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
+def test_a_process_that_waits_for_others_ends_at_once(number: int) -> None:
+    """A handler of Python's would run only once the others have come."""
+    with listening():
+        with ending_at_once():
+            assert signal.getsignal(number) is signal.SIG_DFL
+        assert signal.getsignal(number) is interrupts.stop
+    with ending_at_once():  # what nobody listens to stays
+        expected = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        assert signal.getsignal(number) is expected
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])

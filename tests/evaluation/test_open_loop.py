@@ -156,6 +156,19 @@ def test_the_current_position_is_compared_with_where_actions_are_positions(
         assert found.dimensions[1].hold_rmse == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(("error", "warned"), [(0.2, False), (0.25, True), (0.6, True)])
+def test_a_policy_that_is_no_better_than_standing_still_is_told(error: float, warned: bool) -> None:
+    names = ("a.pos", "b.pos")
+    found = open_loop.compare(
+        recorded(names, names), EVERY, recorded().chunks(EVERY, CHUNK)[0], SPREAD
+    )
+    seen: list[Event] = []
+    report = dataclasses.replace(found, relative_error=error, hold_error=0.25)
+    open_loop._warn_of_standing_still(report, seen.append)
+    open_loop._warn_of_standing_still(dataclasses.replace(report, hold_error=None), seen.append)
+    assert len(seen) == warned
+
+
 def test_dimensions_without_a_name_have_a_number() -> None:
     assert open_loop.action_names(recorded()) == ["action 0", "action 1"]
     assert open_loop.action_names(recorded(("a", ""))) == ["a", "action 1"]

@@ -8,6 +8,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ from aegis_cli.core.moments import empty, merge
 from aegis_cli.data.vqa.dataset import load_scenes
 from aegis_cli.data.vqa.metrics import Graded, wilson_interval
 from aegis_cli.data.vqa.questions import FAMILIES, Question
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import probe, results
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Anchor as Settings
@@ -443,6 +444,43 @@ def test_a_baseline_that_the_run_did_not_begin_from_is_told(
         said[baseline] = [event.text for event in seen if isinstance(event, Warned)]
     assert said[taught] == []
     assert "is not the model that" in said[broken][0]
+
+
+def test_a_run_that_begins_with_another_run_is_held_against_the_vlm(
+    taught: Path, demos_file: Path, tmp_path: Path, aegis: Any
+) -> None:
+    """The model that it began from has lost already what the first run has cost."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    train.run(recipe(taught), "naive", demos_file, None, first)
+    train.run(recipe(first), "stop-gradient", demos_file, None, second)
+    assert [origin.name for origin in results.origins(second)] == [str(first), str(taught)]
+    said: dict[Path, list[str]] = {}
+    for baseline in (taught, first):
+        seen: list[Event] = []
+        probe.run(str(second), "scenes", 20, str(baseline), None, None, on_event=seen.append)
+        said[baseline] = [event.text for event in seen if isinstance(event, Warned)]
+    assert said == {taught: [], first: []}
+    command = ("probe", second, "--questions", "20", "--max-drop", "100", "--json")
+    code, out, err = aegis(*command)
+    asked = json.loads(out)["asked"]
+    assert code == 0 and f"'{taught}'" in err and f"by way of {first}" in err
+    assert asked["baseline"] == str(taught) and asked["target"] == str(second)
+    assert (asked["vqa"], asked["questions"], asked["gate"]) == ("scenes", 20, "mean")
+    for measured_on in (first, taught):  # an anchor belongs to one of them
+        anchor = tmp_path / f"{measured_on.name}.safetensors"
+        measure.run(str(measured_on), Settings(samples=20, parts=("moments",)), anchor)
+        code, out, err = aegis("probe", second, "--questions", "20", "--anchor", anchor, "--json")
+        assert code == 0 and json.loads(out)["asked"]["baseline"] == str(measured_on), err
+
+
+def test_a_drift_between_two_prompts_says_so(taught: Path, tmp_path: Path) -> None:
+    anchor = tmp_path / "anchor.safetensors"
+    measure.run(str(taught), Settings(samples=20, ask="what {}", parts=("moments",)), anchor)
+    seen: list[Event] = []
+    report = probe.run(str(taught), "scenes", 20, str(taught), anchor, None, on_event=seen.append)
+    assert report.w2_between == "scenes as 'what {}' and as '{}'"
+    assert any("--ask 'what {}'" in event.text for event in seen if isinstance(event, Warned))
+    assert probe.two_sets(anchor, "scenes", "what {}") is None
 
 
 def test_a_run_is_asked_the_questions_that_its_recipe_names(

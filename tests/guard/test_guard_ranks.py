@@ -80,12 +80,14 @@ def test_processes_do_what_one_does_with_the_batches_of_all(
         torch.testing.assert_close(rows[name], values, rtol=1e-6, atol=1e-12)
 
 
-def test_processes_that_send_only_the_last_of_a_steps_passes_do_what_one_does(
-    trained: tuple[Path, dict[str, Path]],
+@pytest.mark.parametrize("sends_each", [False, True])
+def test_processes_that_send_each_or_the_last_of_a_steps_passes_do_what_one_does(
+    trained: tuple[Path, dict[str, Path]], sends_each: bool
 ) -> None:
+    """Out of buckets, too, that DistributedDataParallel makes anew in the second pass."""
     folder, paths = trained
     (one, rows), (other, its) = (
-        torch.load(folder / f"aegis-parts-{rank}.pt") for rank in range(WORLD)
+        torch.load(folder / f"aegis-parts-{sends_each}-{rank}.pt") for rank in range(WORLD)
     )
     alone, expected = train_alone(paths["aegis"], PARTS, layers=LAYERS)
     assert torch.equal(one, other)

@@ -362,6 +362,19 @@ def test_a_file_that_is_missing_or_cut(
     bad(*MEASURE, "model", says=("model",))
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_an_adapter_of_peft_is_refused_with_what_makes_a_model_of_it(
+    alone: bool, bad: Bad, model: Path
+) -> None:
+    """transformers would put it into the model, whose checkpoints then could not be written."""
+    (model / "adapter_config.json").write_text('{"peft_type": "LORA"}')
+    if alone:
+        (model / "config.json").unlink()
+        for weights in model.glob("*.safetensors"):
+            weights.rename(model / "adapter_model.safetensors")
+    bad(*MEASURE, "model", says=("adapter", "merge_and_unload"))
+
+
 def test_weights_that_git_lfs_has_not_fetched(bad: Bad, model: Path) -> None:
     (model / "model.safetensors").write_text(LFS_POINTER)
     for command in ((*MEASURE, "model"), ("inspect", "model")):

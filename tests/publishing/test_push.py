@@ -278,13 +278,14 @@ def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_wher
     evaluated = Result("evaluate-validation-arm", open_loop(1, 2, data="/home/somebody/arm"), {})
     played = PlayedResult("rollout-seen", rollout_figures("seen", 0.75), {}, Played(0, 4, None))
     alone = card.inspection.InspectReport("run", "x", {}, open_loops=(evaluated,))
-    line = "| 2 held-out episodes of arm | 50 | 0.250 (0.125 to 0.375) |"
+    line = "| 2 held-out episodes of arm | 50 | 0.250 (0.125 to 0.375); hold's 0.500 |"
     lines = [*card._acting(alone)]
     assert line in lines and not any("Not measured" in each for each in lines)
     both = [*card._acting(dataclasses.replace(alone, rollouts=(played,)))]
     assert line in both and any(each.startswith("| reach | seen | 4 | 75.0 %") for each in both)
     # A Markdown table ends with an empty line.
     assert both[both.index(lines[0]) - 1] == "" and lines[lines.index(line) + 1] == ""
+    assert any("Hold is" in each for each in lines)
 
 
 @pytest.mark.parametrize(("method", "reads"), [("naive", False), ("nullspace", True)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from aegis_cli.data.lerobot.write import Limits, NewEpisode, Spec
 
 STATE, ACTION = ("x", "y", "z"), ("dx", "dy")
 TEXTS = ("go to the red pad", "go to the blue pad", 'grüße "the" robot')
+READABLE = ("move the finger to the red target",)  # by the embedded model
 SPEC = Spec(10.0, STATE, ACTION, "arm")
 
 
@@ -38,6 +39,7 @@ def episodes(
     size: tuple[int, int] = (16, 24),
     seed: int = 0,
     smooth: bool = False,
+    texts: Sequence[str] = TEXTS,
 ) -> list[NewEpisode]:
     """Episodes of 1 to 9 frames of noise; `smooth` frames have one colour, fit for video."""
     rng = np.random.default_rng(seed)
@@ -57,7 +59,7 @@ def episodes(
             {camera: pictures(length) for camera in cameras},
             state,
             actions,
-            TEXTS[number % len(TEXTS)],
+            texts[number % len(texts)],
         )
 
     return [episode(number) for number in range(count)]

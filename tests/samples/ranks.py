@@ -49,8 +49,9 @@ def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
             found = _trained(rank, name, paths[name], share)
             torch.save(found, Path(folder) / f"{name}-{way}-{rank}.pt")
         if name == "aegis":
-            found = _trained_in_parts(rank, paths[name])
-            torch.save(found, Path(folder) / f"aegis-parts-{rank}.pt")
+            for sends_each in (False, True):
+                found = _trained_in_parts(rank, paths[name], sends_each)
+                torch.save(found, Path(folder) / f"aegis-parts-{sends_each}-{rank}.pt")
             with pytest.raises(AegisError, match="sharded weights and a second backward pass"):
                 _trained(rank, name, paths[name], _sharded, automatic=True)
         else:
@@ -105,19 +106,22 @@ def _trained(
     return weights, guard.ledger.tensors()
 
 
-def _trained_in_parts(rank: int, path: Path) -> tuple[Tensor, dict[str, Tensor]]:
+def _trained_in_parts(rank: int, path: Path, sends_each: bool) -> tuple[Tensor, dict[str, Tensor]]:
     """The same in a loop that calls nothing of the guard, a step's gradients in two passes.
 
-    The first one sends nothing, as accelerate and Trainers have it.
+    Args:
+        sends_each: whether each of them sends what it has found, out of buckets that the gradients
+            lie in; else the first one sends nothing, as accelerate and Trainers have it.
     """
-    model, called = _copied(make())
+    model = make()
+    called = DistributedDataParallel(model, gradient_as_bucket_view=sends_each)
     guard = Guard(model, path, LAYERS, process_group="world")
     guard.automatic(mask="mask", image=lambda _: IMAGE)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for index in range(STEPS):
         for part in range(PARTS):
             last = part == PARTS - 1
-            with contextlib.nullcontext() if last else called.no_sync():
+            with contextlib.nullcontext() if last or sends_each else called.no_sync():
                 seed = WORLD * (PARTS * index + part) + rank
                 (task_loss(called, seed) / PARTS).backward()
         optimizer.step()

@@ -128,5 +128,5 @@ def test_lerobots_observation_without_a_text_or_a_camera_is_one_error(seen: dict
         Reader(policy).read(one | {"prompt": TEXT, b"other": 1})
     unknown = {"observation.state": [[np.nan] * 3], "a.pos": np.nan}
     bad = {name: value for name, value in unknown.items() if name in seen}
-    with pytest.raises(AegisError, match="positions of type float"):
+    with pytest.raises(AegisError, match="positions with nan"):
         Reader(policy).read(seen | bad | {"task": TEXT})

@@ -113,7 +113,7 @@ def test_a_robot_that_moves_meanwhile_gets_a_chunk_that_continues_its_own() -> N
             ((previous, 4), "a delay of 4 actions"),
             ((previous[:, :1], 0), "previous actions of shape (3, 1)"),
             (("none", 0), "'previous_actions' of type"),
-            ((None, 1), "a delay of 1 actions, where 0 are left"),
+            ((None, 1), "a delay of 1 actions, and no previous actions"),
         ):
             refused = client.infer({**seen, **dict(zip(names, wrong, strict=True))})
             assert isinstance(refused, str) and said in refused
@@ -162,8 +162,8 @@ def test_a_message_that_is_no_observation_gets_an_error_and_ends_nothing(
     [
         ({"observation/state": np.zeros(4)}, "positions of shape (4,)"),
         ({"observation/state": np.zeros((1, 3))}, "positions of shape (1, 3)"),
-        ({"observation/state": np.full(3, np.nan)}, "no finite numbers"),
-        ({"observation/state": ["a", "b", "c"]}, "no finite numbers"),
+        ({"observation/state": np.full(3, np.nan)}, "'observation/state' with nan"),
+        ({"observation/state": ["a", "b", "c"]}, "which is no number's"),
         ({"observation/state": [[1], [1, 2]]}, "no array"),
         ({"observation/image": np.zeros((3, 64, 64), np.uint8)}, "shape (3, 64, 64)"),
         ({"observation/image": np.zeros((64, 64, 3))}, "type float64"),

@@ -697,6 +697,16 @@ def test_the_verdict_is_on_the_questions_that_most_was_lost_of(
     assert says in pipeline.verdict(rows)
 
 
+def test_the_verdict_on_questions_that_the_vlm_could_not_answer_is_no_verdict_on_methods() -> None:
+    rows = [
+        replace(row, baseline_accuracy=0.0, majority_accuracy=0.3)
+        for row in figured(naive=(0, 0.95), kfac=(0, 0.9))
+    ]
+    said = pipeline.verdict(rows)
+    assert said.startswith("The VLM answered 0.0 % of the questions before training")
+    assert "30.0 %" in said and "probe.ask" in said
+
+
 def test_an_anchor_of_answers_that_the_backbone_is_sure_of_is_warned_of(tmp_path: Path) -> None:
     settings = Anchor(samples=60, vqa="easy-vqa", parts=("curvature",))
     events: list[Event] = []

@@ -228,6 +228,36 @@ def test_nothing_is_overwritten_where_something_is_wrong(
     refused("not a run", start, "naive", tmp_path / "other", overwrite=True)
 
 
+@pytest.mark.parametrize("what", ["backbone", "expert", "demos", "anchor"])
+def test_nothing_is_overwritten_that_the_new_run_is_made_from(
+    what: str, start: Start, recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
+) -> None:
+    run, link = tmp_path / "run", tmp_path / "link"
+    start("naive", run)
+    link.symlink_to(run)
+    given = {"demos": link / "expert.safetensors", "anchor": link / "state.safetensors"}
+    shutil.copy(demos_file, given["demos"])
+    shutil.copy(anchor_file, given["anchor"])
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    changed: dict[str, Any] = {}
+    if what in given:
+        changed[what] = given[what]
+    elif what == "backbone":
+        changed["recipe"] = replace(recipe, backbone=str(link))
+    else:
+        changed["recipe"] = replace(recipe, expert=replace(recipe.expert, start=str(link)))
+    error = refused("which is to be overwritten", start, "aegis", run, overwrite=True, **changed)
+    assert "another --out" in error.fix
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_somebodys_artifact_in_a_run_is_not_removed_with_it(start: Start, tmp_path: Path) -> None:
+    start("naive", tmp_path)
+    shutil.copy(tmp_path / "ledger.safetensors", tmp_path / "anchor.safetensors")
+    refused("not written", start, "naive", tmp_path, overwrite=True)
+    assert (tmp_path / "anchor.safetensors").is_file()
+
+
 def test_a_folder_with_other_things_is_not_a_run(start: Start, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     refused("not a run", start, "naive", tmp_path)

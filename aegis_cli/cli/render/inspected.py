@@ -184,15 +184,15 @@ def _features(features: Sequence[Any]) -> Table:
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))
         columns = [feature.statistics.get(name, ()) for name in shown]
-        for i in range(max(1, *map(len, columns))):
-            own = (
-                f"{feature.name} {feature.components[i]}".rstrip()
-                if i < len(feature.components)
-                else feature.name
-            )
-            rows.append(
-                (own, *kind, *(number(column[i]) if i < len(column) else "-" for column in columns))
-            )
+        count = max(1, *map(len, columns))
+        parts = list(feature.components)
+        if count == 1 and feature.dtype in ("image", "video"):
+            parts = []  # without statistics, nothing is told of a picture's colours
+        names = [f"{feature.name} {part}".rstrip() for part in parts]
+        names += [feature.name] * (count - len(names))
+        for i, name in enumerate(names):
+            figures = [number(column[i]) if i < len(column) else "-" for column in columns]
+            rows.append((name, *kind, *figures))
     return plain_table(("Feature", "Type", "Shape", *shown), rows, left=3)
 
 
@@ -297,6 +297,7 @@ def _columns(report: Any) -> dict[str, Callable[[Any], str]]:
         "Return % of highest": lambda r: percent(r.return_share),
         "Open loop on": lambda r: (r.open_loop_on or "-") if elsewhere else "-",
         _OPEN_LOOP: lambda r: fixed(r.open_loop_error, 3),
+        "Hold's": lambda r: fixed(r.hold_error, 3),
         "W2²": lambda r: number(r.w2),
         "Energy shed %": lambda r: percent(r.energy_shed, 2),
         _VALIDATION: lambda r: fixed(r.validation_loss, 4),

@@ -17,7 +17,7 @@ from aegis_cli.cli.render.tables import pairs
 
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
 _TITLE_CHARACTERS = 44  # of a line of the title, for each episode beside another
-_ROWS = 8  # of the table by steps ahead
+_ROWS = 16  # of the table by steps ahead
 _WIDEST = 100  # characters of an instruction
 _INSTRUCTIONS = 10  # rows of the table by instruction
 _SPLITS = {
@@ -34,6 +34,8 @@ def open_loop(report: Any) -> RenderableType:
     if report.relative_interval is not None:
         low, high = (fixed(end, 3) for end in report.relative_interval)
         error += f" ({low} to {high})"
+    if report.hold_error is not None:
+        error += f"; hold's {fixed(report.hold_error, 3)}"
     facts = {
         "data": report.data,
         # A lone number would be read as how many there are.
@@ -83,7 +85,8 @@ def _by_step(report: Any) -> Table:
         step = report.horizon[at]
         line = (str(step.step), f"{step.frames:,}", fixed(step.relative_error, 3))
         lines.append(line if report.hold_error is None else (*line, fixed(step.hold_error, 3)))
-    return plain_table(header, lines, left=0)
+    title = None if rows == count else f"{rows} of {count} steps ahead; --json has all"
+    return plain_table(header, lines, left=0, title=title)
 
 
 def _by_instruction(report: Any) -> Iterator[RenderableType]:

@@ -17,7 +17,7 @@ from aegis_cli.common.files import parse_json, reading, sha256_file
 from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask, has_one_gap
 
-TEMPLATE = "a photo of a {}."
+TEMPLATE = "a photo of a {}"  # without a full stop, which the embedded encoder cannot read
 # A file in a task's folder, with words for the class folders whose names are not said so.
 CLASSES = "classes.json"
 TEMPLATES = "templates.txt"

@@ -19,6 +19,7 @@ from aegis_cli.models.backbones.dual import DualEncoder
 EMBEDDED, EMBEDDED_EASY = shipped.EMBEDDED, shipped.EMBEDDED_EASY
 EMBEDDED_DUAL = shipped.EMBEDDED_DUAL
 SHIPPED = shipped.FILES
+_LOCAL = ("runs/", "models/")  # folders of ours in recipes and docs, whose names are like ids
 
 
 def locate(name: str) -> Path:
@@ -172,6 +173,7 @@ def sha256(name: str) -> str:
 
 
 def _no_backbone(name: str) -> AegisError:
+    model_folder.refuse_adapter(Path(name))
     found = f"no backbone at '{name}': " + (
         "no model in it" if Path(name).exists() else "no such file or folder"
     )
@@ -182,7 +184,7 @@ def _no_backbone(name: str) -> AegisError:
     fix = f"check the path, and give it as {model_folder.GIVE}"
     if hub.is_id(name) and not _has_transformers():
         fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
-    elif hub.is_id(name) and not name.startswith("runs/"):
+    elif hub.is_id(name) and not name.startswith(_LOCAL):
         fix += f"; of a model on the hub: hf download {name} --local-dir MODEL"
     return AegisError(found, expected, fix)
 

@@ -180,6 +180,7 @@ def check_path(model: nn.Module, layers: str) -> None:
 
 def check_files(folder: Path, kinds: Container[str]) -> None:
     """Raise AegisError unless the folder is of one of these `kinds` of models, in safetensors."""
+    refuse_adapter(folder)
     path, again = folder / "config.json", "download or export the model again"
     expected = "the configuration of a Hugging Face model"
     try:
@@ -208,6 +209,17 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
             f"no *.safetensors in '{folder}'" + (f", but {', '.join(others)}" if others else ""),
             "weights as safetensors",
             "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
+        )
+
+
+def refuse_adapter(folder: Path) -> None:
+    """Raise AegisError for an adapter: transformers would put it into the model that it loads."""
+    if (folder / "adapter_config.json").is_file():
+        raise AegisError(
+            f"an adapter of PEFT in '{folder}' (adapter_config.json)",
+            "a model without one",
+            "merge the adapter into its model, and save that elsewhere: "
+            "peft_model.merge_and_unload().save_pretrained(FOLDER), with the processor's files",
         )
 
 

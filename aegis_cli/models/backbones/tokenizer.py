@@ -48,7 +48,7 @@ class Tokenizer:
             raise AegisError(
                 f"the word '{unknown[0]}' in '{text}'",
                 f"words among the {known} that the embedded model knows",
-                fix,
+                f"{fix}; texts of any words need a Hugging Face model as the backbone",
             )
         return [self._ids[word] for word in words]
 

@@ -13,7 +13,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from samples.lerobot import data_files, edit_info, edit_table, episodes, replaced, save
+from samples.lerobot import (
+    READABLE,
+    data_files,
+    edit_info,
+    edit_table,
+    episodes,
+    replaced,
+    save,
+)
 from samples.user_folder import LFS_POINTER, TRAIN, training
 
 from aegis_cli.data import demonstrations
@@ -34,13 +42,15 @@ Bad = Callable[..., str]
 
 @pytest.fixture(scope="session")
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save(tmp_path_factory.mktemp("images") / "d")
+    return save(tmp_path_factory.mktemp("images") / "d", episodes(texts=READABLE))
 
 
 @pytest.fixture(scope="session")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(
-        tmp_path_factory.mktemp("videos") / "d", episodes(size=(64, 64), smooth=True), as_video=True
+        tmp_path_factory.mktemp("videos") / "d",
+        episodes(size=(64, 64), smooth=True, texts=READABLE),
+        as_video=True,
     )
 
 
@@ -232,14 +242,35 @@ def test_an_action_size_that_changes_between_files(
 
 
 def test_a_task_without_a_text(bad: Bad, folder: Path) -> None:
-    edit_table(folder / "meta/tasks.parquet", lambda table: table.slice(0, 2))
+    edit_table(folder / "meta/tasks.parquet", lambda table: table.slice(0, 0))
     bad(*FROM_FOLDER, says=("task_index", "tasks.parquet"))
 
 
-def test_a_text_that_the_backbone_cannot_read_is_found_before_training(
-    bad: Bad, folder: Path
+def test_a_text_that_the_backbone_cannot_read_is_found_before_anything_is_decoded(
+    bad: Bad, place: Path
 ) -> None:
-    bad(*FROM_FOLDER, says=("'grüße'", "embedded model knows"))
+    folder = save(place / "d", episodes(size=(64, 64), smooth=True), as_video=True)
+    (folder / VIDEO).write_bytes(b"no video")
+    bad(*FROM_FOLDER, says=("'grüße'", "embedded model knows", "a Hugging Face model"))
+
+
+def test_a_text_of_other_episodes_than_those_that_are_learned_from_does_not_matter(
+    place: Path, aegis: Any
+) -> None:
+    save(place / "d", episodes(3))
+    command = (*FROM_FOLDER, "--set", "demos.only=0-1", "--set", "train.steps=1")
+    code, _, err = aegis(*command)
+    assert code == 0, err
+
+
+def test_an_anchor_that_is_missing_is_told_before_anything_is_decoded(
+    bad: Bad, filmed: Path
+) -> None:
+    (filmed / VIDEO).write_bytes(b"no video")
+    without = list(training(demos="d", method="nullspace"))
+    at = without.index("--anchor")
+    del without[at : at + 2]
+    bad(*without, says=("no anchor for method 'nullspace'",))
 
 
 # --- rows ----------------------------------------------------------------------------------------

@@ -80,6 +80,9 @@ def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> No
     ] == ["a", "b", "c"]
     lines = [line.split() for line in aegis("inspect", folder)[1].splitlines()]
     assert ["action", "float32", "2", *"------"] in lines
+    for name in "abc":
+        assert ["observation.state", name, "float32", "3", *"------"] in lines
+    assert sum(line[:1] == ["observation.images.top"] for line in lines) == 1
 
 
 @pytest.mark.parametrize("as_video", [False, True])

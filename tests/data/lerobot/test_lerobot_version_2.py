@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples.lerobot import as_version_2, edit_info, episodes, save
+from samples.lerobot import READABLE, as_version_2, edit_info, episodes, save
 from samples.user_folder import training
 
 from aegis_cli.data import demonstrations
@@ -262,7 +262,7 @@ def test_an_info_that_is_not_sound(
 
 def test_a_video_that_is_missing(bad: Bad, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(write, "_MB", 0)
-    made = episodes(COUNT, size=(64, 64), smooth=True)
+    made = episodes(COUNT, size=(64, 64), smooth=True, texts=READABLE)
     save(place / "d", made, as_video=True)
     (as_version_2(place / "d", "v2.1") / VIDEO).unlink()
     bad(*training(demos="d"), says=("no file", VIDEO))
