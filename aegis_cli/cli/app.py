@@ -497,6 +497,13 @@ def merge(
             callback=not_negative,
         ),
     ] = None,
+    gate: Annotated[
+        Gate | None,
+        Option(
+            help="What --max-drop limits: the drop as measured (mean, the default), or the upper "
+            "end of its 95 % interval.",
+        ),
+    ] = None,
     base: Annotated[
         str | None, Option(help="The pre-trained model; default: the run's own backbone.")
     ] = None,
@@ -567,7 +574,7 @@ def merge(
         near = did_you_mean(method, MERGES)
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
-    _check_sweep(strength, sweep, max_drop, out, plot)
+    _check_sweep(strength, sweep, max_drop, gate, out, plot)
     asks_nothing = strength is not None and (method == "linear" or anchor is not None)
     if asks_nothing and vqa is not None:
         reason = "--method linear" if method == "linear" else "--anchor"
@@ -593,7 +600,15 @@ def merge(
         batch_size=asks.batch_size,
     )
     report = stages.MERGE.run(
-        target, settings, out, strength, numbers(sweep), max_drop, device=device, as_json=as_json
+        target,
+        settings,
+        out,
+        strength,
+        numbers(sweep),
+        max_drop,
+        gate=(gate or Gate.mean).value,
+        device=device,
+        as_json=as_json,
     )
     if plot is not None:
         render.merge_plot(report, plot)
@@ -605,11 +620,12 @@ def _check_sweep(
     strength: float | None,
     sweep: str | None,
     max_drop: float | None,
+    gate: Gate | None,
     out: Path | None,
     plot: Path | None,
 ) -> None:
     """Raise AegisError for options of `merge` that do not go together, before any work."""
-    of_sweep = {"--sweep": sweep, "--max-drop": max_drop, "--plot": plot}
+    of_sweep = {"--sweep": sweep, "--max-drop": max_drop, "--gate": gate, "--plot": plot}
     given_too = [name for name, value in of_sweep.items() if value is not None]
     if strength is not None and given_too:
         options = " and ".join(given_too)
@@ -618,6 +634,9 @@ def _check_sweep(
             "one strength, or a sweep",
             f"leave out --strength, or {options}",
         )
+    if gate is not None and max_drop is None:
+        expected, fix = "a limit to hold the drop to", "add --max-drop POINTS, or leave --gate out"
+        raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
     writes = strength is not None or max_drop is not None
     if writes and out is None:
         name = "--strength" if strength is not None else "--max-drop"
@@ -681,12 +700,13 @@ def probe(
         ),
     ] = None,
     gate: Annotated[
-        Gate,
+        Gate | None,
         Option(
             help="What --max-drop limits: the drop as measured, or the upper end of its 95 % "
-            "interval, so that too few questions cannot pass.",
+            "interval, so that too few questions cannot pass; default: a run's own probe.gate, "
+            "else mean.",
         ),
-    ] = Gate.mean,
+    ] = None,
     batch_size: OwnBatchSize = None,
     device: Device = None,
     as_json: Json = False,
@@ -711,7 +731,7 @@ def probe(
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
         if launch.rank() == 0:
             render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
-    if max_drop is None and "--gate" in given(ctx):
+    if max_drop is None and gate is not None:
         expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
         fix = "add --max-drop POINTS, or leave --gate out"
         raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
@@ -720,6 +740,7 @@ def probe(
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    gate = Gate(asks.gate) if gate is None else gate
     advice.of_questions(target, asks.vqa)
     with stages.joined(device):
         report = stages.PROBE.run(
@@ -1170,6 +1191,8 @@ def run(
         failed = None
         if one_run and report.gate_failed:
             limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
+            if resolved.probe.gate == Gate.upper:
+                limit += ", by the upper end of the drop's interval"
             failed = f"{', '.join(report.gate_failed)} dropped {limit}"
         _say_gate(failed)
     _end_at_gate(failed)

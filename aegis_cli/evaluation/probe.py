@@ -25,13 +25,13 @@ from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
 from aegis_cli.evaluation import results, wrong_answers
+from aegis_cli.evaluation.results import MEAN
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
 from aegis_cli.training.folder import METRICS
 
 PROBE_SEED = 0
-MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
 
 
@@ -441,7 +441,7 @@ def compare(
     interval = None if before is None else _in_points(drop_interval(before, after))
     passed = None
     if max_drop is not None and drop is not None and interval is not None:
-        passed = results.within(interval[1] if gate == UPPER else drop, max_drop)
+        passed = results.within(results.limited(drop, interval, gate), max_drop)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None

@@ -32,6 +32,7 @@ FOLDER = "results"
 OPEN_LOOP = "evaluate"  # what the names of its files begin with
 # Which episodes an open-loop evaluation is of.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
+MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 _PATIENCE_S = 5.0  # with others who write there
 _LONGEST_CHAIN = 100  # runs that begin from each other
 # What one probe of a checkpoint tells and another of the same questions may not.
@@ -423,20 +424,31 @@ def _number(found: Result, kind: str) -> int:
     return int(number) if number.isdigit() else 1
 
 
-def gate(probed: Sequence[Result], max_drop: float | None) -> bool | None:
+def gate(probed: Sequence[Result], settings: recipes.Probe) -> bool | None:
     """Whether every probe passes its gate; None where there is none.
 
     Args:
-        max_drop: that of the run's recipe, to which the probes of `aegis run` are held.
+        settings: of the run's recipe, to which the probes of `aegis run` are held.
     """
+    max_drop = settings.max_drop
     verdicts = []
     for result in probed:
         passed, drop = result.figures.get("passed"), result.figures.get("drop_points")
         if passed is None and max_drop is not None and not result.settings and drop is not None:
-            passed = within(drop, max_drop)
+            interval = result.figures.get("drop_interval")
+            passed = within(limited(drop, interval, settings.gate), max_drop)
         if passed is not None:
             verdicts.append(passed)
     return all(verdicts) if verdicts else None
+
+
+def limited(drop_points: float, interval: Sequence[float] | None, gate: str) -> float:
+    """What of a drop a gate limits; a drop without an interval stands for itself.
+
+    Args:
+        gate: MEAN or UPPER.
+    """
+    return drop_points if gate == MEAN or interval is None else interval[1]
 
 
 def within(drop_points: float, max_drop: float) -> bool:

@@ -163,7 +163,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         rollouts=tuple(results.rollouts(path)),
         open_loops=tuple(results.open_loops(path)),
         question_sets=tuple(results.question_set(each, settings) for each in probed),
-        gate=results.gate(probed, settings.probe.max_drop),
+        gate=results.gate(probed, settings.probe),
     )
 
 

@@ -55,6 +55,7 @@ class MergeReport:
             sweep, as `questions` is 0 then and `points` is empty.
         points: the sweep, weakest first, beginning with 0, which is the fine-tuned model.
         passed: whether a strength keeps `max_drop`; None without that limit.
+        gate: what of the drop that limits, MEAN or UPPER; None without it.
     """
 
     method: str
@@ -70,6 +71,7 @@ class MergeReport:
     baseline_accuracy: float | None
     points: tuple[MergePoint, ...] = ()
     validation_loss: float | None = None
+    gate: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -84,6 +86,7 @@ def run(
     max_drop: float | None = None,
     on_event: OnEvent = ignore,
     judged: bool = False,
+    gate: str = results.MEAN,
 ) -> MergeReport:
     """Write the merge of one strength, or try several.
 
@@ -95,6 +98,7 @@ def run(
         max_drop: of a sweep, the weakest merge is written that loses at most these percentage
             points of accuracy on validation questions.
         judged: of one strength, whether the task is tried on validation data, as a sweep does.
+        gate: what of the drop `max_drop` limits, MEAN or UPPER.
 
     Raises:
         AegisError: nothing that can be merged, or not by this method, or another process that is
@@ -104,7 +108,7 @@ def run(
     if out is not None:
         sources.check_out(out)
     with contextlib.nullcontext() if out is None else locks.alone(out):
-        return _run(target, settings, out, strength, sweep, max_drop, on_event, judged)
+        return _run(target, settings, out, strength, sweep, max_drop, on_event, judged, gate)
 
 
 def _run(
@@ -116,6 +120,7 @@ def _run(
     max_drop: float | None,
     on_event: OnEvent,
     judged: bool,
+    gate: str,
 ) -> MergeReport:
     strengths = (strength,) if strength is not None else tuple(sweep) or GRIDS[settings.method]
     for each in strengths:
@@ -129,7 +134,7 @@ def _run(
     if strength is None:
         judge = _Judge(source, settings, on_event)
         tried = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
-        chosen = _weakest(tried.points, max_drop)
+        chosen = _weakest(tried.points, max_drop, gate)
         if chosen == 0:
             said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
             on_event(Warned("merge", said))
@@ -154,6 +159,7 @@ def _run(
         baseline_accuracy=tried.baseline_accuracy,
         points=tried.points,
         validation_loss=loss,
+        gate=None if max_drop is None else gate,
     )
 
 
@@ -256,9 +262,13 @@ def _try(
     return _Sweep(tuple(points), judge.baseline_accuracy, judge.questions)
 
 
-def _weakest(points: Sequence[MergePoint], max_drop: float | None) -> float | None:
+def _weakest(points: Sequence[MergePoint], max_drop: float | None, gate: str) -> float | None:
     """The smallest strength that passes: of those that keep the answers, the strongest policy."""
     if max_drop is None:
         return None
-    passing = [point.strength for point in points if results.within(point.drop_points, max_drop)]
+    passing = []
+    for point in points:
+        held = results.limited(point.drop_points, point.drop_interval, gate)
+        if results.within(held, max_drop):
+            passing.append(point.strength)
     return min(passing, default=None)

@@ -64,6 +64,9 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
         yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
+    if recipe.probe.gate != "mean" and recipe.probe.max_drop is None:
+        found = f"probe.gate: {recipe.probe.gate} without probe.max_drop"
+        yield Problem(found, "a limit that the drop is held to", "set probe.max_drop")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
         found = f"demos.drop_below: {recipe.demos.drop_below:g} with task: {recipe.task}"
         yield Problem(

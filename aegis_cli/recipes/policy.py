@@ -719,6 +719,13 @@ class Probe:
         doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1, and "
         "`aegis probe` of the run.",
     )
+    gate: str = key(
+        choice("mean", "upper"),
+        "mean",
+        later=True,
+        doc="What of the drop `max_drop` limits: mean, the drop as measured, or upper, the upper "
+        "end of its 95 % interval, so that too few questions cannot pass.",
+    )
 
     def of_each_set(self) -> tuple[Probe, ...]:
         """This probe of each of its question sets alone, in their order."""

@@ -172,7 +172,7 @@ def _gate(path: Path, asked: _Named | None) -> bool | None:
     """The verdict on the drop that the row shows; `aegis inspect` tells of all the probes."""
     if asked is None:
         return None
-    return results.gate([asked[1]], results.recipe_of(path).probe.max_drop)
+    return results.gate([asked[1]], results.recipe_of(path).probe)
 
 
 def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:

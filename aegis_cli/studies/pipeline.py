@@ -13,7 +13,7 @@ from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, leading, locks
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.evaluation import results
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
 from aegis_cli.training import assemble, track
@@ -89,7 +89,6 @@ def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> Pi
     on_event(Progress(recipe.name, len(rows), len(rows), "methods"))
     rows = _with_ratios(rows)
     first = rows[0]  # the baseline is the same in each
-    limit = recipe.probe.max_drop
     report = PipelineReport(
         recipe.name,
         rows,
@@ -97,7 +96,7 @@ def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> Pi
         first.baseline_cross_entropy,
         first.majority_accuracy,
         str(folder),
-        [] if limit is None else [row.method for row in rows if _past(row, limit)],
+        [row.method for row in rows if _past(row, recipe.probe)],
         verdict(rows),
         None if recipe.merge.method is None else dataclasses.asdict(recipe.merge),
     )
@@ -178,9 +177,15 @@ def _acts(row: PolicyFigures) -> float | None:
     return None if row.open_loop_error is None else -row.open_loop_error
 
 
-def _past(row: PolicyFigures, limit: float) -> bool:
+def _past(row: PolicyFigures, settings: Probe) -> bool:
     """Whether a method lost more than the gate lets pass on any of its sets of questions."""
-    return not all(results.within(drop, limit) for drop in _drops(row))
+    if settings.max_drop is None:
+        return False
+    for asked in (row, *row.others.values()):
+        held = results.limited(asked.drop_points, asked.drop_interval, settings.gate)
+        if not results.within(held, settings.max_drop):
+            return True
+    return False
 
 
 def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:

@@ -647,7 +647,9 @@ class PolicyRunner:
             if layers
             else None
         )
-        report = probe.compare(after, before, layers, settings.max_drop, asked.skipped, between)
+        report = probe.compare(
+            after, before, layers, settings.max_drop, asked.skipped, between, settings.gate
+        )
         probe.check_trained(report, recipe.train.steps)
         probe.warn_of_few_questions(report, settings.max_drop, on_event)
         wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
@@ -745,10 +747,12 @@ def _tuple(values: list[Any] | None) -> tuple[Any, ...] | None:
 
 
 def _probe_settings(settings: Probe) -> dict[str, Any]:
-    """What a probe's record knows of its settings; records older than `seed` are of its default."""
+    """What a probe's record knows of its settings; records older than a key are of its default."""
     keys = dataclasses.asdict(settings)
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
+    if settings.gate == probe.MEAN:
+        del keys["gate"]
     return keys
 
 

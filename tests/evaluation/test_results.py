@@ -86,7 +86,7 @@ def test_a_probe_without_a_drop_is_kept_beside_an_earlier_gate_which_comes_first
     _, first, second = results.probes(run)
     assert (first.name, first.figures["drop_points"]) == ("probe-scenes", 2.0)
     assert (second.name, second.figures["drop_points"]) == ("probe-scenes-with-accuracy", None)
-    assert results.gate([first, second], None) is False
+    assert results.gate([first, second], recipes.Probe()) is False
     (warned,) = told
     assert isinstance(warned, Warned) and "which also tells the drop and the gate" in warned.text
 
@@ -260,7 +260,15 @@ def test_what_chose_a_knob_is_no_result(run: Path) -> None:
 
 def verdict(*drops: float, max_drop: float | None = None, passed: bool | None = None):
     probes = [Result("probe", {"drop_points": drop, "passed": passed}, {}) for drop in drops]
-    return results.gate(probes, max_drop)
+    return results.gate(probes, recipes.Probe(max_drop=max_drop))
+
+
+@pytest.mark.parametrize(("gate", "passes"), [("mean", True), ("upper", False)])
+def test_a_recipe_says_what_of_a_drop_its_gate_limits(gate: str, passes: bool) -> None:
+    found = Result("probe", {"drop_points": 0.4, "drop_interval": [-0.2, 1.0]}, {})
+    settings = recipes.Probe(max_drop=0.5, gate=gate)
+    assert results.gate([found], settings) is passes
+    assert results.gate([found], replace(settings, max_drop=1.0)) is True
 
 
 def test_a_gate_passes_if_every_probe_does() -> None:

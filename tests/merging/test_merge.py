@@ -20,6 +20,7 @@ from samples.vqa_files import write_jsonl
 from aegis_cli import load_policy
 from aegis_cli.anchors import curvature
 from aegis_cli.common import artifacts, locks
+from aegis_cli.evaluation.results import MEAN, UPPER
 from aegis_cli.merging.merge import MergePoint, _weakest
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
@@ -309,9 +310,16 @@ def test_a_gate_fails_where_no_strength_passes(
 
 def test_the_weakest_that_passes_is_taken_wherever_it_stands() -> None:
     points = [MergePoint(s, 1.0, 1.0, drop, (0.0, 0.0)) for s, drop in ((0, 9), (1, 0.4), (3, 0.6))]
-    assert _weakest(points, 0.5) == 1 and _weakest(points, 0.4) == 1
-    assert _weakest(points, 0.1) is None and _weakest(points, 10) == 0
-    assert _weakest(points, None) is None
+    assert _weakest(points, 0.5, MEAN) == 1 and _weakest(points, 0.4, MEAN) == 1
+    assert _weakest(points, 0.1, MEAN) is None and _weakest(points, 10, MEAN) == 0
+    assert _weakest(points, None, MEAN) is None
+
+
+def test_the_upper_end_of_the_drop_can_be_what_is_limited() -> None:
+    drops = ((0.0, 9.0, (8.0, 10.0)), (1.0, 0.4, (-0.5, 1.3)), (2.0, 0.3, (-0.1, 0.7)))
+    points = [MergePoint(s, 1.0, 0.9, drop, ends) for s, drop, ends in drops]
+    assert [_weakest(points, 1.0, gate) for gate in (MEAN, UPPER)] == [1, 2]
+    assert _weakest(points, 0.5, UPPER) is None
 
 
 # --- models without a run -------------------------------------------------------------------------

@@ -319,11 +319,29 @@ def test_a_second_run_of_several_sets_does_nothing(
     assert not calls
 
 
+@pytest.mark.parametrize("gate", ["mean", "upper"])
 @pytest.mark.parametrize(("own", "other", "passes"), [(0, 0, True), (2, 0, False), (0, 2, False)])
-def test_the_gate_holds_every_set_to_its_limit(own: float, other: float, passes: bool) -> None:
-    kept = study_samples.row(recipe("x"), drop_points=own)
-    others = {"easy-vqa": study_samples.vqa_figures(drop_points=other)}
-    assert pipeline._past(replace(kept, others=others), limit=1.0) != passes
+def test_the_gate_holds_every_set_to_its_limit(
+    own: float, other: float, passes: bool, gate: str
+) -> None:
+    """By the mean, or by the upper end of the interval, which lies farther."""
+    shift = 0.0 if gate == "mean" else -5.0
+
+    def held(drop: float) -> dict[str, Any]:
+        return {"drop_points": drop + shift, "drop_interval": (drop - 9.0, drop)}
+
+    kept = study_samples.row(recipe("x"), **held(own))
+    others = {"easy-vqa": study_samples.vqa_figures(**held(other))}
+    settings = Probe(max_drop=1.0, gate=gate)
+    assert pipeline._past(replace(kept, others=others), settings) != passes
+    assert not pipeline._past(replace(kept, others=others), replace(settings, max_drop=None))
+
+
+def test_a_gate_of_a_recipe_does_not_ask_again_what_was_asked_without_one() -> None:
+    """Records of probes are older than the key."""
+    settings = Probe(max_drop=1.0)
+    assert "gate" not in policy_cells._probe_settings(settings)
+    assert policy_cells._probe_settings(replace(settings, gate="upper"))["gate"] == "upper"
 
 
 # --- what runs again -----------------------------------------------------------------------------

@@ -218,11 +218,11 @@ def _scale(axis: Any, report: Any) -> None:
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
     across, lost = [x for x, _ in spots], [y for _, y in spots]
     margin = max(2.0, 0.08 * (max(across) - min(across)))
-    axis.set(
-        xlabel=acting_axis(report),
-        ylabel=_COLUMNS[_LOST].axis,
-        xlim=(min(across) - margin, max(across) + margin),
-    )
+    # A return may surpass the expert's; no success is below 0 % or above 100 %.
+    left, right = max(min(across) - margin, -1.0), max(across) + margin
+    if all(_acting(result) != "return_share" for result in compared):
+        right = min(right, 101.0)
+    axis.set(xlabel=acting_axis(report), ylabel=_COLUMNS[_LOST].axis, xlim=(left, right))
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)
     axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
     axis.set_yticks(_TICKS, [f"{tick:g}" for tick in _TICKS])

@@ -137,7 +137,9 @@ def _evaluated(open_loops: Sequence[Any]) -> Table:
 
 
 def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
-    names = ("VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²")
+    names = ["VQA %", "Before %", "Drop (points)", "95 % interval", "Largest W2²"]
+    gated = any(result.figures.get("passed") is not None for result in probes)
+    names += ["Gate"] * gated
     rows = []
     for result, asked in zip(probes, question_sets, strict=True):
         found = result.figures
@@ -151,9 +153,20 @@ def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
                 fixed(found.get("drop_points"), 2),
                 _ends(found.get("drop_interval"), lambda points: fixed(points, 2)),
                 number(max(drifts, default=None)),
+                *([_gate(result)] if gated else []),
             )
         )
     return plain_table(("Asked", "Questions", *names), rows)
+
+
+def _gate(probed: Any) -> str:
+    """A probe's verdict, and the limit that it was held to, as far as it says that itself."""
+    verdict = _VERDICTS[probed.figures.get("passed")]
+    limit = probed.settings.get("max_drop")
+    if verdict == "-" or limit is None:
+        return verdict
+    upper = " by the upper end" if probed.settings.get("gate") == "upper" else ""
+    return f"{verdict} at {limit:g}{upper}"
 
 
 def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> str:

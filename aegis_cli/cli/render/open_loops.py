@@ -126,6 +126,8 @@ def open_loop_plot(report: Any, path: Path) -> None:
 
 
 def _drawn(report: Any) -> Any:
+    from matplotlib.ticker import MaxNLocator
+
     rows, columns = len(report.dimensions), len(report.traces)
     drawn = figure(figsize=(1.2 + 3.6 * columns, 1.5 + 1.4 * rows), layout="constrained")
     panels = drawn.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
@@ -138,6 +140,7 @@ def _drawn(report: Any) -> Any:
                 axis.set_ylabel(f"{literal(dimension.name)}{literal(unit)}", fontsize=8)
         panels[0][column].set_title(_titled(report, trace), fontsize=9)
         panels[-1][column].set_xlabel("frame", fontsize=8)
+        panels[-1][column].xaxis.set_major_locator(MaxNLocator(integer=True))
     finding = textwrap.fill(_finding(report), _TITLE_CHARACTERS * columns)
     drawn.suptitle(finding, x=0.01, ha="left", fontsize=11, fontweight="bold")
     _explain(drawn, report.traces[0].replan)
