@@ -113,6 +113,13 @@ class DeployedPolicy:
         self._one_at_a_time = threading.Lock()
         self.reset()
 
+    def __repr__(self) -> str:
+        seen = ", ".join(self.cameras) or "one picture"
+        return (
+            f"<policy of {self.task or 'a robot'}: {seen} and {self.positions} positions to "
+            f"{self.chunk} x {self.actions} actions, {self.replan} of them executed>"
+        )
+
     @property
     def precision(self) -> str:
         """Of the matrix products: bf16 or float32."""

@@ -171,6 +171,14 @@ def test_a_chunk_continues_what_the_robot_executes_meanwhile(run_folder: Path) -
     assert off[:2].mean() < 0.2 * before[:2].mean() and off[:2].mean() < off[-1].mean()
 
 
+def test_a_policy_says_what_it_is() -> None:
+    made = DeployedPolicy(make_policy().eval(), "reach", ("top", "wrist"), 2)
+    assert repr(made).startswith("<policy of reach: top, wrist and ")
+    assert f"{made.chunk} x {made.actions} actions, 2 of them executed" in repr(made)
+    nowhere = DeployedPolicy(make_policy().eval(), None, (), 1)
+    assert repr(nowhere).startswith("<policy of a robot: one picture and ")
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -45,8 +45,9 @@ _SHARES = {
 
 
 def facts(report: Any) -> Table:
-    """Every plain value of a report, one a line."""
-    return pairs({f.name: getattr(report, f.name) for f in dataclasses.fields(report)})
+    """Every plain value of a report, one a line; what is an empty list has none."""
+    values = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
+    return pairs({name: value for name, value in values.items() if value != ()})
 
 
 def serving(report: Any) -> RenderableType:
@@ -310,8 +311,11 @@ def pairs(values: dict[str, Any]) -> Table:
     return table
 
 
+_NO_SCALARS = ("families", "layers", "asked")  # of a probe's report
+
+
 def _scalars(report: Any) -> dict[str, Any]:
-    names = [f.name for f in dataclasses.fields(report) if f.name not in ("families", "layers")]
+    names = [field.name for field in dataclasses.fields(report) if field.name not in _NO_SCALARS]
     return {name: getattr(report, name) for name in names}
 
 
