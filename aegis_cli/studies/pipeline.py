@@ -11,8 +11,10 @@ from typing import Any
 
 from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, leading, locks
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.evaluation import results
+from aegis_cli.models import backbones
 from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
@@ -193,11 +195,27 @@ def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
 
     Else a fault would show only after the stages before the one that reads them.
     """
+    _refuse_own_models(runner.folder, recipe)
     runner.backbone_sha256(recipe)
     for method in recipe.methods:
         runner.vqa_state(_of(recipe, method))
     runner.check_questions(recipe, "probe")
     assemble.check_named(recipe, runner.on_event)
+
+
+def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
+    """Refuse a job that begins with one of its own runs, which it would train anew and remove."""
+    named = {"backbone": recipe.backbone, "expert.start": recipe.expert.start}
+    for key, name in named.items():
+        if name is None:
+            continue
+        path = Path(backbones.divided(name)[0])
+        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
+            raise AegisError(
+                f"{key}: {name}, which lies in '{folder}', the folder of this job",
+                "a model that lies elsewhere: a job trains its own runs anew",
+                "give the recipe another name, or aegis run another --out",
+            )
 
 
 def _of(recipe: Recipe, method: str) -> Recipe:

@@ -274,6 +274,23 @@ def test_a_gate_fails_after_the_tables_are_written(
         assert files.load_json(root / "small/table.json")["gate_failed"] == ["naive"] * code
 
 
+@pytest.mark.parametrize("key", ["backbone", "expert.start"])
+def test_a_job_does_not_begin_with_a_run_of_its_own_which_it_would_remove(
+    key: str, small: Recipe, root: Path
+) -> None:
+    """As where a recipe was copied for a second training, and kept its name."""
+    run = root / "small" / METHODS[0]
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    other = replace(small, seed=small.seed + 1)
+    if key == "backbone":
+        other = replace(other, backbone=str(run))
+    else:
+        other = replace(other, expert=replace(other.expert, start=str(run)))
+    with pytest.raises(AegisError, match=f"{key}: .* the folder of this job"):
+        pipeline.run(other, root)
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
 # --- several sets of questions -------------------------------------------------------------------
 
 
