@@ -366,8 +366,8 @@ def train(
         bool,
         Option(
             "--dry-run",
-            help="Check all, estimate memory, disk and hours, write nothing; exit 1 if the first "
-            "two do not fit.",
+            help="Of a policy: check all, estimate memory, disk and hours, write nothing; exit 1 "
+            "if the first two do not fit.",
         ),
     ] = False,
     overrides: Set = None,
@@ -1350,7 +1350,9 @@ def recipes(
 
 @app.command(short_help="Check the installation and the machine.")
 def doctor(
-    quick: Annotated[bool, Option("--quick", help="Leave the self-test out.")] = False,
+    quick: Annotated[
+        bool, Option("--quick", help="Leave the job out, which takes half a minute or more.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check packages, extras, torch, OpenGL and the disk, and run a job in miniature.
