@@ -25,7 +25,6 @@ from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
 from aegis_cli.evaluation import results, wrong_answers
-from aegis_cli.evaluation.results import MEAN
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
@@ -103,7 +102,7 @@ def run(
     anchor: Path | None,
     max_drop: float | None,
     batch_size: int = 64,
-    gate: str = MEAN,
+    gate: str = results.MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
     keep: bool = False,
@@ -174,7 +173,8 @@ def run(
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
         name = f"probe-{source.name}"
-        figures = replace(report, asked=None).to_json() | wrong
+        figures = report.to_json() | wrong
+        del figures["asked"]  # the settings say it
         settings |= _path_of(vqa)
         results.keep_if_possible(Path(target), name, figures, settings, on_event)
     return report
@@ -421,7 +421,7 @@ def compare(
     max_drop: float | None,
     skipped: int = 0,
     w2_between: str | None = None,
-    gate: str = MEAN,
+    gate: str = results.MEAN,
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions.
 

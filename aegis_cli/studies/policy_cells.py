@@ -751,7 +751,7 @@ def _probe_settings(settings: Probe) -> dict[str, Any]:
     keys = dataclasses.asdict(settings)
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
-    if settings.gate == probe.MEAN:
+    if settings.gate == results.MEAN:
         del keys["gate"]
     return keys
 

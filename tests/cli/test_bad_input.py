@@ -132,7 +132,10 @@ def test_demonstrations_and_anchor_in_each_others_place_are_told_their_options(
     override: tuple[str, ...], bad: Callable[..., str]
 ) -> None:
     both = training(demos="anchor.safetensors", anchor="demos.safetensors")
-    err = bad(*both, *override, says=("'anchor.safetensors' is of kind 'anchor'", "--anchor"))
+    err = bad(*both, *override, says=("'demos.safetensors' is of kind 'demos'", "--demos"))
+    assert "demos.camera" not in err
+    swapped = training(demos="anchor.safetensors")
+    err = bad(*swapped, *override, says=("'anchor.safetensors' is of kind 'anchor'", "--anchor"))
     assert "demos.camera" not in err
     bad(*training(anchor="demos.safetensors"), says=("of kind 'demos'", "belongs to --demos"))
 

@@ -70,6 +70,8 @@ def test_the_job_by_hand(
         and probed["layers"][1]["w2"] > 0
     )
     kept = json.loads((tmp_path / "runs/x/results/probe-scenes.json").read_text())
+    asked = probed.pop("asked")  # the kept one has settings in its place
+    assert (asked["questions"], asked["anchor"]) == (14, "anchor.safetensors")
     assert kept.items() >= probed.items() and kept["settings"]["questions"] == 14
     assert kept["wrong"] and {one["family"] for one in kept["wrong"]} <= kept["families"].keys()
     inspected = done("inspect", "runs/x", "--plot", "energy.png")

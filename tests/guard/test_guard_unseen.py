@@ -136,7 +136,8 @@ def test_a_model_that_has_moved_since_the_guard_was_made(
     optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
     guard.backward(watched(guard, model))
     there = torch.device("cuda", 0)  # as if it had been there
-    guard._stepper._devices = [there for _ in guard._stepper._devices]
+    learning = guard._stepper._learning
+    learning._devices = [there for _ in learning._devices]
     before = vector(model)
     refused(lambda: guard.step(optimizer), "cuda:0", "before Guard(...)")
     refused(lambda: watched(guard, model), "cuda:0", "before Guard(...)")
