@@ -261,6 +261,8 @@ def compared(report: Any) -> RenderableType:
     is_marked = any(isinstance(cell, Text) for cells in shown.values() for cell in cells)
     notes = [MARKS] if is_marked else []
     on = next((row.open_loop_on for row in report.rows if row.open_loop_on), None)
+    if "Hold's" in shown:
+        notes.append("hold's: the open-loop error of the current position, repeated")
     if on is not None and report.same_open_loop:
         notes.append(f"open-loop error: on {on}")
     return Group(table, *map(Text, notes))
