@@ -217,7 +217,6 @@ def test_facts_have_units_and_figures_that_can_be_read():
         "memory weights 12,346, gradients 0.5 MB",
         "disk free 72,041 MB",
         "drop interval -0.25 to 1.5 points",
-        "cameras -",
     ]
 
 
