@@ -233,6 +233,11 @@ def hidden(path: Path) -> str:
     return f".{short}"
 
 
+def lies_in(path: Path, folder: Path) -> bool:
+    """Whether something that is there lies in a folder, or is it, whatever links lead to it."""
+    return path.exists() and path.resolve().is_relative_to(folder.resolve())
+
+
 def check_writable(path: Path) -> None:
     """Fail before the work, not after it; writing still checks.
 

@@ -34,7 +34,6 @@ OPEN_LOOP = "evaluate"  # what the names of its files begin with
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 _PATIENCE_S = 5.0  # with others who write there
-_LONGEST_CHAIN = 100  # runs that begin from each other
 # What one probe of a checkpoint tells and another of the same questions may not.
 _TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
 
@@ -202,14 +201,16 @@ def origins(run: Path) -> list[Origin]:
     The last of them is the VLM that nothing of ours has trained.
     """
     found: list[Origin] = []
+    seen: set[Path] = set()
     while True:
+        seen.add(run.resolve())
         expert = run / "checkpoints" / checkpoint.LAST / checkpoint.EXPERT
         header = artifacts.read_header(expert) if expert.is_file() else None
         digest = None if header is None else header.inputs.get("backbone")
         found.append(Origin(recipe_of(run).backbone, digest))
         before = run_of(Path(backbones.divided(found[-1].name)[0]))
-        # A run that was copied to where it began from would begin from itself.
-        if before is None or len(found) > _LONGEST_CHAIN:
+        # One that has been put in the place of its own backbone begins from itself.
+        if before is None or before.resolve() in seen:
             return found
         run = before
 

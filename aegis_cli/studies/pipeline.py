@@ -207,10 +207,7 @@ def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
     """Refuse a job that begins with one of its own runs, which it would train anew and remove."""
     named = {"backbone": recipe.backbone, "expert.start": recipe.expert.start}
     for key, name in named.items():
-        if name is None:
-            continue
-        path = Path(backbones.divided(name)[0])
-        if path.exists() and path.resolve().is_relative_to(folder.resolve()):
+        if name is not None and files.lies_in(Path(backbones.divided(name)[0]), folder):
             raise AegisError(
                 f"{key}: {name}, which lies in '{folder}', the folder of this job",
                 "a model that lies elsewhere: a job trains its own runs anew",

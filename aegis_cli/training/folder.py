@@ -202,11 +202,8 @@ def _check_own(out: Path) -> None:
 
 def _check_read(out: Path, read: Iterable[str | Path | None]) -> None:
     """Raise AegisError where what is read lies in the run that is to be overwritten."""
-    run = out.resolve()
     for place in read:
-        if place is None or not (path := Path(place)).exists():
-            continue  # what ships, and what lies on the hub
-        if path.resolve().is_relative_to(run):
+        if place is not None and files.lies_in(Path(place), out):
             raise AegisError(
                 f"'{place}' in the run '{out}', which is to be overwritten",
                 "models and data that lie elsewhere",

@@ -473,6 +473,16 @@ def test_a_run_that_begins_with_another_run_is_held_against_the_vlm(
         assert code == 0 and json.loads(out)["asked"]["baseline"] == str(measured_on), err
 
 
+def test_a_run_in_the_place_of_its_own_backbone_begins_from_itself_once(
+    taught: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    train.run(recipe(taught), "naive", demos_file, None, run)
+    said = (run / "recipe.yaml").read_text(encoding="utf-8")
+    (run / "recipe.yaml").write_text(said.replace(str(taught), str(run)), encoding="utf-8")
+    assert [origin.name for origin in results.origins(run)] == [str(run)]
+
+
 def test_a_drift_between_two_prompts_says_so(taught: Path, tmp_path: Path) -> None:
     anchor = tmp_path / "anchor.safetensors"
     measure.run(str(taught), Settings(samples=20, ask="what {}", parts=("moments",)), anchor)

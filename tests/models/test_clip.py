@@ -21,7 +21,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.continual.report import ImageStreamReport, TaskRecord, sums
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.data.streams import folders, mtil
-from aegis_cli.models.backbones import clip
+from aegis_cli.models.backbones import EMBEDDED_DUAL, clip, load_dual
 from aegis_cli.models.backbones.dual import class_weights
 
 SIZE = 16
@@ -211,6 +211,8 @@ def test_images_are_cut_as_the_models_processor_cuts_them(folder: Path, dataset:
 def test_a_folder_becomes_a_task(dataset: Path) -> None:
     task = folders.load(dataset, "animals", SIZE)
     assert task.classes == CLASSES and task.templates == (folders.TEMPLATE,)
+    # The encoder that ships can read it, with words that it knows.
+    load_dual(EMBEDDED_DUAL).tokenizer.encode(folders.TEMPLATE.format("circle"))
     assert (len(task.test), len(task.train) + len(task.validation)) == (12, 30) and len(
         task.validation
     ) >= 1
