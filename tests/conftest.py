@@ -21,6 +21,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
 
 import pytest
+import typer
 from hypothesis import settings
 from samples import fast
 from samples.tiny import make_tiny
@@ -166,13 +167,19 @@ def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> 
     return path
 
 
+@cache
+def command() -> Callable[..., None]:
+    """What `app` makes of its commands whenever it is called, which takes a moment; made once."""
+    return typer.main.get_command(app)
+
+
 @pytest.fixture
 def aegis(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Run the command in this process: (exit code, stdout, stderr)."""
 
     def call(*args: object) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as caught:
-            app([str(a) for a in args], prog_name="aegis")
+            command()([str(a) for a in args], prog_name="aegis")
         captured = capsys.readouterr()
         return caught.value.code or 0, captured.out, captured.err
 

@@ -48,6 +48,7 @@ class PolicyFigures:
         open_loop_error: of a policy that cannot be rolled out: the squared error of its actions on
             held-out episodes over their variance in training; 1 is that of always the mean action.
             Of several data sets, the mean of theirs.
+        hold_error: the same of a robot that holds its position, where actions are positions.
         code: version and digest of the package that measured the cell.
     """
 
@@ -69,6 +70,7 @@ class PolicyFigures:
     majority_accuracy: float
     return_share: float | None = None
     open_loop_error: float | None = None
+    hold_error: float | None = None
     lost_per_image: tuple[int, ...] | None = None
     questions_per_image: tuple[int, ...] | None = None
     images: tuple[str, ...] | None = None

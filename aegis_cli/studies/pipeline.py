@@ -157,6 +157,8 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     if naive.success_seen is None:
         at = f"an open-loop error of {best.open_loop_error:.3f} where naive has "
         at += f"{naive.open_loop_error:.3f}"
+        if best.hold_error is not None:
+            at += f" and a robot that holds its position {best.hold_error:.3f}"
     else:
         at = f"{_percent(best.success_seen):.1f} % success where naive has "
         at += f"{_percent(naive.success_seen):.1f} %"

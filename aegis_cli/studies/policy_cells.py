@@ -478,7 +478,9 @@ class PolicyRunner:
         playable = _playable(meta, recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
-        measured = None if playable or validation else self.open_loop_error(label, recipe)
+        error, hold = None, None
+        if not playable and not validation:
+            error, hold = self.open_loop_errors(label, recipe)
         return PolicyFigures(
             method=recipe.train.method,
             **vars(asked[first]),
@@ -486,7 +488,8 @@ class PolicyRunner:
             success_held_out=success.get("held-out"),
             wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
             return_share=played["seen"]["return_share"] if "seen" in played else None,
-            open_loop_error=measured,
+            open_loop_error=error,
+            hold_error=hold,
             energy_shed=trained["energy_shed_mean"],
             step_s=trained["step_s"],
             step_time_ratio=None,
@@ -690,19 +693,24 @@ class PolicyRunner:
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
 
-    def open_loop_error(self, label: str, recipe: Recipe) -> float | None:
-        """The cell's open-loop error on the held-out episodes of its demonstrations.
+    def open_loop_errors(self, label: str, recipe: Recipe) -> tuple[float | None, float | None]:
+        """The open-loop errors of the cell and of holding the position, on held-out episodes.
 
-        With several sets of demonstrations it is the mean of theirs; None where no action varies.
+        With several sets of demonstrations each is the mean over the sets in which actions vary,
+        and None where there is no such set. Holding has an error where it has one in all of them.
         """
         given = self.demos(recipe)
         sets = [given.path] if isinstance(given.path, Path) else list(given.path)
-        found = []
+        errors, holds = [], []
         for number, data in enumerate(sets, start=1):
             report = self._evaluated(label, recipe, data, given.sha256, number)
             if report["relative_error"] is not None:
-                found.append(report["relative_error"])
-        return statistics.fmean(found) if found else None
+                errors.append(report["relative_error"])
+                holds.append(report["hold_error"])
+        if not errors:
+            return None, None
+        hold = None if None in holds else statistics.fmean(holds)
+        return statistics.fmean(errors), hold
 
     def _evaluated(
         self, label: str, recipe: Recipe, data: Path, demos_sha256: str, number: int

@@ -385,11 +385,10 @@ def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
 
 
 def _alive(device: torch.device) -> dict[int, torch.UntypedStorage]:
-    """The memory of every tensor on a device, by its address.
+    """The memory of every tensor on a device, by its address, garbage that is not collected too.
 
     It is held, so that no address is given to another one meanwhile.
     """
-    gc.collect()
     tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
     storages = [t.untyped_storage() for t in map(rows_here, tensors)]
     return {s.data_ptr(): s for s in storages if s.device.type == device.type}
@@ -401,6 +400,7 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
     known = [*weights, *training.average.weights.values()]
     known += [*training.demos.held, *_plain(training)]
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
+    gc.collect()
     alive = _alive(training.policy.backbone.device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in others)
 
@@ -446,6 +446,7 @@ def _remembered(training: TrainingRun) -> int:
     device = training.policy.backbone.device
     there = _alive(device)
     parts.begin()  # anew before the first step
+    gc.collect()
     alive = _alive(device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in there)
 

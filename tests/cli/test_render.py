@@ -262,13 +262,30 @@ def test_the_summary_of_methods_that_cannot_be_rolled_out_has_no_column_of_dashe
     unknown = ("success_seen", "success_held_out", "wrong_target", "return_share", "energy_shed")
     row = dict.fromkeys((*unknown, "step_time_ratio")) | {"others": {}, "accuracy": 0.9}
     row |= {"drop_points": 1.0, "cross_entropy": 0.2, "w2": 0.1, "validation_loss": 0.4}
-    row |= {"open_loop_error": 0.25}
+    row |= {"open_loop_error": 0.25, "hold_error": None}
     text = text_of(pipeline(job([SimpleNamespace(method="naive", **row)])))
     header = "Method VQA % Drop (points) Cross-entropy (nats) Open-loop error W2² Validation loss"
     lines = [line.split() for line in text.splitlines()]
     assert header.split() in lines
     assert "naive 90.0 1.00 0.200 0.250 0.1 0.4000".split() in lines
-    assert "nothing could be rolled out" in text
+    assert "nothing could be rolled out" in text and "holds its position" not in text
+
+
+def test_the_summary_says_which_methods_are_no_better_than_a_robot_that_stands_still():
+    shared = dict.fromkeys(("success_seen", "success_held_out", "wrong_target", "return_share"))
+    shared |= dict.fromkeys(("energy_shed", "step_time_ratio", "w2", "validation_loss"))
+    shared |= {"others": {}, "accuracy": 0.9, "drop_points": 1.0, "cross_entropy": 0.2}
+    errors = {"naive": 0.2, "lora": 0.3, "aegis": 0.5}
+    rows = [
+        SimpleNamespace(method=method, open_loop_error=error, hold_error=0.3, **shared)
+        for method, error in errors.items()
+    ]
+    text = text_of(pipeline(job(rows)))
+    said = (
+        "A robot that holds its position has an open-loop error of 0.300; not below it: lora, aegis"
+    )
+    assert said in text
+    assert "error of 0.300\n" in text_of(pipeline(job(rows[:1])))
 
 
 def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
@@ -281,6 +298,7 @@ def test_the_summary_table_has_a_row_a_method_and_dashes_for_unknowns():
         wrong_target=0.02,
         return_share=None,
         open_loop_error=None,
+        hold_error=None,
         w2=12.5,
         energy_shed=0.0123,
         step_time_ratio=1.5,

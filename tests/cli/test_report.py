@@ -114,13 +114,14 @@ def test_the_table_of_a_job_has_the_open_loop_error_of_what_cannot_be_rolled_out
     table = files.load_json(job / "table.json")
     for row, error in zip(table["rows"], (0.125, 0.375), strict=True):
         row |= dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
-        row["open_loop_error"] = error
+        row["open_loop_error"], row["hold_error"] = error, 0.25
     files.save_json(job / "table.json", table)
     page, document = reported(aegis, job)
     check_figures(page, document)
     shown = {path: text for path, _, text in page.figures}
     assert shown["/table/rows/0/open_loop_error"] == "0.125"
     assert shown["/table/rows/1/open_loop_error"] == "0.375"
+    assert shown["/table/rows/0/hold_error"] == "0.250"
     assert "/table/rows/0/success_seen" not in shown
     assert "Open-loop error" in page.said
 

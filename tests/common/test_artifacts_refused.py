@@ -348,6 +348,19 @@ def test_tensors_must_be_those_of_the_header(tmp_path: Path, kind: str) -> None:
         ),
         ("routing", "tasks.threshold", torch.zeros(3).double(), "'tasks.threshold' is float64 [3]"),
         ("training-state", "half", torch.tensor([float("-inf")]), "'half' has 1 NaN or infinite"),
+        # whose sum is NaN, and one beside values whose sum is infinite without it
+        (
+            "training-state",
+            "half",
+            torch.tensor([float("inf"), float("-inf")]),
+            "'half' has 2 NaN or infinite",
+        ),
+        (
+            "training-state",
+            "half",
+            torch.tensor([3e38, 3e38, float("nan")]),
+            "'half' has 1 NaN or infinite",
+        ),
     ],
 )
 def test_wrong_content_is_neither_written_nor_loaded(
@@ -366,6 +379,15 @@ def test_wrong_content_is_neither_written_nor_loaded(
         patch.setattr(artifacts, "_validate", lambda *_: None)
         path = write(tmp_path, kind, tensors=altered(kind, name, value))
     refused(path, words, artifacts.KINDS[kind].command, kind=kind)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_values_that_are_finite_are_kept_where_their_sum_is_not(
+    tmp_path: Path, dtype: torch.dtype
+) -> None:
+    largest = torch.full((8,), torch.finfo(dtype).max, dtype=dtype)
+    path = write(tmp_path, "training-state", tensors=altered("training-state", "half", largest))
+    assert torch.equal(artifacts.load(path).tensors["half"], largest)
 
 
 def test_experts_must_be_those_of_the_structure(tmp_path: Path) -> None:

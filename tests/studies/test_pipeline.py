@@ -691,7 +691,11 @@ def opened(**of: tuple[float, float]) -> list[Any]:
         (
             opened(naive=(14, 0.2), lora=(1, 0.3), kfac=(0.5, 0.25), aegis=(15, 0.1)),
             "kfac lost 0.5 points of VQA where naive lost 14.0, at an open-loop error of 0.250 "
-            "where naive has 0.200",
+            "where naive has 0.200 (one seed)",
+        ),
+        (
+            [replace(r, hold_error=0.125) for r in opened(naive=(14, 0.2), kfac=(0.5, 0.25))],
+            "0.250 where naive has 0.200 and a robot that holds its position 0.125 (one seed)",
         ),
         (
             figured(naive=(14, 0.95), stop_gradient=(0, 0.6), kfac=(0.5, 0.9)),

@@ -253,6 +253,9 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     ]
     explained = "Lost: percentage points of VQA accuracy, with the 95 % interval of one training."
     parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
+    hold = next((row["hold_error"] for row in rows if row["hold_error"].value is not None), None)
+    if hold is not None:
+        parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
     spots = _spots(rows, own)
     if spots:
         chart = charts.frontier(

@@ -191,8 +191,25 @@ def pipeline(report: Any) -> RenderableType:
         *([Text(report.verdict)] if report.verdict else []),
         *([] if report.merge is None else [Text(_merged(report.merge))]),
         *([] if _acted(report.rows, acts) else [Text(_OPEN_LOOP_INSTEAD)]),
+        *([] if (hold := _held_still(report.rows)) is None else [Text(hold)]),
         Text(f"files: {report.out}"),
     )
+
+
+def _held_still(rows: Sequence[Any]) -> str | None:
+    """What a robot that holds its position has, beside the open-loop errors of these methods.
+
+    None where that was not measured. All methods are measured on the same frames.
+    """
+    hold = next((row.hold_error for row in rows if row.hold_error is not None), None)
+    if hold is None:
+        return None
+    text = f"A robot that holds its position has an open-loop error of {hold:.3f}"
+    errors = [(row.method, row.open_loop_error) for row in rows if row.open_loop_error is not None]
+    behind = [method for method, error in errors if error >= hold]
+    if behind:
+        text += f"; not below it: {', '.join(behind)}"
+    return text
 
 
 def _acted(rows: Sequence[Any], acts: Mapping[str, str]) -> bool:

@@ -5,16 +5,14 @@ The scenes are those that the VLM's questions and the robot tasks already have.
 
 from __future__ import annotations
 
-import atexit
 import math
-from functools import cache
 
 import numpy as np
 
 from aegis_cli.common.palette import COLORS
 from aegis_cli.data.streams.names import SIZE
 from aegis_cli.data.streams.photo import Photo, to_bytes
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, SceneRenderer
+from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, renderer_of_thread
 from aegis_cli.sim import point, reach
 from aegis_cli.sim.scene import Look, lay_out
 
@@ -28,16 +26,9 @@ NIGHT = Photo(
 )
 
 
-@cache
-def _scenes() -> SceneRenderer:
-    renderer = SceneRenderer()
-    atexit.register(renderer.close)  # while EGL is still there
-    return renderer
-
-
 def _solid(rng: np.random.Generator, color: str, solid: str) -> np.ndarray:
     """The part of a scene around its one thing, enlarged: [S, S, 3] in [0, 1]."""
-    scene = _scenes().render(rng, only=(color, solid))
+    scene = renderer_of_thread().render(rng, only=(color, solid))
     at = np.array([scene.things[0].x_px, scene.things[0].y_px])
     corner = np.clip(at - _CROP_PX / 2 + rng.uniform(-3, 3, 2), 0, IMAGE_SIZE - _CROP_PX)
     left, top = np.rint(corner).astype(int)

@@ -176,21 +176,18 @@ def _render_chunk(job: _Job) -> Rendered:
 
     Answers are balanced inside the chunk, so workers need no common state.
     """
-    from aegis_cli.data.vqa.scenes import SceneRenderer, scene_rng  # loads OpenGL
+    from aegis_cli.data.vqa.scenes import renderer_of_thread, scene_rng  # loads OpenGL
 
     seed, split, start, count, mix = job
-    renderer, balancer = SceneRenderer(), Balancer()
+    renderer, balancer = renderer_of_thread(), Balancer()
     images, cells, questions = [], [], []
-    try:
-        for index in range(start, start + count):
-            rng = scene_rng(seed, split, index)
-            scene = renderer.render(rng)
-            images.append(scene.image)
-            cells.append(cell_labels(scene))
-            asked = []
-            for family, count_of_family in mix.items():
-                asked += balancer.choose(scene, family, count_of_family, rng)
-            questions.append(asked)
-    finally:
-        renderer.close()
+    for index in range(start, start + count):
+        rng = scene_rng(seed, split, index)
+        scene = renderer.render(rng)
+        images.append(scene.image)
+        cells.append(cell_labels(scene))
+        asked = []
+        for family, count_of_family in mix.items():
+            asked += balancer.choose(scene, family, count_of_family, rng)
+        questions.append(asked)
     return Rendered(np.stack(images), np.stack(cells), questions)

@@ -7,6 +7,7 @@ each. See https://github.com/vzhou842/easy-VQA (MIT).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -60,6 +61,7 @@ def is_test(key: str) -> bool:
     return key.startswith("test/")
 
 
+@cache  # 48,248 questions have 107 texts
 def family(text: str) -> str:
     """What a question asks for: a shape, a color, or whether something is there, or is not."""
     words = text.lower().rstrip("?").split()

@@ -8,7 +8,9 @@ which makes every answer to "where is it" equally likely.
 
 from __future__ import annotations
 
+import atexit
 import math
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,7 +129,10 @@ def _model_xml() -> str:
 
 
 class SceneRenderer:
-    """One compiled model and one OpenGL context, reused for every scene."""
+    """One compiled model and one OpenGL context, reused for every scene.
+
+    Each scene sets all that it shows, so that none depends on those before it.
+    """
 
     def __init__(self) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml())
@@ -254,6 +259,20 @@ class SceneRenderer:
         centre = _lift(camera, x_px, y_px, height)
         self._place(f"thing{i}", centre, rng)
         return Thing(color, shape, x_px, y_px)
+
+
+_of_thread = threading.local()
+
+
+def renderer_of_thread() -> SceneRenderer:
+    """The calling thread's renderer.
+
+    To make an OpenGL context takes a tenth of a second, and none can be current in two threads.
+    """
+    if not hasattr(_of_thread, "renderer"):
+        _of_thread.renderer = SceneRenderer()
+        atexit.register(_of_thread.renderer.close)  # while EGL is still there
+    return _of_thread.renderer
 
 
 def _lift(camera: _Camera, x_px: float, y_px: float, height: float) -> np.ndarray:

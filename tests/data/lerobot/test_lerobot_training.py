@@ -17,6 +17,7 @@ import torch
 from samples import studies as study_samples
 from samples.command import refused
 from samples.lerobot import (
+    STATE,
     data_files,
     edit_info,
     edit_table,
@@ -567,6 +568,7 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     run = tmp_path / "runs" / "small" / "naive"
     alone = open_loop.run(run, folder)
     assert (row.open_loop_error, alone.split) == (alone.relative_error, "validation")
+    assert row.hold_error is alone.hold_error is None  # these actions are no positions
     (kept,) = results.open_loops(run)
     assert kept.figures["relative_interval"] == alone.relative_interval
     progress = [e for e in events if isinstance(e, Progress)]
@@ -592,7 +594,11 @@ def test_the_open_loop_error_on_several_sets_is_the_mean_of_theirs(
     sets = [
         save(
             tmp_path / name,
-            [replace(e, instruction="go to the red pad") for e in episodes(4, seed=seed)],
+            [
+                replace(e, instruction="go to the red pad", actions=e.state)
+                for e in episodes(4, seed=seed)
+            ],
+            action_names=STATE,
         )
         for seed, name in enumerate(("a", "b"))
     ]
@@ -600,9 +606,12 @@ def test_the_open_loop_error_on_several_sets_is_the_mean_of_theirs(
     given = replace(base, demos=Demos(path=tuple(map(str, sets))))
     (row,) = pipeline.run(given, tmp_path / "runs").rows
     run = tmp_path / "runs" / "small" / "naive"
-    alone = [open_loop.run(run, data).relative_error for data in sets]
-    assert None not in alone and len(set(alone)) == 2
-    assert row.open_loop_error == pytest.approx(sum(alone) / 2)
+    alone = [open_loop.run(run, data) for data in sets]
+    errors = [found.relative_error for found in alone]
+    assert None not in errors and len(set(errors)) == 2
+    assert row.open_loop_error == pytest.approx(sum(errors) / 2)
+    holds = [found.hold_error for found in alone]  # since these actions are positions
+    assert None not in holds and row.hold_error == pytest.approx(sum(holds) / 2)
     assert len(results.open_loops(run)) == 2
 
 

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -20,7 +21,14 @@ from aegis_cli.common.palette import COLORS, RGB
 from aegis_cli.data.vqa import dataset
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes, render_training
 from aegis_cli.data.vqa.questions import FAMILIES, GRID, cell_labels, majority_share
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, SPLITS, SceneRenderer, scene_rng
+from aegis_cli.data.vqa.scenes import (
+    IMAGE_SIZE,
+    SHAPES,
+    SPLITS,
+    SceneRenderer,
+    renderer_of_thread,
+    scene_rng,
+)
 from aegis_cli.models.backbones.embedded import MAX_ANSWER, MAX_TEXT
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS
@@ -276,17 +284,17 @@ def test_a_rendering_process_that_dies_is_one_error(monkeypatch: pytest.MonkeyPa
         list(dataset._map([1, 1, 1], 2))
 
 
-def test_a_rendering_that_fails_frees_the_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
-    freed: list[SceneRenderer] = []
-    monkeypatch.setattr(SceneRenderer, "render", lambda *_: 1 / 0)
-    monkeypatch.setattr(
-        SceneRenderer,
-        "close",
-        lambda self, close=SceneRenderer.close: (close(self), freed.append(self)),
-    )
-    with pytest.raises(ZeroDivisionError):
-        render_training(0, 1)
-    assert len(freed) == 1
+def test_a_thread_has_one_renderer_whose_scenes_are_those_of_a_new_one() -> None:
+    ours = renderer_of_thread()
+    first = [ours.render(scene_rng(3, "train", i)).image for i in range(4)]
+    assert renderer_of_thread() is ours
+    with ThreadPoolExecutor(1) as other:
+        theirs = other.submit(renderer_of_thread).result()
+        there = [other.submit(theirs.render, scene_rng(3, "train", i)) for i in range(4)]
+        assert theirs is not ours
+        assert all((a == b.result().image).all() for a, b in zip(first, there))
+    again = [ours.render(scene_rng(3, "train", i)).image for i in reversed(range(4))]
+    assert all((a == b).all() for a, b in zip(first, reversed(again)))
 
 
 def test_questions_do_not_depend_on_the_process() -> None:
