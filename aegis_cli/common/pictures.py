@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 GREY = 128  # what a backbone that scales pixels to [-1, 1] reads as nothing
 FILTER = "bilinear, as wide as the reduction, grey borders"
-DECODER = "upright, 16 bits of grey as 8"
+DECODER = "upright, on white where transparent, 16 bits of grey as 8"
 # What a picture's bytes may be, whatever its name says. Pillow knows others that are programs, such
 # as PostScript, which it has another program run.
 RASTER = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "JPEG2000", "TGA")
@@ -26,6 +26,8 @@ RASTER = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "JPEG2000"
 
 def decoded(data: bytes) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8 of an image file, upright as a viewer shows them.
+
+    What is transparent lies on white, as transformers' processors have it.
 
     Raises:
         ValueError: no raster image or only a part of one, too many pixels, or grey of no known
@@ -60,10 +62,15 @@ def _raster() -> list[str]:
 
 
 def _rgb(image: Image) -> np.ndarray:
+    from PIL import Image as pillow
+
     if image.mode.startswith("I;16"):  # where Pillow's own conversion makes all above 255 white
         return np.repeat((np.asarray(image) / 257).round().astype(np.uint8)[..., None], 3, axis=-1)
     if image.mode in ("I", "F"):
         raise ValueError(f"numbers of mode {image.mode}, which do not say what is white")
+    if image.has_transparency_data:
+        drawn = image.convert("RGBA")
+        image = pillow.alpha_composite(pillow.new("RGBA", drawn.size, "white"), drawn)
     return np.array(image.convert("RGB"))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from samples.vqa_files import picture
+from transformers import image_transforms
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import decoded
@@ -80,6 +81,31 @@ def middle(pixels: np.ndarray) -> np.ndarray:
 
 def test_pictures_are_upright_wherever_they_are_read(decode: Decode) -> None:
     assert np.array_equal(middle(decode(turned())), middle(np.rot90(np.asarray(picture(1)), -1)))
+
+
+def clear(mode: str) -> Image.Image:
+    """A picture whose left half is transparent, and has black below that."""
+    image = picture(1).convert("L" if mode == "LA" else "RGB")
+    alpha = Image.new("L", image.size, 255)
+    for target, value in ((image, 0), (alpha, 0)):
+        target.paste(value, (0, 0, image.width // 2, image.height))
+    image.putalpha(alpha)
+    return image.quantize(16) if mode == "P" else image
+
+
+@pytest.mark.parametrize(
+    ("mode", "format"), [("RGBA", "PNG"), ("LA", "PNG"), ("P", "PNG"), ("RGBA", "WEBP")]
+)
+def test_what_is_transparent_lies_on_white_as_processors_have_it(
+    mode: str, format: str, decode: Decode
+) -> None:
+    image = clear(mode)
+    data = stored(image, format, **({"lossless": True} if format == "WEBP" else {}))
+    pixels = decode(data)
+    half = pixels.shape[1] // 2
+    assert (pixels[:, :half] == 255).all() and (pixels[:, half:] < 255).any()
+    theirs = image_transforms.convert_to_rgb(Image.open(io.BytesIO(data)))
+    assert np.array_equal(middle(pixels), middle(np.asarray(theirs)))
 
 
 @pytest.mark.parametrize("data", [huge(), turned()[:300], b"hello"], ids=["huge", "half", "none"])

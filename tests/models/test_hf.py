@@ -93,7 +93,7 @@ def test_answers_are_what_generate_says_token_for_token(
     said: list[list[int]] = []
     decode = backbone._prompter.decode
     monkeypatch.setattr(
-        backbone._prompter, "decode", lambda ids: (said.extend(ids.tolist()), decode(ids))[1]
+        backbone._prompter, "decode", lambda ids: (said.extend(ids), decode(ids))[1]
     )
     answers = backbone.answer(images(4), TEXTS)
     pad = native.processor.tokenizer.pad_token_id
@@ -103,6 +103,21 @@ def test_answers_are_what_generate_says_token_for_token(
         assert tokens[: len(wanted)] == wanted and set(tokens[len(wanted) :]) <= {pad}
         assert answer == native.processor.tokenizer.decode(wanted, skip_special_tokens=True).strip()
     assert len({tuple(tokens) for tokens in said}) > 1
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_an_answer_may_be_as_long_as_its_reference(
+    native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And by one token longer: what goes on after the reference is not equal to it."""
+    frame, text, tokenizer = images(1), TEXTS[0], native.processor.tokenizer
+    out = native.generate(frame[0], text, 2 * MAX_ANSWER)
+    said = out.sequences[0, native.inputs(frame[0], text)["input_ids"].shape[1] :].tolist()
+    references = [said[: MAX_ANSWER + 8], said[:2]]
+    monkeypatch.setattr(backbone._prompter, "answer_ids", lambda answers: references)
+    ((answers, _),) = backbone.answers([([frame[0]] * 2, [text] * 2, ["long", "short"])])
+    allowed = [said[: MAX_ANSWER + 9], said[:MAX_ANSWER]]
+    assert answers == [tokenizer.decode(a, skip_special_tokens=True).strip() for a in allowed]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -259,6 +274,34 @@ def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
     ids = [*prompt, *prompter.answer_ids(["red cube"])[0], hf_backbone(name)._ends()[0]]
     assert prompter._prompt(TEXTS[0]) == prompt_of(name, TEXTS[0])
     assert whole.rstrip("\n") == tokenizer.decode(ids)
+
+
+def edited(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the settings of a folder's tokenizer."""
+    path = folder / "tokenizer_config.json"
+    settings = json.loads(path.read_text())
+    change(settings)
+    path.write_text(json.dumps(settings))
+
+
+@pytest.mark.parametrize("change", ["the template beside the tokenizer", "no padding token"])
+def test_processors_files_as_others_have_them_say_the_same(
+    change: str, hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(hf_folder("idefics3"), tmp_path / "model"))
+    if change == "no padding token":
+        edited(folder, lambda settings: settings.pop("pad_token"))
+    else:
+        template = (folder / "chat_template.jinja").read_text()
+        (folder / "chat_template.jinja").unlink()
+        edited(folder, lambda settings: settings.update(chat_template=template))
+    changed, whole = backbones.load(str(folder)), backbones.load(str(hf_folder("idefics3")))
+    asked = (images(4), TEXTS, SAID)
+    assert changed.answer(*asked[:2]) == whole.answer(*asked[:2])
+    assert torch.equal(changed.answer_log_likelihood(*asked), whole.answer_log_likelihood(*asked))
+    again = tmp_path / "saved"
+    changed.save(again)
+    assert backbones.load(str(again)).answer(*asked[:2]) == whole.answer(*asked[:2])
 
 
 def test_groups_are_named_after_what_they_are(backbone: HFBackbone) -> None:

@@ -375,6 +375,18 @@ def test_an_adapter_of_peft_is_refused_with_what_makes_a_model_of_it(
     bad(*MEASURE, "model", says=("adapter", "merge_and_unload"))
 
 
+@pytest.mark.parametrize("part", [None, "text_config"])
+def test_quantised_weights_are_refused_with_what_makes_a_model_of_them(
+    part: str | None, bad: Bad, model: Path
+) -> None:
+    """Nothing learns in them; an anchor of them would have been measured before that is said."""
+    config = json.loads((model / "config.json").read_text())
+    within = config if part is None else config[part]
+    within["quantization_config"] = {"quant_method": "bitsandbytes", "load_in_4bit": True}
+    (model / "config.json").write_text(json.dumps(config))
+    bad(*MEASURE, "model", says=("quantised weights", "bitsandbytes", "dequantize"))
+
+
 def test_weights_that_git_lfs_has_not_fetched(bad: Bad, model: Path) -> None:
     (model / "model.safetensors").write_text(LFS_POINTER)
     for command in ((*MEASURE, "model"), ("inspect", "model")):
@@ -452,7 +464,7 @@ def test_the_processor_of_another_family(
     [
         (None, "no chat template"),
         ("{% for", "end of template"),
-        ("{{ messages[0]['content'][-1]['text'] }}", "refuses"),
+        ("{{ messages[0]['content'][-1]['text'] }}", "the chat template places no image"),
     ],
 )
 def test_a_template_that_asks_about_no_image(
@@ -551,26 +563,64 @@ def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path])
     """Before anything is asked: `--skip-bad` can leave it out."""
     for family in FAMILIES.keys() - WITH_TORCHVISION:
         backbone = backbones.load(str(hf_folder(family)))
-        marker = backbone._prompter._marker
-        for ask in (
-            lambda text: backbone.prepare(images(1), [text]),
-            lambda text: backbone.check_text(text, "red"),
-            lambda text: backbone.check_text("what", text),
-        ):
-            with pytest.raises(AegisError, match="processor refuses") as caught:
-                ask(f"is there an {marker} here")
-            assert marker in caught.value.found
-            ask("is there an image here")
+        for marker in backbone._prompter._markers:
+            for ask in (
+                lambda text: backbone.prepare(images(1), [text]),
+                lambda text: backbone.check_text(text, "red"),
+                lambda text: backbone.check_text("what", text),
+            ):
+                with pytest.raises(AegisError, match="processor refuses") as caught:
+                    ask(f"is there an {marker} here")
+                assert marker in caught.value.found
+                ask("is there an image here")
+
+
+@pytest.mark.parametrize(
+    ("family", "marker"),
+    [("smolvlm", "<video>"), ("llava_onevision", "<video>"), ("gemma3", "<|vision_start|>")],
+)
+def test_other_media_have_markers_too(
+    hf_folder: Callable[[str], Path], family: str, marker: str
+) -> None:
+    backbone = backbones.load(str(hf_folder(family)))
+    assert marker in backbone._prompter._markers
+    with pytest.raises(AegisError, match="processor refuses"):
+        backbone.check_text(f"what is a {marker}", "red")
+
+
+def test_a_text_that_is_too_long_is_told_before_anything_is_asked(
+    hf_folder: Callable[[str], Path],
+) -> None:
+    backbone = backbones.load(str(hf_folder("smolvlm")))
+    long = "how many " * backbone._prompter._longest
+    for question, answer in ((long, "red"), ("what", long)):
+        with pytest.raises(AegisError, match=r"'how many .* \.\.\.': \d+ tokens"):
+            backbone.check_text(question, answer)
 
 
 def test_an_image_that_the_processor_refuses(hf_folder: Callable[[str], Path]) -> None:
     """It is not said to be a text."""
     narrow = torch.zeros(1, 1000, 2, 3, dtype=torch.uint8)
     with pytest.raises(
-        AegisError, match="^found: an image or a text .* refuses: absolute aspect ratio"
+        AegisError, match="^found: an image or a text .* refuses: .*: absolute aspect ratio"
     ) as caught:
         backbones.load(str(hf_folder("qwen2_5_vl"))).prepare(narrow, ["is there a cube"])
-    assert "image" in caught.value.fix
+    assert "question" in caught.value.fix
+
+
+def test_of_many_questions_the_one_is_named_that_the_processor_refuses(
+    hf_folder: Callable[[str], Path],
+) -> None:
+    backbone = backbones.load(str(hf_folder("qwen2_5_vl")))
+    narrow = torch.zeros(1000, 2, 3, dtype=torch.uint8)
+    wide = torch.zeros(64, 64, 3, dtype=torch.uint8)
+    asked = ["is there a cube", "what is this", "is there a ball"]
+    with pytest.raises(AegisError, match="'what is this' about 2 x 1000 pixels: absolute aspect"):
+        backbone.prepare([wide, narrow, wide], asked)
+    backbone.check_text("what is this", "red", wide)
+    backbone.check_text("what is this", "red")  # which knows of no image
+    with pytest.raises(AegisError, match="absolute aspect"):
+        backbone.check_text("what is this", "red", narrow)
 
 
 def test_what_checkpoints_is_not_compiled(bad: Bad, place: Path, model: Path, aegis: Any) -> None:

@@ -1,7 +1,8 @@
 """How people's answers are compared, by the rules of VQA's official evaluation (arXiv 1505.00468).
 
-One difference to its code, and none to its text: an answer is always normalised, also where all
-people said the same.
+Two differences to its code, and none to its text: an answer is always normalised, also where all
+people said the same; and one of which nothing would be left, such as the letter A or a plus sign,
+stays as it is, or to say nothing would be right.
 """
 
 from __future__ import annotations
@@ -49,12 +50,12 @@ def normalise(answer: str) -> str:
     """An answer in the form in which answers are compared.
 
     It has lower case, no punctuation, digits for number words, no articles, and its apostrophes
-    restored.
+    restored. An answer of articles and punctuation alone keeps them.
     """
-    words = [
-        _NUMBERS.get(word, word) for word in _strip_marks(" ".join(answer.split())).lower().split()
-    ]
-    return " ".join(_CONTRACTIONS.get(word, word) for word in words if word not in _ARTICLES)
+    spaced = " ".join(answer.split())
+    words = [_NUMBERS.get(word, word) for word in _strip_marks(spaced).lower().split()]
+    said = " ".join(_CONTRACTIONS.get(word, word) for word in words if word not in _ARTICLES)
+    return said or spaced.lower()
 
 
 def _strip_marks(text: str) -> str:

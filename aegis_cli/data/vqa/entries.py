@@ -55,20 +55,36 @@ def bad(where: str, found: str, expected: str, fix: str) -> AegisError:
 def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -> Question:
     """A question that people answered.
 
+    Args:
+        answers: a list of what each person said, or one person's answer alone; each a text, a whole
+            number, or an object whose `answer` is one.
+
     Raises:
         AegisError: a text that is none, no answers, or a name that is neither text nor a whole
             number.
     """
     if not _is_text(text):
         raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
-    if not isinstance(answers, list) or not answers or not all(_is_text(a) for a in answers):
-        found = "no answer" if answers in (None, []) else f"answers {_show(answers)}"
+    answers = _texts(answers)
+    if not answers or not all(_is_text(a) for a in answers):
+        found = f"answers {_show(answers)}" if answers else "no answer"
         expected = "a list of one or more texts, what people answered"
         raise bad(where, found, expected, 'write e.g. ["red"]')
     if isinstance(name, bool) or not isinstance(name, (str, int)):
         raise bad(where, f"id {_show(name)}", "a text or a whole number", "correct the id")
     said = tuple(map(sys.intern, answers))  # the same few words, a million times
     return Question(family, text.strip(), reference(said).strip(), said, name)
+
+
+def _texts(answers: Any) -> list[Any]:
+    """The answers one by one, whole numbers as texts."""
+    if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
+        answers = answers.get("answer")
+    if answers is None:
+        return []
+    listed = answers if isinstance(answers, list) else [answers]
+    said = [a.get("answer") if isinstance(a, dict) else a for a in listed]
+    return [str(a) if isinstance(a, int) and not isinstance(a, bool) else a for a in said]
 
 
 class Inside:

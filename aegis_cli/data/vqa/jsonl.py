@@ -64,8 +64,8 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
             "a path relative to the file's folder",
             "correct the path",
         )
-    question = make_question(
-        where, raw["question"], raw["answers"], raw.get("id", f"line {number}"), "all"
-    )
+    name = raw.get("id")
+    own = f"line {number}" if name is None else name
+    question = make_question(where, raw["question"], raw["answers"], own, "all")
     path = images.find(where, raw["image"])
     return Entry(where, question, Picture(images.name(path), where, path))

@@ -108,8 +108,6 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
             "take both files of one release",
         )
     answers, kind = annotation.get("answers"), annotation.get("answer_type")
-    if isinstance(answers, list):
-        answers = [a.get("answer") if isinstance(a, dict) else a for a in answers]
     family = kind if isinstance(kind, str) and kind else "all"
     question = make_question(where, row.get("question"), answers, name, family)
     return Entry(where, question, images.picture(where, row.get("image_id")))

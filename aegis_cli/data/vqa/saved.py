@@ -148,7 +148,7 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
             file = folder.find(where, outside[number]) if outside[number] else None
             own, kind = number if name is None else row[name], row.get("answer_type")
             family = kind if isinstance(kind, str) and kind else "all"
-            question = make_question(where, row["question"], _texts(row[answers]), own, family)
+            question = make_question(where, row["question"], row[answers], own, family)
             source, image_id = file or _InRow(stored, number, where), row.get("image_id")
             key = _digest(source) if image_id is None else f"image {image_id}"
             yield Entry(where, question, Picture(key, where, source))
@@ -190,17 +190,6 @@ def _unreadable(path: Path, error: Exception) -> AegisError:
     why = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
     expected = "a folder that datasets saved, or whole parquet files"
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
-
-
-def _texts(answers: Any) -> Any:
-    """The answers of a row as a list of texts, however the column holds them."""
-    if isinstance(answers, str):
-        return [answers]
-    if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
-        return answers.get("answer")
-    if isinstance(answers, list):
-        return [a.get("answer") if isinstance(a, dict) else a for a in answers]
-    return answers
 
 
 def _outside(rows: Any) -> list[str | None]:

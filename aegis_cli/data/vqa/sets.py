@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
@@ -36,8 +38,11 @@ PARTS: dict[str, range] = {
     "probe": range(5, 10),
 }
 
-# Raises AegisError if a model cannot read a question with its answer.
-TextCheck = Callable[[str, str], None]
+
+class TextCheck(Protocol):
+    """See `Backbone.check_text`."""
+
+    def __call__(self, question: str, answer: str, image: Tensor | None = None) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -141,13 +146,21 @@ class Listed:
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
         """The questions about one image that can be asked.
 
-        Where bad questions are left out, the image's pixels are tried too.
+        Where bad questions are left out, the image's pixels are tried too, with each question.
         """
+        image = None
+        if self.skip_bad:
+            try:
+                # All of them are about this image.
+                image = torch.from_numpy(decode(entries[0].picture, None))
+            except AegisError:  # the caller counts those that are left out
+                return []
         sound = []
         for entry in entries:
+            text = self.ask.replace(PLAIN, entry.question.text)
             try:
                 for check in checks:
-                    check(entry.question.text, entry.question.answer)
+                    check(text, entry.question.answer, image)
             except AegisError as error:
                 if not self.skip_bad:
                     raise AegisError(
@@ -155,11 +168,6 @@ class Listed:
                     ) from error
             else:
                 sound.append(entry)
-        if self.skip_bad and sound:
-            try:
-                decode(sound[0].picture, None)  # all of them are about this image
-            except AegisError:  # the caller counts those that are left out
-                return []
         return sound
 
     def _nothing(self, part: str, pictures: int, skipped: int) -> AegisError:

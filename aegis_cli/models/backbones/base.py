@@ -299,8 +299,13 @@ class Backbone(nn.Module, ABC):
         """
         return [str(i) for i in range(count)]
 
-    def check_text(self, question: str, answer: str) -> None:
-        """Raise AegisError if the model cannot read a question with its answer; most read any."""
+    def check_text(self, question: str, answer: str, image: Tensor | None = None) -> None:
+        """Raise AegisError if the model cannot read a question with its answer; most read any.
+
+        Args:
+            image: [H, W, 3] uint8 that the question is about. With it the whole is tried, which
+                takes the time of preparing it.
+        """
 
     def check_prompt(self, text: str) -> None:
         """Raise AegisError if the model cannot read this text as a prompt; most read any.

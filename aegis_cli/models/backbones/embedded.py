@@ -308,7 +308,7 @@ class EmbeddedVLM(Backbone):
     def check_prompt(self, text: str) -> None:
         _check_length(len(self.tokenizer.prompt(text)))
 
-    def check_text(self, question: str, answer: str) -> None:
+    def check_text(self, question: str, answer: str, image: Tensor | None = None) -> None:
         prompt, reference = self.tokenizer.prompt(question), self.tokenizer.encode(answer)
         # The model's own answer has to fit too.
         _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))

@@ -35,7 +35,7 @@ from aegis_cli.models.backbones.prompting import Prompter
 from aegis_cli.models.backbones.recording import Seen, attention, recording, unrotated
 from aegis_cli.models.structure import of_type, outermost_lists, widest
 
-MAX_ANSWER = 32  # tokens that `answer` generates at most
+MAX_ANSWER = 32  # tokens that an answer is given at most, where its reference is not longer
 
 
 class _Answered(NamedTuple):
@@ -120,7 +120,10 @@ class HFBackbone(Backbone):
                 encoding = self.encode(self.prepare(black, ["a"]))
         except AegisError as error:
             # A text of one letter is refused only for what the processor makes of it.
-            raise model_folder.misfit(error.found) from error
+            found = error.found
+            if not self._prompter.places_image():
+                found = "the chat template places no image in what the model is asked"
+            raise model_folder.misfit(found) from error
         except (
             ValueError,
             LookupError,
@@ -248,19 +251,20 @@ class HFBackbone(Backbone):
         return self._prompter.padded(batch, self._multiple)
 
     def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
-        return self._generated(self._to_answer(images, questions))
+        return self._generated(self._to_answer(images, questions), [MAX_ANSWER] * len(questions))
 
     def _to_answer(self, images: Images, questions: Sequence[str]) -> Batch:
         # Padding on the left, so that what is generated follows each prompt directly.
         return self._prompter.process(images, questions, "left")
 
     @torch.no_grad()
-    def _generated(self, prompts: Batch) -> list[str]:
-        """The answers that the model generates."""
+    def _generated(self, prompts: Batch, most: Sequence[int]) -> list[str]:
+        """The answers that the model generates, each up to its own number of tokens."""
         batch = prompts.to(self.device)
         with _greedy(self.vlm):
-            said = self.vlm.generate(**_arguments(batch), max_new_tokens=MAX_ANSWER)
-        return self._prompter.decode(said[:, batch.ids.shape[1] :])
+            said = self.vlm.generate(**_arguments(batch), max_new_tokens=max(most))
+        rows = said[:, batch.ids.shape[1] :].tolist()
+        return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
         """See `Backbone.answers`; for a GPU the next batches are prepared meanwhile."""
@@ -271,14 +275,18 @@ class HFBackbone(Backbone):
 
         with prefetch.for_device(prepare, batches, self.device) as prepared:
             for prompts, answered in prepared:
-                yield self._generated(prompts), self._log_likelihood(answered)
+                # One more than the reference, so that nothing longer is taken for it.
+                most = [max(MAX_ANSWER, len(said) + 1) for said in answered.said]
+                yield self._generated(prompts, most), self._log_likelihood(answered)
 
     def check_prompt(self, text: str) -> None:
         self._prompter.check_text(text)
 
-    def check_text(self, question: str, answer: str) -> None:
+    def check_text(self, question: str, answer: str, image: Tensor | None = None) -> None:
         for text in (question, answer):
             self._prompter.check_text(text)
+        if image is not None:
+            self.prepare_answers([image], [question], [answer])
 
     def _ends(self) -> list[int]:
         """The tokens each of which ends an answer."""
@@ -523,6 +531,11 @@ def _assembled(
     model_folder.check_attention(model.get_submodule(family.layers))
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
+    tokenizer = processor.tokenizer
+    if not processor.chat_template:  # a tokenizer that was saved by itself holds it
+        processor.chat_template = tokenizer.chat_template
+    if tokenizer.pad_token is None:  # as of LLaMA: what is padded is masked
+        tokenizer.pad_token = tokenizer.eos_token
     if family.prompt is None and not processor.chat_template:
         raise model_folder.misfit(f"no chat template in '{folder}', by which the model is asked")
     return HFBackbone(model, processor, family, model_folder.processor_files(folder)).eval()

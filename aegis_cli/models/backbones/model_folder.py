@@ -203,6 +203,7 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
             "a family that it has",
             "pip install --upgrade transformers, if it is a new one",
         )
+    _refuse_quantised(folder, config)
     if not weights(folder):
         others = [p.name for p in sorted(folder.iterdir()) if p.suffix in (".bin", ".pt", ".pth")]
         raise AegisError(
@@ -210,6 +211,20 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
             "weights as safetensors",
             "save it anew with transformers: model.save_pretrained(FOLDER)" if others else again,
         )
+
+
+def _refuse_quantised(folder: Path, config: dict[str, Any]) -> None:
+    """Raise AegisError for weights that are packed: no gradient reaches them."""
+    parts = [config, *(part for part in config.values() if isinstance(part, dict))]
+    for part in parts:
+        if isinstance(said := part.get("quantization_config"), dict):
+            by = str(said.get("quant_method", "a method that it does not name"))
+            raise AegisError(
+                f"quantised weights in '{folder}' (by {by}, says its config.json)",
+                "weights of float32, bfloat16 or float16, which can learn",
+                "take the model that it was made from, or save it anew with transformers: "
+                "model.dequantize().save_pretrained(FOLDER), with the processor's files",
+            )
 
 
 def refuse_adapter(folder: Path) -> None:

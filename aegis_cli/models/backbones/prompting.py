@@ -7,6 +7,7 @@ known of its type.
 from __future__ import annotations
 
 import copy
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.data.batch import Images
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
@@ -69,7 +70,7 @@ class Prompter:
         self._processors, self._family = Processors(processor), family
         self._longest, self._words = longest, words
         self._tokenizer = processor.tokenizer  # of the original
-        self._marker = self._tokenizer.convert_ids_to_tokens(image_token)
+        self._markers = _markers(processor, image_token)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
         """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
@@ -96,11 +97,7 @@ class Prompter:
                     **self._special(texts[0]),
                 )
         except ValueError as error:
-            raise AegisError(
-                f"an image or a text that the processor refuses: {error}",
-                "images and texts that this model takes",
-                "leave out that image, or the model's own markers in the text",
-            ) from error
+            raise self._first_refused(pictures, prompts, texts) or _unfit(str(error)) from error
         tensors = {
             name: t for name, t in made.items() if isinstance(t, Tensor) and name != "labels"
         }
@@ -108,9 +105,22 @@ class Prompter:
         pixels = tensors.pop("pixel_values")
         if _PIXEL_MASK in tensors:  # as large as a picture, in eight bytes a pixel
             tensors[_PIXEL_MASK] = tensors[_PIXEL_MASK].bool()
-        self._check_length(ids.shape[1])
+        self._check_length(ids.shape[1], prompts[int(mask.sum(1).argmax())])
         self._check_known(ids.max().item())
         return Batch(pixels, ids, mask.bool(), tensors)
+
+    def _first_refused(
+        self, pictures: Sequence[list[Image.Image]], prompts: Sequence[str], texts: Sequence[str]
+    ) -> AegisError | None:
+        """What the processor says of the first row that it refuses alone."""
+        for own, asked, text in zip(pictures, prompts, texts, strict=True):
+            try:
+                with self._processors.one() as processor:
+                    processor(images=[own], text=[text], **self._special(text))
+            except ValueError as error:
+                sizes = " and ".join(f"{image.width} x {image.height}" for image in own)
+                return _unfit(f"{_quoted(asked)} about {sizes} pixels: {in_short(error)}")
+        return None
 
     def padded(self, batch: Batch, multiple: int) -> Batch:
         """The batch, padded on the right to a multiple of that many tokens where the model can."""
@@ -143,6 +153,10 @@ class Prompter:
             tokenize=False,
         )
 
+    def places_image(self) -> bool:
+        """Whether the mark of an image is in what the model is asked about one."""
+        return any(marker in self._prompt("a") for marker in self._markers)
+
     def _special(self, text: str) -> dict[str, bool]:
         """Arguments that keep a template with the first token from getting it twice."""
         first = self._tokenizer.bos_token
@@ -151,14 +165,22 @@ class Prompter:
         return {}
 
     def check_text(self, text: str) -> None:
-        """Raise AegisError if a question, instruction or answer holds the mark of an image."""
-        if isinstance(self._marker, str) and self._marker in text:
-            raise _refused(f"'{text}' holds {self._marker}, which stands for an image")
+        """Raise AegisError if a question, instruction or answer can be read beside no image.
 
-    def _check_length(self, tokens: int) -> None:
+        It holds the mark of an image or of another medium, or is too long by itself.
+        """
+        found = next((marker for marker in self._markers if marker in text), None)
+        if found is not None:
+            raise _refused(f"{_quoted(text)} holds {found}, which stands for an image")
+        if len(text.encode()) > self._longest:  # else it has no more tokens than the model reads
+            with self._processors.one() as processor:
+                own = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+            self._check_length(len(own), text)
+
+    def _check_length(self, tokens: int, text: str) -> None:
         if tokens > self._longest:
             raise AegisError(
-                f"a text of {tokens} tokens (its image's among them)",
+                f"{_quoted(text)}: {tokens} tokens (its image's among them)",
                 f"at most {self._longest}, the model's positions",
                 "ask with fewer words",
             )
@@ -184,8 +206,8 @@ class Prompter:
                 self._check_known(max(said[-1], default=0))
         return said
 
-    def decode(self, ids: Tensor) -> list[str]:
-        """Texts of generated tokens [B, S], without the model's markers."""
+    def decode(self, ids: Sequence[Sequence[int]]) -> list[str]:
+        """Texts of generated tokens, without the model's markers."""
         texts = self._tokenizer.batch_decode(ids, skip_special_tokens=True)
         return [text.strip() for text in texts]
 
@@ -200,7 +222,7 @@ class Prompter:
         """Each row followed by its answer's tokens, padded on the right again."""
         prompt_lengths = batch.mask.sum(1).tolist()
         lengths = [n + len(words) for n, words in zip(prompt_lengths, said, strict=True)]
-        self._check_length(max(lengths))
+        self._check_length(max(lengths), "a question with its answer")
         room = (len(said), max(lengths))
         ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)
         # What the processor says of each token, such as its type, has to be said of the answer's.
@@ -215,6 +237,31 @@ class Prompter:
                 type_ids[i, n:total] = self._family.answer_types.get(name, 0)
         mask = torch.arange(room[1], device=ids.device) < ids.new_tensor(lengths)[:, None]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
+
+
+def _markers(processor: Any, image_token: int) -> tuple[str, ...]:
+    """The words that a processor replaces by an image, a video or a sound."""
+    kinds = ("image", "video", "audio", "boi")  # the last is how an image begins
+    named = [
+        getattr(owner, f"{kind}_token", None)
+        for owner in (processor, processor.tokenizer)
+        for kind in kinds
+    ]
+    known = [processor.tokenizer.convert_ids_to_tokens(image_token), *named]
+    return tuple(dict.fromkeys(word for word in known if isinstance(word, str) and word))
+
+
+def _quoted(text: str) -> str:
+    """The beginning of a text, in quotes."""
+    return f"'{textwrap.shorten(text, 80, placeholder=' ...')}'"
+
+
+def _unfit(why: str) -> AegisError:
+    return AegisError(
+        f"an image or a text that the processor refuses: {why}",
+        "images and texts that this model takes",
+        "leave out that question, such as by --skip-bad, or the model's own markers in its text",
+    )
 
 
 def _refused(why: str) -> AegisError:

@@ -347,6 +347,24 @@ def test_a_longer_set_begins_with_the_shorter_one(lines: Path, part: str) -> Non
     assert names[::2] == names[1::2]  # side by side
 
 
+def test_what_a_model_refuses_beside_its_image_is_left_out_where_bad_questions_are(
+    lines: Path,
+) -> None:
+    seen: list[str] = []
+
+    def check(question: str, answer: str, image: torch.Tensor | None = None) -> None:
+        seen.append(question)
+        if image is not None and image.shape[1] > 40:
+            raise AegisError("a wide image", "a narrow one", "leave it out")
+
+    whole = sets.read(str(lines), ask="{} say").choose("probe", 1000, 0, [check])
+    assert all(question.endswith(" say") for question in seen)  # as the model will read it
+    wide = [image.shape[1] > 40 for image in whole.images[whole.image_of]]
+    assert any(wide) and not all(wide)
+    rest = sets.read(str(lines), skip_bad=True).choose("probe", 1000, 0, [check])
+    assert rest.skipped == sum(wide) and len(rest.questions) == len(wide) - sum(wide)
+
+
 @pytest.mark.parametrize("skip_bad", [False, True])
 def test_a_part_without_an_image_is_an_error(skip_bad: bool, tmp_path: Path) -> None:
     source = sets.read(str(write_jsonl(tmp_path, 1)), skip_bad)
