@@ -203,7 +203,8 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
         )
     valid = _valid(mask, shape, device)
     if image is None:
-        return Pass(0, None, hidden, valid, torch.zeros(shape[1], dtype=torch.bool, device=device))
+        no_image = torch.zeros(shape[1], dtype=torch.bool, device=device)
+        return Pass(step=0, inputs=None, hidden=hidden, mask=valid, image=no_image)
     is_image = boolean(image, "an image mask").to(device)
     if is_image.shape not in (shape, shape[1:]):
         raise AegisError(
@@ -211,7 +212,7 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
             f"{list(shape)} or {list(shape[1:])}",
             "mark each token the layers see",
         )
-    return Pass(0, None, hidden, valid, is_image)
+    return Pass(step=0, inputs=None, hidden=hidden, mask=valid, image=is_image)
 
 
 def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tensor:

@@ -118,7 +118,12 @@ class Stepper:
 
     def _update(self) -> Update:
         """What the pending steps have done."""
-        return Update(self._before, self._anchor, self._moved, self._rate_left)
+        return Update(
+            before=self._before,
+            anchor_gradient=self._anchor,
+            steps=self._moved,
+            rate_left=self._rate_left,
+        )
 
     def _copies(self) -> dict[str, Tensor]:
         """The parameters' values by all their names, each copied once."""

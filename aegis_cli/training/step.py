@@ -117,16 +117,16 @@ def compute_gradients(
     names = _learning_names(policy.backbone)
     groups = list(policy.backbone.learning_groups().values())
     settings = _Settings(
-        policy,
-        method,
-        parts,
-        groups,
-        index,
-        flow_samples,
-        precision,
-        ranks,
-        accumulate,
-        reused is not None,
+        policy=policy,
+        method=method,
+        parts=parts,
+        groups=groups,
+        index=index,
+        flow_samples=flow_samples,
+        precision=precision,
+        ranks=ranks,
+        accumulate=accumulate,
+        reuses=reused is not None,
     )
     loss, w2, taken = _all_passes(settings, batch, generator, masters)
     parallel.add_up_gradients(policy, ranks)
@@ -286,15 +286,15 @@ def _backward(
             inputs = backbone.prepare(shown.images, shown.instructions)
         encoding = backbone.encode(inputs)
         seen = Pass(
-            settings.index,
-            inputs,
-            encoding.hidden,
-            encoding.mask,
-            encoding.image,
-            shown,
-            of.share,
-            total,
-            prepared_by_method,
+            step=settings.index,
+            inputs=inputs,
+            hidden=encoding.hidden,
+            mask=encoding.mask,
+            image=encoding.image,
+            frames=shown,
+            share=of.share,
+            total=total,
+            prepared=prepared_by_method,
         )
         return encoding, seen
 
