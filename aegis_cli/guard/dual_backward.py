@@ -255,7 +255,7 @@ class DualBackward:
         return groups
 
     def _refuse_reentrant(self, penalty: Tensor) -> None:
-        if not self._looked and backward.has_node(penalty, "CheckpointFunctionBackward"):
+        if not self._looked and backward.uses_reentrant_checkpointing(penalty):
             raise AegisError(
                 "gradient checkpointing with use_reentrant=True",
                 "use_reentrant=False",

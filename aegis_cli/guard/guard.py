@@ -195,7 +195,7 @@ class Guard(Removable):
         self._check_image(image)
         self._dual.check_group()
         self._dual.forget_cleared()
-        backward.keep_compiled()
+        backward.recompile_for_two_backward_passes()
         with self._hooks.watch(mask, image, self._note):
             yield
 
@@ -257,7 +257,7 @@ class Guard(Removable):
                 "call the guard in the loop: guard.watch, guard.backward and guard.step",
             )
         self._check_image(image)
-        backward.keep_compiled_from_now_on()
+        backward.compile_for_two_backward_passes()
         self._automatic = AutomaticLoop(
             self._stepper,
             self._dual,

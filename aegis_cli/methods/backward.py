@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import Node
 
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
@@ -57,17 +58,31 @@ def second_backward_of_rows(
     return found
 
 
-def _leaves(result: Tensor) -> Iterator[Tensor]:
-    """The tensors into whose `.grad` a backward pass from `result` may add."""
+def _nodes(result: Tensor) -> Iterator[Node]:
+    """The nodes of the graph that leads to `result`, each once."""
     waiting, seen = [result.grad_fn], set()
     while waiting:
         node = waiting.pop()
         if node is None or node in seen:
             continue
         seen.add(node)
+        yield node
+        waiting += [earlier for earlier, _ in node.next_functions]
+
+
+def _leaves(result: Tensor) -> Iterator[Tensor]:
+    """The tensors into whose `.grad` a backward pass from `result` may add."""
+    for node in _nodes(result):
         if (leaf := getattr(node, "variable", None)) is not None:
             yield leaf
-        waiting += [earlier for earlier, _ in node.next_functions]
+
+
+def uses_reentrant_checkpointing(result: Tensor) -> bool:
+    """Whether a part of the graph is recomputed by `torch.utils.checkpoint(use_reentrant=True)`.
+
+    Such a part allows one backward pass only.
+    """
+    return any(node.name() == "CheckpointFunctionBackward" for node in _nodes(result))
 
 
 def where_task_moves(
@@ -153,8 +168,8 @@ def _rows_here(gradients: projection.Gradients) -> projection.Gradients:
     return [None if g is None else rows_here(g) for g in gradients]
 
 
-def keep_compiled() -> None:
-    """Compile graphs that bear two backward passes from now on, and drop those compiled before.
+def recompile_for_two_backward_passes() -> None:
+    """If torch.compile was used: recompile, so that each graph allows a second backward pass.
 
     A graph compiled for one backward pass overwrites the buffers that the second needs.
     """
@@ -167,23 +182,9 @@ def keep_compiled() -> None:
         dynamo.reset()
 
 
-def keep_compiled_from_now_on() -> None:
-    """The same for graphs that are compiled later, whether or not anything is compiled yet."""
+def compile_for_two_backward_passes() -> None:
+    """Let graphs compiled from now on allow a second backward pass, and recompile older ones."""
     import torch._functorch.config as config
 
-    keep_compiled()
+    recompile_for_two_backward_passes()
     config.donated_buffer = False
-
-
-def has_node(result: Tensor, name: str) -> bool:
-    """Whether a function of that name, such as `AddBackward0`, has a part in the result's graph."""
-    seen, waiting = set(), [result.grad_fn]
-    while waiting:
-        node = waiting.pop()
-        if node is None or node in seen:
-            continue
-        if node.name() == name:
-            return True
-        seen.add(node)
-        waiting += [before for before, _ in node.next_functions]
-    return False
