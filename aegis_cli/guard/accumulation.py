@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
-from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
@@ -198,80 +197,3 @@ def poison(total: Accumulation, groups: Groups) -> list[nn.Parameter]:
                 parameter.grad = torch.full_like(parameter, torch.inf)
                 poisoned.append(parameter)
     return poisoned
-
-
-# --- several processes ---------------------------------------------------------------------------
-
-
-WORLD = "world"  # all processes, also where they are connected only after the guard was made
-Group = dist.ProcessGroup | str | None
-
-
-def processes() -> int:
-    """How many processes torch.distributed has connected by now; 1 where it has none."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
-
-
-def resolved(group: Group) -> dist.ProcessGroup | None:
-    """The group that is meant, as far as it is there by now.
-
-    Raises:
-        AegisError: another text than "world".
-    """
-    if not isinstance(group, str):
-        return group
-    if group != WORLD:
-        raise AegisError(
-            f"process_group={group!r}",
-            f"a group of torch.distributed, or {WORLD!r}",
-            f"process_group={WORLD!r}",
-        )
-    return dist.group.WORLD if processes() > 1 else None
-
-
-def check_group(group: Group) -> None:
-    """Raise AegisError where several processes run and no group names those that share a model."""
-    if resolved(group) is None and processes() > 1:
-        raise AegisError(
-            f"a guard in one of {processes()} processes without process_group=",
-            "those that train one model together",
-            f"process_group={WORLD!r}, under DistributedDataParallel or FSDP2",
-        )
-
-
-@torch.no_grad()
-def mean_over(tensors: Sequence[Tensor], group: dist.ProcessGroup) -> list[Tensor]:
-    """Mean of each tensor over the group's processes.
-
-    The means are new tensors, because autograd may give several parameters one and the same.
-    """
-    means = [tensor / dist.get_world_size(group) for tensor in tensors]
-    # All are begun before the first is waited for, so that they overlap.
-    begun = [dist.all_reduce(tensor, group=group, async_op=True) for tensor in means]
-    for work in begun:
-        work.wait()
-    return means
-
-
-@torch.no_grad()
-def mean_gradients(
-    gradients: Mapping[int, Tensor | None],
-    parameters: Mapping[int, Tensor],
-    group: dist.ProcessGroup,
-) -> dict[int, Tensor | None]:
-    """Mean of each gradient over the group's processes, by the parameters' ids.
-
-    A gradient that a process lacks counts as zero there; one that all lack stays None.
-    """
-    like = next(iter(parameters.values()))
-    here = [gradients[i] is not None for i in parameters]
-    # Every process has to join each reduction below, so they agree first on which there are.
-    counts = torch.tensor(here, dtype=torch.int32, device=like.device)
-    dist.all_reduce(counts, group=group)
-    somewhere = [i for i, count in zip(parameters, counts.tolist(), strict=True) if count]
-    own = []
-    for i in somewhere:
-        gradient = gradients[i]
-        own.append(torch.zeros_like(parameters[i]) if gradient is None else gradient)
-    means = dict(zip(somewhere, mean_over(own, group), strict=True))
-    return dict.fromkeys(gradients) | means

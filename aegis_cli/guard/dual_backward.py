@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.ranks import Ranks
-from aegis_cli.guard import accumulation
-from aegis_cli.guard.accumulation import Accumulation, Group
+from aegis_cli.guard import accumulation, process_groups
+from aegis_cli.guard.accumulation import Accumulation
+from aegis_cli.guard.process_groups import ProcessGroup
 from aegis_cli.guard.stepper import GuardedStepper
 from aegis_cli.methods import backward
 from aegis_cli.methods.base import Parts, Pass
@@ -47,7 +48,7 @@ class DualBackward:
         stepper: GuardedStepper,
         ledger: LedgerOutsideRuns,
         owners: Ranks,
-        processes: Group,
+        processes: ProcessGroup,
         around: Sequence[nn.Parameter] = (),
     ) -> None:
         """Begin without a pass.
@@ -100,7 +101,7 @@ class DualBackward:
 
         Trainers connect them long after the guard was made.
         """
-        accumulation.check_group(self._processes)
+        process_groups.check(self._processes)
 
     def forget_cleared(self) -> None:
         """Forget the sum if its gradients are gone, before a forward pass needs the memory."""
@@ -213,13 +214,13 @@ class DualBackward:
         """
         assert self._parts.combine is not None
         groups, taken, w2 = self._learning(), anchor.taken, anchor.w2
-        processes = accumulation.resolved(self._processes)
+        processes = process_groups.resolved(self._processes)
         if processes is not None:
             if not self._owners.several:  # else they arrive as means
                 learning = {id(p): p for group in groups for p in group}
-                taken = accumulation.mean_gradients(taken, learning, processes)
+                taken = process_groups.mean_gradients(taken, learning, processes)
             numbers = [w2] if loss is None else [w2, loss]
-            w2, *rest = accumulation.mean_over(numbers, processes)
+            w2, *rest = process_groups.mean_over(numbers, processes)
             loss = next(iter(rest), None)
         if total is None:
             if not self._poisoned:  # else it is a further micro-batch of that step

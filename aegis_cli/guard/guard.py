@@ -17,11 +17,11 @@ from aegis_cli.anchors.any_model import Measurement
 from aegis_cli.anchors.hooks import LayerHooks, Removable
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks
-from aegis_cli.guard import accumulation
-from aegis_cli.guard.accumulation import Group
+from aegis_cli.guard import process_groups
 from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
 from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
 from aegis_cli.guard.options import SECTIONS, naming_its_part, start
+from aegis_cli.guard.process_groups import ProcessGroup
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.guard.trainer_callback import trainer_callback
 from aegis_cli.methods import backward
@@ -73,7 +73,7 @@ class Guard(Removable):
         method: str = "aegis",
         part: str | None = None,
         vision: str | Sequence[str] = (),
-        process_group: Group = None,
+        process_group: ProcessGroup = None,
         **options: Any,
     ) -> None:
         """Check model and anchor against each other, and start the method.
@@ -108,9 +108,9 @@ class Guard(Removable):
         policy = model
         model, path = structure.part_of(policy, part), Path(anchor)
         dual = methods.get(method).compares_layers
-        self._owners = _owners(model, accumulation.resolved(process_group))
+        self._owners = _owners(model, process_groups.resolved(process_group))
         if dual:
-            accumulation.check_group(process_group)
+            process_groups.check(process_group)
         _refuse_sparse(model)
         structure.refuse_offloaded(model)
         _refuse_spread_together(model)
@@ -460,9 +460,9 @@ def _refuse_spread_together(model: nn.Module) -> None:
     They would exchange gradients of a device that is another process's.
     """
     devices = sorted({str(p.device) for p in model.parameters()})
-    if len(devices) > 1 and accumulation.processes() > 1:
+    if len(devices) > 1 and process_groups.count() > 1:
         raise AegisError(
-            f"a model on {' and '.join(devices)} in one of {accumulation.processes()} processes",
+            f"a model on {' and '.join(devices)} in one of {process_groups.count()} processes",
             "a model on one device in each process, or on several devices in one process",
             "load it without device_map in each process, or start a single process",
         )

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.guard.accumulation import processes
+from aegis_cli.guard import process_groups
 from aegis_cli.models import structure
 
 MASTER = "aegis_master"  # in a parameter's state: its value in float32
@@ -43,10 +43,10 @@ class WideStep:
             AegisError: several processes, whose DistributedDataParallel would no longer see the
                 gradients of parameters that have been of another type.
         """
-        if self._half and processes() > 1:
+        if self._half and process_groups.count() > 1:
             raise AegisError(
                 f"weights in {str(self._half[0].dtype).removeprefix('torch.')} in one of "
-                f"{processes()} processes",
+                f"{process_groups.count()} processes",
                 "float32 weights, or one process",
                 "load the model in float32",
             )

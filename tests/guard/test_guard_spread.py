@@ -17,7 +17,7 @@ from samples.spread_model import DONE, PLACES
 
 from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
-from aegis_cli.guard import accumulation
+from aegis_cli.guard import process_groups
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +59,8 @@ def test_a_spread_model_in_one_of_several_processes_is_refused(
 ) -> None:
     anchor = measured(make(), tmp_path / "anchor.safetensors")
     model = make()
-    monkeypatch.setattr(accumulation, "processes", lambda: 2)
-    monkeypatch.setattr(accumulation, "check_group", lambda _: None)
+    monkeypatch.setattr(process_groups, "count", lambda: 2)
+    monkeypatch.setattr(process_groups, "check", lambda _: None)
     model.text.layers[1].register_parameter(
         "elsewhere", torch.nn.Parameter(torch.empty(1, device="meta"))
     )

@@ -28,7 +28,7 @@ from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
-from aegis_cli.guard import accumulation
+from aegis_cli.guard import process_groups
 from aegis_cli.methods.aegis import _penalty
 from aegis_cli.methods.base import Pass
 
@@ -165,16 +165,16 @@ def test_processes_that_are_connected_after_the_guard_was_made(
     named = Guard(make(), anchors["aegis"], layers=LAYERS, process_group="world")
     if is_automatic:
         guard.automatic(mask="mask")
-    monkeypatch.setattr(accumulation, "processes", lambda: 2)
+    monkeypatch.setattr(process_groups, "count", lambda: 2)
     begin = (lambda: task_loss(model, 0)) if is_automatic else (lambda: watched(guard, model))
     refused(begin, "one of 2 processes", "process_group='world'")
     known = {"world": "all of them", None: None}
-    monkeypatch.setattr(accumulation, "resolved", lambda group: known[group])
+    monkeypatch.setattr(process_groups, "resolved", lambda group: known[group])
     asked: list[object] = []
     monkeypatch.setattr(
-        accumulation, "mean_gradients", lambda taken, _, group: (asked.append(group), taken)[1]
+        process_groups, "mean_gradients", lambda taken, _, group: (asked.append(group), taken)[1]
     )
-    monkeypatch.setattr(accumulation, "mean_over", lambda numbers, group: list(numbers))
+    monkeypatch.setattr(process_groups, "mean_over", lambda numbers, group: list(numbers))
     with named.watch(MASK):
         loss = task_loss(named._model, 0)
     named.backward(loss)

@@ -18,7 +18,7 @@ from torch.nn.parallel import DistributedDataParallel
 from aegis_cli import Guard
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import whole
-from aegis_cli.guard import accumulation
+from aegis_cli.guard import process_groups
 from aegis_cli.models import structure
 from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss, vector
 
@@ -221,7 +221,7 @@ def lack_one(rank: int, folder: str) -> None:
         1: torch.full((2,), 4.0) if rank == 0 else None,
         2: None,
     }
-    found = accumulation.mean_gradients(given, parameters, dist.group.WORLD)
+    found = process_groups.mean_gradients(given, parameters, dist.group.WORLD)
     assert {i: None if g is None else g.tolist() for i, g in found.items()} == {
         0: [1.5, 1.5],
         1: [2.0, 2.0],
