@@ -20,6 +20,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
+from aegis_cli.core.numerics import widened
 from aegis_cli.core.spectrum import DENSE, Spectrum
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
@@ -286,7 +287,7 @@ class CurvatureRecorder:
         """Add what one call of the module says by the gradient at its output."""
         _refuse_changed(f"what '{site}' read", reading.x, reading.version)
         x, g = inputs.dense_rows(module, reading.x), _output_rows(module, gradient)
-        g = g.to(torch.promote_types(g.dtype, torch.float32))
+        g = widened(g)
         # |x|^2 g g^T is the second moment of the row |x| g, and so for the other factor.
         self._sums.note(f"{site}.{SIDES[0]}")
         self._sums.add_rows([f"{site}.{SIDES[1]}"], g * x.norm(dim=1, keepdim=True))

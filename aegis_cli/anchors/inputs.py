@@ -19,6 +19,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
+from aegis_cli.core.numerics import widened
 from aegis_cli.core.spectrum import DENSE, Spectrum, channel_moment, lone_row
 from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
@@ -383,8 +384,7 @@ def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
 
     Rows narrower than float32 are widened.
     """
-    rows = rows_of(module, x)
-    rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
+    rows = widened(rows_of(module, x))
     if getattr(module, "bias", None) is None:
         return rows
     return torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)

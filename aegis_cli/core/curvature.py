@@ -37,7 +37,7 @@ from torch import Tensor
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.projection import ratio
+from aegis_cli.core.numerics import ratio, wide_type
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.core.stacking import Pair
 
@@ -190,7 +190,7 @@ def curvatures(
     found = {}
     held: dict[tuple[int, torch.device], Tensor] = {}
     for site, weight in weights.items():
-        like = weight.new_empty(0, dtype=torch.promote_types(weight.dtype, torch.float32))
+        like = weight.new_empty(0, dtype=wide_type(weight.dtype))
         kept_in = like.half() if sketched else like
         inputs, outputs = (anchor.curvature[name] for name in factors[site])
         for spectrum in (inputs, outputs):

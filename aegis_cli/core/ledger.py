@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core import projection
+from aegis_cli.core.numerics import ratio
 
 COLUMNS = ("tt", "ta", "aa", "w2")
 _LEAST_ROWS = 64  # room that a ledger makes at a time
@@ -122,7 +123,7 @@ def step_energy_shed(tensors: Mapping[str, Tensor]) -> Tensor:
     It is 0 where that sum is 0.
     """
     removed = projection.removed_energy(tensors["ta"], tensors["aa"]).sum(1)
-    return projection.ratio(removed, tensors["tt"].sum(1))
+    return ratio(removed, tensors["tt"].sum(1))
 
 
 def energy_shed_mean(tensors: Mapping[str, Tensor]) -> float:

@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aegis_cli.core.projection import ratio
+from aegis_cli.core.numerics import ratio
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.core.stacking import Pair
 

@@ -23,6 +23,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from aegis_cli.core.numerics import widened
 from aegis_cli.core.spectrum import Spectrum, decompose, second_moment, with_rest
 
 EXACT_SUM = 512  # widest second moment that is summed in float64
@@ -103,7 +104,7 @@ class Whole(MomentSum):
 
     @torch.no_grad()
     def add(self, rows: Tensor) -> None:
-        x = _widened(rows)
+        x = widened(rows)
         if self._width <= EXACT_SUM:
             moment = second_moment(x)
             self._sums = [self._sums[0] + moment if self._sums else moment]
@@ -223,7 +224,7 @@ class TraceOnly(MomentSum):
         self._trace = torch.zeros((), dtype=torch.float64, device=device)
 
     def add(self, rows: Tensor) -> None:
-        self._trace += _energy(_widened(rows))
+        self._trace += _energy(widened(rows))
 
     def plus(self, other: MomentSum) -> MomentSum:
         assert isinstance(other, TraceOnly)
@@ -251,10 +252,6 @@ def merged(sums: Sequence[MomentSum]) -> MomentSum:
 def _energy(rows: Tensor) -> Tensor:
     """The sum of squares of rows [n, d], float64; each row's own norm is in float32."""
     return torch.linalg.vector_norm(rows, dim=1).double().square().sum()
-
-
-def _widened(rows: Tensor) -> Tensor:
-    return rows.to(torch.promote_types(rows.dtype, torch.float32))
 
 
 def _strips(width: int) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.projection import ratio
+from aegis_cli.core.numerics import ratio, wide_type, widened
 from aegis_cli.core.spectrum import Spectrum, rank
 from aegis_cli.core.stacking import Pair
 
@@ -241,7 +241,7 @@ def protect(
     Raises:
         AegisError: a spectrum holds too few eigenvectors for that share.
     """
-    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
+    like = like.new_empty(0, dtype=wide_type(like.dtype))
     if read.kind == "rows":
         head = None
         if scores is not None:
@@ -357,7 +357,7 @@ def minus(a: Pair, b: Pair) -> Pair:
 
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
-    return a.to(torch.promote_types(a.dtype, torch.float32)) - b
+    return widened(a) - b
 
 
 def protections(

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from aegis_cli.core.numerics import ratio
+
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -224,9 +226,3 @@ def conflict(ta: Tensor) -> Tensor:
     """Whether the task's step would raise the transport cost, to first order."""
     # A step along -g changes the cost by -<g, a>.
     return ta < 0
-
-
-def ratio(x: Tensor, y: Tensor) -> Tensor:
-    """x / y, and 0 where y is exactly 0, whatever x is."""
-    zero = y == 0
-    return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)

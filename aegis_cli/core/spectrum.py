@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.core.numerics import widened
+
 # Maps that mix their inputs; the others read each channel for itself.
 DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)
 _BLOCK = 4096  # rows multiplied in float32 before the product is added in float64
@@ -75,7 +77,7 @@ def second_moment(rows: Tensor) -> Tensor:
     directions. Some processors' products are not symmetric bit by bit, so the lower triangle is
     mirrored.
     """
-    x = rows.to(torch.promote_types(rows.dtype, torch.float32))
+    x = widened(rows)
     total = torch.zeros(x.shape[1], x.shape[1], dtype=torch.float64, device=x.device)
     with torch.autocast(x.device.type, enabled=False):
         for block in x.split(_BLOCK):

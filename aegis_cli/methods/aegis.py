@@ -35,6 +35,7 @@ from aegis_cli.core.moments import (
     merge,
     shared_moments,
 )
+from aegis_cli.core.numerics import ratio, wide_type
 from aegis_cli.core.transport import layer_weights, transport_penalty
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
 
@@ -60,7 +61,7 @@ def start(setting: Setting) -> Parts:
         )
     like = next(p for group in setting.groups.values() for p in group)
     # Weights in bfloat16 are compared with an anchor in float32 all the same.
-    like = like.new_empty(0, dtype=torch.promote_types(like.dtype, torch.float32))
+    like = like.new_empty(0, dtype=wide_type(like.dtype))
     return Parts(
         penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
         combine=_combine(
@@ -202,7 +203,7 @@ def project_update(
     anchor = [None if a is None else rows_here(a) for a in given]
     # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
     _, along, aa = owners.total(torch.stack(projection.inner(moved, anchor)))
-    excess: float | Tensor = projection.ratio(torch.relu(along), aa)
+    excess: float | Tensor = ratio(torch.relu(along), aa)
     if not devices.reading_stalls(aa.device):
         excess = float(excess)
         if excess == 0:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common import devices
+from aegis_cli.core.numerics import widened
 from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
 from aegis_cli.models.backbones.base import Backbone
 
@@ -77,7 +78,7 @@ def relative_distance(
     if devices.reading_stalls(mask.device):
         # To select rows would wait for their number.
         for h, h0 in zip(hidden, taught, strict=True):
-            layers.append(_relative_padded(_wide(h), _wide(h0), mask[..., None], total))
+            layers.append(_relative_padded(widened(h), widened(h0), mask[..., None], total))
         return torch.stack(layers).mean()
     index = mask.flatten().nonzero().squeeze(1)
     for h, h0 in zip(hidden, taught, strict=True):
@@ -107,12 +108,7 @@ def _relative_padded(
 
 def _rows(h: Tensor, index: Tensor) -> Tensor:
     """[B, T, D] -> [n, D]."""
-    return _wide(h.flatten(0, 1).index_select(0, index))
-
-
-def _wide(x: Tensor) -> Tensor:
-    """In float32, or float64 where it came so."""
-    return x if x.dtype == torch.float64 else x.float()
+    return widened(h.flatten(0, 1).index_select(0, index))
 
 
 METHOD = Method(

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.core.numerics import wide_type
 from aegis_cli.methods.base import Method
 
 
@@ -21,7 +22,7 @@ class LowRankLinear(nn.Module):
         super().__init__()
         self.base, self.scale = base, alpha / rank
         # The term is small, and so are its steps: half precision would lose them.
-        wide = torch.promote_types(base.weight.dtype, torch.float32)
+        wide = wide_type(base.weight.dtype)
         # Drawn on the CPU, so that a seed begins alike on every device; uniform in +-1/sqrt(in), as
         # the paper's own code has it.
         drawn = nn.init.kaiming_uniform_(

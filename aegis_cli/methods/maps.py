@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
+from aegis_cli.core.numerics import ratio
 from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
 
 
@@ -84,7 +85,7 @@ def _project(parameter: nn.Parameter, origin: Tensor, products: Tensor, strength
     now = rows_here(parameter) - rows_here(origin)
     far, near = products[:2].sqrt()
     uphill = products[2]  # -c
-    grown = projection.ratio(torch.relu(far - near), far)
+    grown = ratio(torch.relu(far - near), far)
     # Above 1 it would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     rows_here(parameter).sub_(share * now)

@@ -15,6 +15,7 @@ from torch.func import functional_call
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here, whole
+from aegis_cli.core.numerics import widened
 from aegis_cli.models import wrappers
 from aegis_cli.models.wrappers import PlainNames, plain_names
 
@@ -581,6 +582,6 @@ def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
 
     The arithmetic is in float32 or wider.
     """
-    wide = x if x.dtype == torch.float64 else x.float()
+    wide = widened(x)
     epsilon = rms_epsilon(module, wide.dtype)
     return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + epsilon)

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from aegis_cli.core import projection
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
+from aegis_cli.core.numerics import ratio
 from aegis_cli.methods import METHODS, aegis
 from aegis_cli.methods.base import Parts, Pass, Setting, Update
 from aegis_cli.models.policy import Policy
@@ -376,7 +377,7 @@ def along(names: list[str], now: Named, before: Named, anchor: Named) -> tuple[T
     dd, da, aa = projection.inner(
         [difference(now[n], before[n]) for n in names], [anchor.get(n) for n in names]
     )
-    return da, projection.ratio(da, (dd * aa).sqrt())
+    return da, ratio(da, (dd * aa).sqrt())
 
 
 @pytest.mark.parametrize("projects", ["update", "both"])
