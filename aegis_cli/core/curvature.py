@@ -38,8 +38,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.numerics import ratio, wide_type
+from aegis_cli.core.pairs import Pair
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.core.stacking import Pair
 
 # A proximal step of this weight takes away all that has a curvature. In float32 a larger one may be
 # infinite, and infinity times a curvature of 0 is no number.

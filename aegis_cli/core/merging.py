@@ -41,8 +41,8 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core.numerics import ratio
+from aegis_cli.core.pairs import Pair, like, matrix
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.core.stacking import Pair
 
 
 @dataclass(frozen=True)
@@ -111,21 +111,6 @@ def damped(spectrum: Spectrum, damping: float) -> Tensor:
     whole = (vectors * (stored - rest)) @ vectors.T
     whole.diagonal().add_(rest + damping)
     return (whole + whole.T) / 2
-
-
-def matrix(pair: Pair) -> Tensor:
-    """A map's weight [o, ...] as a matrix [o, d], with its bias as the last column."""
-    weight, bias = pair
-    flat = weight.flatten(1)
-    return flat if bias is None else torch.cat([flat, bias[:, None]], 1)
-
-
-def like(flat: Tensor, pair: Pair) -> Pair:
-    """The matrix [o, d] as a weight and a bias in the pair's shapes, dtypes and device."""
-    weight, bias = pair
-    width = weight[0].numel()
-    flat = flat.to(weight)
-    return flat[:, :width].reshape(weight.shape), None if bias is None else flat[:, width]
 
 
 def _share(task: Tensor, questions: Tensor, strength: float) -> Tensor:

@@ -19,9 +19,9 @@ from torch import Tensor
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.numerics import ratio, wide_type, widened
+from aegis_cli.core.numerics import ratio, wide_type
+from aegis_cli.core.pairs import Pair, copied, minus
 from aegis_cli.core.spectrum import Spectrum, rank
-from aegis_cli.core.stacking import Pair
 
 Remembered = tuple[Tensor | None, ...]  # what a protection keeps of a map's values
 
@@ -323,41 +323,9 @@ def stacked(found: Sequence[Protection]) -> Protection:
     raise TypeError("only maps or normalisations are stacked, not tables")
 
 
-# --- updates --------------------------------------------------------------------------------------
-
-
 def allowed(protection: Protection, update: Pair) -> Pair:
     """The update without its protected part."""
     return minus(update, protection.removed(*update))
-
-
-def copied(pair: Pair) -> Pair:
-    """A copy of the values, which later changes of the parameters do not reach."""
-    weight, bias = pair
-    return weight.detach().clone(), None if bias is None else bias.detach().clone()
-
-
-def copied_small(pair: Pair) -> Pair:
-    """A copy in half precision where that holds the same numbers, as of a model of the hub."""
-    weight, bias = pair
-    return _small(weight), None if bias is None else _small(bias)
-
-
-def _small(x: Tensor) -> Tensor:
-    half = x.detach().to(torch.bfloat16)
-    return half if torch.equal(half.to(x.dtype), x) else x.detach().clone()
-
-
-def minus(a: Pair, b: Pair) -> Pair:
-    """The differences a - b of weights and of biases, in float32 or wider."""
-    (weight, bias), (other_weight, other_bias) = a, b
-    if bias is None or other_bias is None:
-        return _difference(weight, other_weight), None
-    return _difference(weight, other_weight), _difference(bias, other_bias)
-
-
-def _difference(a: Tensor, b: Tensor) -> Tensor:
-    return widened(a) - b
 
 
 def protections(

@@ -12,7 +12,8 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
+from aegis_cli.core.pairs import Pair
+
 # Weights that are stacked at once. Larger ones keep a GPU busy by themselves.
 MOST = 2**24
 

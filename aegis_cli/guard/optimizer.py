@@ -22,7 +22,7 @@ from aegis_cli import methods
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common.errors import AegisError, few
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.stacking import Pair
+from aegis_cli.core.pairs import Pair
 from aegis_cli.guard import wide_step
 from aegis_cli.guard.options import load_anchor, method_options
 from aegis_cli.guard.stepper import SlowedStep, overflowed

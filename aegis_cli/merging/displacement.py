@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 import torch
 
-from aegis_cli.core.nullspace import minus
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.projection import dot
-from aegis_cli.core.stacking import Pair
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.base import weights
 from aegis_cli.models.backbones.base import Backbone

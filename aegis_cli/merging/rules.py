@@ -15,9 +15,8 @@ from aegis_cli.common.events import OnEvent
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.merging import TwoSided, basis, damped
-from aegis_cli.core.nullspace import minus
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import Spectrum
-from aegis_cli.core.stacking import Pair
 from aegis_cli.data.vqa import sets
 from aegis_cli.merging.displacement import Keep
 from aegis_cli.merging.settings import MergeSettings

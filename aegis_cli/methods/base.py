@@ -13,8 +13,8 @@ from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
+from aegis_cli.core.pairs import Pair
 from aegis_cli.core.projection import Combine
-from aegis_cli.core.stacking import Pair
 from aegis_cli.data.batch import RobotBatch, Share
 
 Options = Mapping[str, Any]

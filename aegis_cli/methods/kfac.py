@@ -37,10 +37,9 @@ from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks, rows_here
 from aegis_cli.core import curvature, stacking
 from aegis_cli.core.curvature import Curvature
-from aegis_cli.core.nullspace import copied_small, minus
 from aegis_cli.core.numerics import ratio
+from aegis_cli.core.pairs import Pair, copied_small, minus
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.core.stacking import Pair
 from aegis_cli.methods.base import (
     Method,
     Options,

@@ -26,7 +26,7 @@ from torch import nn
 from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import nullspace, stacking
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Rows, Strength
-from aegis_cli.core.stacking import Pair
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.methods.base import (
     Method,
     Parts,
@@ -113,7 +113,7 @@ class _Group:
         if len(self.sites) == 1:
             _project(self.here()[0], before[0], self.protection)
             return
-        moved = nullspace.minus(stacking.stacked(self.here()), stacking.stacked(before))
+        moved = minus(stacking.stacked(self.here()), stacking.stacked(before))
         stacking.subtract(self.here(), self.protection.removed(*moved))
 
     def hold(self, before: Remembered) -> None:
@@ -161,7 +161,7 @@ def _before(site: str, now: Pair, update: Update) -> Pair:
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:
     weight, bias = now
-    moved, shifted = nullspace.allowed(protection, nullspace.minus((weight, bias), before))
+    moved, shifted = nullspace.allowed(protection, minus((weight, bias), before))
     torch.add(before[0], moved, out=weight.data)
     if bias is not None:
         torch.add(before[1], shifted, out=bias.data)

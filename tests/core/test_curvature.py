@@ -12,7 +12,7 @@ from torch import Tensor
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import Curvature, curvatures, taken
-from aegis_cli.core.nullspace import Pair, minus
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, decompose, with_rest
 
 SITE = "map"

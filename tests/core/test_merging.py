@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from aegis_cli.core.merging import TwoSided, basis, damped, like, matrix
+from aegis_cli.core.merging import TwoSided, basis, damped
+from aegis_cli.core.pairs import like, matrix
 from aegis_cli.core.spectrum import decompose
 
 OUT, IN = 5, 7

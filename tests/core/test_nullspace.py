@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Protection, Strength, allowed, minus, protect
+from aegis_cli.core.nullspace import Protection, Strength, allowed, protect
+from aegis_cli.core.pairs import Pair, copied, copied_small, minus
 from aegis_cli.core.spectrum import (
     Spectrum,
     channel_moment,
@@ -32,7 +33,6 @@ from aegis_cli.core.spectrum import (
     second_moment,
     with_rest,
 )
-from aegis_cli.core.stacking import Pair
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
@@ -234,7 +234,7 @@ def test_held_by_its_coordinates_a_map_is_where_the_projection_leaves_it(
     protection = protection_of(case, case.vqa(), strength.energy, strength.soft)
     module = case.model().map
     now = module.weight.data, None if getattr(module, "bias", None) is None else module.bias.data
-    before, update = nullspace.copied(now), random_update(case)
+    before, update = copied(now), random_update(case)
     known = protection.remember(*now)
     for tensor, moved in zip(now, update, strict=True):
         if tensor is not None:
@@ -267,7 +267,7 @@ def test_coordinates_are_fewer_numbers_than_weights() -> None:
 def test_a_small_copy_holds_the_same_numbers(exact: bool) -> None:
     weight = torch.randn(5, 6)
     weight = weight.bfloat16().float() if exact else weight
-    small, bias = nullspace.copied_small((weight, None))
+    small, bias = copied_small((weight, None))
     assert bias is None and small.data_ptr() != weight.data_ptr()
     assert small.dtype == (torch.bfloat16 if exact else torch.float32)
     update = torch.randn(5, 6)

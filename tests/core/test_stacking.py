@@ -14,7 +14,7 @@ from torch import Tensor
 from aegis_cli.core import curvature, nullspace, stacking
 from aegis_cli.core.curvature import Curvature
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Rows
-from aegis_cli.core.stacking import Pair
+from aegis_cli.core.pairs import Pair, copied
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
@@ -107,7 +107,7 @@ def check_protection(
 
     held = []
     for one, pair, old in zip(each, now, before, strict=True):
-        held.append(nullspace.copied(pair))
+        held.append(copied(pair))
         one.hold(*held[-1], one.remember(*old))
     assert isinstance(together, Dense | Elementwise)
     remembered = together.remember(*stacking.stacked(before))

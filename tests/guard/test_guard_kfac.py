@@ -35,7 +35,7 @@ from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
-from aegis_cli.core.nullspace import minus
+from aegis_cli.core.pairs import minus
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.guard.stepper import SlowedStep
 from aegis_cli.methods import kfac

@@ -10,7 +10,7 @@ import torch
 from samples.tiny import make_tiny
 from samples.training_runs import small_policy
 
-from aegis_cli.core.stacking import Pair
+from aegis_cli.core.pairs import Pair
 from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.merging import task_factors

@@ -13,9 +13,8 @@ from torch import Tensor, nn
 
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
-from aegis_cli.core.nullspace import minus
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import decompose
-from aegis_cli.core.stacking import Pair
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Parts, Setting, Update, weights
 from aegis_cli.recipes import Kfac

@@ -12,7 +12,8 @@ from torch.nn import functional as F
 
 from aegis_cli.core import nullspace
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.nullspace import Pair, Protection, Strength, minus
+from aegis_cli.core.nullspace import Protection, Strength
+from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
 from aegis_cli.methods.base import weights
 from aegis_cli.models.backbones import Backbone

@@ -1,0 +1,54 @@
+"""A map's weight and bias as one value, and what is computed of two of them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from aegis_cli.core.numerics import widened
+
+Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
+
+
+def copied(pair: Pair) -> Pair:
+    """A copy of the values, which later changes of the parameters do not reach."""
+    weight, bias = pair
+    return weight.detach().clone(), None if bias is None else bias.detach().clone()
+
+
+def copied_small(pair: Pair) -> Pair:
+    """A copy in half precision where that holds the same numbers, as of a model of the hub."""
+    weight, bias = pair
+    return _small(weight), None if bias is None else _small(bias)
+
+
+def _small(x: Tensor) -> Tensor:
+    half = x.detach().to(torch.bfloat16)
+    return half if torch.equal(half.to(x.dtype), x) else x.detach().clone()
+
+
+def minus(a: Pair, b: Pair) -> Pair:
+    """The differences a - b of weights and of biases, in float32 or wider."""
+    (weight, bias), (other_weight, other_bias) = a, b
+    if bias is None or other_bias is None:
+        return _difference(weight, other_weight), None
+    return _difference(weight, other_weight), _difference(bias, other_bias)
+
+
+def _difference(a: Tensor, b: Tensor) -> Tensor:
+    return widened(a) - b
+
+
+def matrix(pair: Pair) -> Tensor:
+    """A map's weight [o, ...] as a matrix [o, d], with its bias as the last column."""
+    weight, bias = pair
+    flat = weight.flatten(1)
+    return flat if bias is None else torch.cat([flat, bias[:, None]], 1)
+
+
+def like(flat: Tensor, pair: Pair) -> Pair:
+    """The matrix [o, d] as a weight and a bias in the pair's shapes, dtypes and device."""
+    weight, bias = pair
+    width = weight[0].numel()
+    flat = flat.to(weight)
+    return flat[:, :width].reshape(weight.shape), None if bias is None else flat[:, width]
