@@ -131,18 +131,8 @@ def run(
     """
     source = sets.read(vqa, skip_bad, on_event, ask)
     if predictions is not None:
-        files.check_writable(predictions)
-        read = [*source.files, *backbones.model_files(target)]
-        if baseline is not None:
-            read += backbones.model_files(baseline)
-        if anchor is not None:
-            read.append(anchor)
-        # A run's own files, and not what an earlier probe was asked to write beside them.
-        for model in (target, *([] if baseline is None else [baseline])):
-            if (run := results.run_of(Path(model))) is not None:
-                own = (path for path in run.rglob("*") if path.is_file())
-                read += [path for path in own if path.suffix != ".jsonl" or path.name == METRICS]
-        files.check_apart("--predictions", predictions, read)
+        models = [name for name in (target, baseline) if name is not None]
+        _check_predictions(predictions, source.files, models, anchor)
     model = backbones.load(target)
     before = None if baseline is None else backbones.load(baseline)
     if before is not None:
@@ -178,6 +168,22 @@ def run(
         settings |= _path_of(vqa)
         results.keep_if_possible(Path(target), name, figures, settings, on_event)
     return report
+
+
+def _check_predictions(
+    predictions: Path, questions: Sequence[Path], models: Sequence[str], anchor: Path | None
+) -> None:
+    """Raise AegisError unless `predictions` can be written and is none of the files that are read."""
+    files.check_writable(predictions)
+    read = [*questions, *([] if anchor is None else [anchor])]
+    for name in models:
+        read += backbones.model_files(name)
+        run_folder = results.run_of(Path(name))
+        if run_folder is not None:
+            own = (path for path in run_folder.rglob("*") if path.is_file())
+            # An earlier probe's predictions may lie beside the run's own files.
+            read += [path for path in own if path.suffix != ".jsonl" or path.name == METRICS]
+    files.check_apart("--predictions", predictions, read)
 
 
 def _path_of(vqa: str) -> dict[str, str]:
