@@ -100,6 +100,27 @@ def _never_varies(rows: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class PreparedPass:
+    """What was made on the CPU, ahead of a step, for one of its passes.
+
+    Attributes:
+        inputs: what the backbone has made of the pass's frames.
+        anchor_inputs: the same of the first of them, where the anchor gradient is taken on these
+            alone; else None.
+        by_method: what the method's own `prepare` has made of the frames, if it has one.
+    """
+
+    inputs: Any
+    anchor_inputs: Any = None
+    by_method: Any = None
+
+    def to(self, device: torch.device) -> PreparedPass:
+        """The same with the backbone's inputs on that device."""
+        anchor_inputs = None if self.anchor_inputs is None else self.anchor_inputs.to(device)
+        return PreparedPass(self.inputs.to(device), anchor_inputs, self.by_method)
+
+
+@dataclass(frozen=True)
 class RobotBatch:
     """Demonstration frames with what to do next.
 
@@ -111,11 +132,7 @@ class RobotBatch:
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
         of_step: frames of the step that these are a share of, and how many steps of its chunks are
             no padding; None where nobody has counted.
-        prepared: what the backbone has made of the frames of each pass, in their order; empty
-            where it makes it when the pass comes.
-        prepared_parts: the same of the first frames of each pass, where the anchor gradient is
-            taken on these alone.
-        prepared_by_method: what the method's own `prepare` has made of the frames of each pass.
+        prepared: one per pass of the step, in their order; empty where nothing was made ahead.
     """
 
     images: Images
@@ -124,20 +141,14 @@ class RobotBatch:
     actions: Tensor
     is_pad: Tensor
     of_step: tuple[int, int] | None = None
-    prepared: Sequence[Any] = ()
-    prepared_parts: Sequence[Any] = ()
-    prepared_by_method: Sequence[Any] = ()
+    prepared: Sequence[PreparedPass] = ()
 
     def __len__(self) -> int:
         return len(self.instructions)
 
     def with_prepared_on(self, device: torch.device) -> RobotBatch:
         """The batch with what is prepared on that device."""
-        return replace(
-            self,
-            prepared=[inputs.to(device) for inputs in self.prepared],
-            prepared_parts=[inputs.to(device) for inputs in self.prepared_parts],
-        )
+        return replace(self, prepared=[each.to(device) for each in self.prepared])
 
     def rows(self, chosen: slice) -> RobotBatch:
         """The frames of these rows, of whose step and preparation nothing is known."""

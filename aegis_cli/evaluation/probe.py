@@ -173,7 +173,7 @@ def run(
 def _check_predictions(
     predictions: Path, questions: Sequence[Path], models: Sequence[str], anchor: Path | None
 ) -> None:
-    """Raise AegisError unless `predictions` can be written and is none of the files that are read."""
+    """Raise AegisError unless `predictions` can be written and is no file that is read."""
     files.check_writable(predictions)
     read = [*questions, *([] if anchor is None else [anchor])]
     for name in models:

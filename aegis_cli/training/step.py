@@ -21,7 +21,7 @@ from torch import Tensor
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import projection
-from aegis_cli.data.batch import RobotBatch, Share, Whole
+from aegis_cli.data.batch import PreparedPass, RobotBatch, Share, Whole
 from aegis_cli.methods.backward import (
     Gram,
     Groups,
@@ -37,6 +37,7 @@ from aegis_cli.training import parallel
 from aegis_cli.training.masters import NONE, Masters
 
 Rows = TypeVar("Rows", np.ndarray, Tensor)
+NOT_PREPARED = PreparedPass(inputs=None)
 
 
 @dataclass(frozen=True)
@@ -162,13 +163,9 @@ def _all_passes(
     each = passes(batch, settings.ranks, settings.accumulate, settings.policy.backbone.device)
     for number, (part, of) in enumerate(each):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
-        prepared = batch.prepared[number] if batch.prepared else None
-        of_part = batch.prepared_parts[number] if batch.prepared_parts else None
-        by_method = batch.prepared_by_method[number] if batch.prepared_by_method else None
+        prepared = batch.prepared[number] if batch.prepared else NOT_PREPARED
         with masters.rounded():
-            loss, w2, anchor = _backward(
-                settings, part, of, generator, prepared, of_part, by_method
-            )
+            loss, w2, anchor = _backward(settings, part, of, generator, prepared)
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
@@ -235,20 +232,16 @@ def with_prepared(
         by_method: the method's own `prepare`.
     """
     batch = replace(batch, of_step=size)
-    found, found_of_parts, found_by_method = list[Batch](), list[Batch](), list[Any]()
+    prepared = []
     for part, _ in passes(batch, ranks, accumulate, backbone.device):
-        found.append(backbone.process(part.images, part.instructions))
+        inputs = backbone.process(part.images, part.instructions)
+        anchor_inputs = None
         if fraction < 1:
             shown = first_frames(part, fraction)
-            found_of_parts.append(backbone.process(shown.images, shown.instructions))
-        if by_method is not None:
-            found_by_method.append(by_method(part))
-    return replace(
-        batch,
-        prepared=found,
-        prepared_parts=found_of_parts,
-        prepared_by_method=found_by_method,
-    )
+            anchor_inputs = backbone.process(shown.images, shown.instructions)
+        made = None if by_method is None else by_method(part)
+        prepared.append(PreparedPass(inputs, anchor_inputs, made))
+    return replace(batch, prepared=prepared)
 
 
 def first_frames(batch: RobotBatch, fraction: float) -> RobotBatch:
@@ -261,16 +254,12 @@ def _backward(
     batch: RobotBatch,
     of: Whole,
     generator: torch.Generator,
-    prepared: Batch | None = None,
-    prepared_part: Batch | None = None,
-    prepared_by_method: Any = None,
+    prepared: PreparedPass,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
     """One pass over some frames, and back.
 
     Args:
-        prepared: what the backbone has made of all of them already.
-        prepared_part: what it has made of those that the anchor gradient is taken on.
-        prepared_by_method: what the method has made of all of them already.
+        prepared: what was made of them ahead of the step, if anything was.
 
     Returns:
         What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
@@ -294,19 +283,19 @@ def _backward(
             frames=shown,
             share=of.share,
             total=total,
-            prepared=prepared_by_method,
+            prepared=prepared.by_method,
         )
         return encoding, seen
 
     def encode_part() -> Pass:
         shown = first_frames(batch, parts.fraction)
         with devices.autocast(device, settings.precision), torch.enable_grad():
-            return encode(shown, prepared_part)[1]
+            return encode(shown, prepared.anchor_inputs)[1]
 
     with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
         # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding, seen = encode(batch, prepared)
+            encoding, seen = encode(batch, prepared.inputs)
         if method.stop_gradient:
             # Before torch 2.11 autocast keeps weights that it has rounded without a graph for later
             # passes with one, such as a method's own, and these then give the weights no gradient.

@@ -712,11 +712,11 @@ def validation_loss(
         for part, (own, sharing, passes) in zip(parts, prepared, strict=True):
             noise, losses = generator.get_state(), []
             each = step.passes(own, sharing, passes, backbone.device)
-            for (batch, of), inputs in zip(each, own.prepared, strict=True):
+            for (batch, of), made in zip(each, own.prepared, strict=True):
                 # Each pass draws the part's noise, and takes its own frames' of it.
                 generator.set_state(noise)
                 with devices.autocast(backbone.device, settings.precision):
-                    encoding = backbone.encode(inputs.to(backbone.device))
+                    encoding = backbone.encode(made.inputs.to(backbone.device))
                     loss = policy.flow_loss(
                         batch, encoding, settings.flow_samples, generator, of=of
                     )

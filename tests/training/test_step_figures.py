@@ -111,9 +111,9 @@ def test_no_frame_is_prepared_within_a_step(
     run.policy.train()
     fetch = train._fetching(run)
     batches = [fetch(index) for index in range(2)]
-    assert [len(batch.prepared_parts) for batch in batches] == [1, int(refresh == 1)]
-    (part,) = batches[0].prepared_parts
-    assert len(part.ids) == -(-len(batches[0]) // 2)
+    parts = [batch.prepared[0].anchor_inputs for batch in batches]
+    assert [part is not None for part in parts] == [True, refresh == 1]
+    assert len(parts[0].ids) == -(-len(batches[0]) // 2)
     found = []
     for ahead in (True, False):
         run, window = begun(chosen, "aegis", demos_file, anchor_file, tmp_path), train.Window()
@@ -122,7 +122,7 @@ def test_no_frame_is_prepared_within_a_step(
             if ahead:
                 patch.setattr(type(run.policy.backbone), "process", None)
             for index, batch in enumerate(batches):
-                bare = replace(batch, prepared=(), prepared_parts=())
+                bare = replace(batch, prepared=())
                 train.update(run, index, batch if ahead else bare, window)
         train.read(run, window)
         found.append((window.loss, run.ledger.tensors()["w2"].tolist()))
@@ -203,8 +203,8 @@ def test_batches_that_several_threads_prepare_are_those_of_one(
         assert one.instructions == other.instructions and one.of_step == other.of_step
         ((one_part,), (other_part,)) = one.prepared, other.prepared
         assert torch.equal(one.actions, other.actions)
-        assert torch.equal(one_part.pixels, other_part.pixels)
-        assert torch.equal(one_part.ids, other_part.ids)
+        assert torch.equal(one_part.inputs.pixels, other_part.inputs.pixels)
+        assert torch.equal(one_part.inputs.ids, other_part.inputs.ids)
 
 
 @pytest.mark.parametrize("decay", [None, 0.6])
