@@ -72,7 +72,7 @@ def make(
         whole: widest other rows that are summed whole.
     """
     if width <= _limit(convolution, whole):
-        return Whole(width, device)
+        return FullSum(width, device)
     return Sketch(width, device) if width <= SKETCHED else TraceOnly(width, device)
 
 
@@ -94,7 +94,7 @@ def _limit(convolution: bool, whole: int) -> int:
     return max(whole, WHOLE_CONVOLUTION) if convolution else whole
 
 
-class Whole(MomentSum):
+class FullSum(MomentSum):
     """The second moment itself, in strips of columns that begin at the diagonal."""
 
     def __init__(self, width: int, device: torch.device) -> None:
@@ -119,8 +119,8 @@ class Whole(MomentSum):
                     total.addmm_(block[:, start:].T, block[:, start:stop])
 
     def plus(self, other: MomentSum) -> MomentSum:
-        assert isinstance(other, Whole)
-        both = Whole(self._width, self._device)
+        assert isinstance(other, FullSum)
+        both = FullSum(self._width, self._device)
         both._sums = [a + b for a, b in zip(self._sums, other._sums, strict=True)]
         return both
 

@@ -158,7 +158,7 @@ class Elementwise:
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """Protection of a table: no row that VQA reads may change.
 
     Attributes:
@@ -179,9 +179,9 @@ class Rows:
         scored, _ = self.scores.removed(weight - read, None)
         return read + scored, bias
 
-    def of_rows(self, rows: slice) -> Rows:
+    def of_rows(self, rows: slice) -> TableRows:
         # A lone row's flag stands for all of it, however it is cut.
-        return self if len(self.used) == 1 else Rows(self.used[rows], self.scores)
+        return self if len(self.used) == 1 else TableRows(self.used[rows], self.scores)
 
     def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
         read = self._read(weight)
@@ -246,7 +246,7 @@ def protect(
         head = None
         if scores is not None:
             head = _dense(scores, strength, like)
-        return Rows((read.values > 0).to(like.device), head)
+        return TableRows((read.values > 0).to(like.device), head)
     if read.kind == "elementwise":
         return Elementwise(_channels(read, strength).to(like))
     return _dense(read, strength, like)

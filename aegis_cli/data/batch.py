@@ -178,7 +178,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Whole:
+class WholeBatch:
     """The batch that a smaller one is a share of; it has its noise, and counts in its mean.
 
     Attributes:

@@ -160,7 +160,7 @@ class Steps:
         train.update(self._run, self._taken, self._batch, self._window)
         self._taken += 1
         if self._taken % self.in_turn == 0:
-            train.read(self._run, self._window)
+            train.read_figures(self._run, self._window)
 
     def turn(self) -> None:
         """Take the steps of one turn."""

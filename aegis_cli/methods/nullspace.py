@@ -25,7 +25,7 @@ from torch import nn
 
 from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import nullspace, stacking
-from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Rows, Strength
+from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Strength, TableRows
 from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.methods.base import (
     Method,
@@ -137,7 +137,9 @@ def _grouped(
         return len(protection.factor) if isinstance(protection, Dense) else 0
 
     def alone(site: str) -> bool:
-        return isinstance(protections[site], Rows)  # each table has rows of its own that are read
+        return isinstance(
+            protections[site], TableRows
+        )  # each table has rows of its own that are read
 
     pairs = {site: weights(backbone, site) for site in protections}
     groups = []

@@ -13,7 +13,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.core import continuation
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.core.continuation import Continued
-from aegis_cli.data.batch import Images, Normalizer, RobotBatch, Whole
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch, WholeBatch
 from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
@@ -90,7 +90,7 @@ class Policy(nn.Module):
         samples: int,
         generator: torch.Generator,
         detach: bool = False,
-        of: Whole | None = None,
+        of: WholeBatch | None = None,
     ) -> Tensor:
         """Flow-matching loss over `samples` flow times and noises of each frame.
 
@@ -107,7 +107,7 @@ class Policy(nn.Module):
         """
         device = self.backbone.device
         actions = self.targets(batch)[:, None]  # [B, 1, H, A]
-        of = of or Whole(len(actions), int((~batch.is_pad).sum()))
+        of = of or WholeBatch(len(actions), int((~batch.is_pad).sum()))
         shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
         # Both are drawn on the CPU, so that they are the same whatever the device, and for the
         # whole batch, so that they are the same whatever the shares.

@@ -497,10 +497,10 @@ def _timed(training: TrainingRun) -> float:
     with train.batches_of(training, steps) as batches:
         for index in steps:
             if index == first[0]:
-                train.read(training, window)  # a GPU has done by then what it was given
+                train.read_figures(training, window)  # a GPU has done by then what it was given
                 started_s = time.perf_counter()
             train.update(training, index, next(batches), window)
-        train.read(training, window)
+        train.read_figures(training, window)
     return (time.perf_counter() - started_s) / (len(steps) - first[0])
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from aegis_cli.common import devices
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import projection
-from aegis_cli.data.batch import PreparedPass, RobotBatch, Share, Whole
+from aegis_cli.data.batch import PreparedPass, RobotBatch, Share, WholeBatch
 from aegis_cli.methods.backward import (
     Gram,
     Groups,
@@ -54,8 +54,8 @@ class LedgerRow:
 
 
 @dataclass(frozen=True)
-class Gradients:
-    """Gradients now lie in `.grad`.
+class StepGradients:
+    """What `compute_gradients` found; the combined gradients themselves are left in `.grad`.
 
     Attributes:
         loss: the task's own, whatever else the gradient is of.
@@ -101,7 +101,7 @@ def compute_gradients(
     ranks: Ranks = ALONE,
     accumulate: int = 1,
     masters: Masters = NONE,
-) -> Gradients:
+) -> StepGradients:
     """Forward, backward, and what the method does to the gradient.
 
     AEGIS's sequential dual backward: both gradients come from the same graph. The anchor gradient
@@ -133,7 +133,7 @@ def compute_gradients(
     parallel.add_up_gradients(policy, ranks)
     loss = ranks.total(loss)
     if w2 is None:
-        found = Gradients(loss, None, {}, {})
+        found = StepGradients(loss, None, {}, {})
     else:
         if reused is not None:
             taken = {i: reused.get(name) for i, name in names.items()}
@@ -142,7 +142,7 @@ def compute_gradients(
         anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
         gram = _bend(settings, anchor)
         row = LedgerRow(*gram, w2)
-        found = Gradients(loss, row, _named(names, anchor), _named(names, taken))
+        found = StepGradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
         parts.pull()
     return found
@@ -198,7 +198,7 @@ def shares(ranks: Ranks, accumulate: int) -> list[Share]:
 
 def passes(
     batch: RobotBatch, ranks: Ranks, accumulate: int, device: torch.device
-) -> Iterator[tuple[RobotBatch, Whole]]:
+) -> Iterator[tuple[RobotBatch, WholeBatch]]:
     """This process's frames of each pass, and the batch that they are a share of."""
     if batch.of_step is not None:
         frames, shown = batch.of_step
@@ -210,7 +210,7 @@ def passes(
     for share in shares(ranks, accumulate):
         rows = share.rows(frames)
         end = begin + rows.stop - rows.start
-        yield batch.rows(slice(begin, end)), Whole(frames, shown, share)
+        yield batch.rows(slice(begin, end)), WholeBatch(frames, shown, share)
         begin = end
 
 
@@ -252,7 +252,7 @@ def first_frames(batch: RobotBatch, fraction: float) -> RobotBatch:
 def _backward(
     settings: _Settings,
     batch: RobotBatch,
-    of: Whole,
+    of: WholeBatch,
     generator: torch.Generator,
     prepared: PreparedPass,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:

@@ -20,7 +20,7 @@ from torch.optim import Optimizer
 
 from aegis_cli.common import devices
 from aegis_cli.methods.base import Parts
-from aegis_cli.training.step import Gradients, LedgerRow
+from aegis_cli.training.step import LedgerRow, StepGradients
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class UnreadFigures:
     def __len__(self) -> int:
         return len(self._steps)
 
-    def note(self, index: int, found: Gradients, norm: Tensor) -> None:
+    def note(self, index: int, found: StepGradients, norm: Tensor) -> None:
         """Keep a step's figures."""
         parts = [found.loss.reshape(1), norm.reshape(1)]
         if found.row is not None:

@@ -403,7 +403,7 @@ def _take_step(
     with _good_steps_saved(run):
         update(run, index, batch, window, settle=due.checkpoint or due.validation)
         if due.line:
-            read(run, window)
+            read_figures(run, window)
     window.data_s += fetched - started
     window.update_s += time.perf_counter() - fetched
     window.steps += 1
@@ -422,7 +422,7 @@ def _heeds(run: TrainingRun, due: _Due) -> bool:
 def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
     """Write the checkpoint that a run goes on from after a signal."""
     with _good_steps_saved(run):
-        read(run, window)
+        read_figures(run, window)
     _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
 
 
@@ -594,7 +594,7 @@ def update(
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
     if not run.unread.deferred:
-        read(run, window)
+        read_figures(run, window)
     if run.parts.refresh > 1:
         run.reused = result.taken
     run.unread.stop(run.optimizers)
@@ -610,7 +610,7 @@ def update(
         run.average.follow(run.unread.moved)
 
 
-def read(run: TrainingRun, window: Window) -> None:
+def read_figures(run: TrainingRun, window: Window) -> None:
     """Read what the steps since the last time have left, into the ledger and the window.
 
     Raises:

@@ -17,7 +17,7 @@ from aegis_cli.anchors.inputs import InputRecorder
 from aegis_cli.common import artifacts
 from aegis_cli.core import moment_sums
 from aegis_cli.core.anchor import Anchor
-from aegis_cli.core.moment_sums import Whole, size
+from aegis_cli.core.moment_sums import FullSum, size
 from aegis_cli.core.nullspace import Strength, allowed, protect
 from aegis_cli.core.spectrum import Spectrum, second_moment
 from aegis_cli.data.vqa.dataset import VQASet
@@ -261,6 +261,6 @@ def test_whole_sums_of_the_embedded_vlm_stay_whole() -> None:
         width = inputs.dense_width(module)
         if width is not None:
             convolution = not isinstance(module, nn.Linear)
-            assert isinstance(moment_sums.make(width, torch.device("cpu"), convolution), Whole), (
+            assert isinstance(moment_sums.make(width, torch.device("cpu"), convolution), FullSum), (
                 name
             )

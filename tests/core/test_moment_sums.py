@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core import moment_sums
-from aegis_cli.core.moment_sums import MomentSum, Sketch, Whole, make, merged, size
+from aegis_cli.core.moment_sums import FullSum, MomentSum, Sketch, make, merged, size
 from aegis_cli.core.spectrum import Spectrum, orthonormal, second_moment
 
 CPU = torch.device("cpu")
@@ -46,7 +46,7 @@ def test_a_narrow_sum_is_that_of_its_parts_moments_bit_by_bit() -> None:
     parts = rows(90, 40, -0.5).split(30)
     wanted = second_moment(parts[0]) + second_moment(parts[1])
     total = summed(make(40, CPU), *parts[:2])
-    assert isinstance(total, Whole) and torch.equal(total.matrix(), wanted)
+    assert isinstance(total, FullSum) and torch.equal(total.matrix(), wanted)
 
 
 def test_a_float32_sum_of_many_passes_is_off_by_millionths_of_its_largest_entry() -> None:
@@ -54,15 +54,15 @@ def test_a_float32_sum_of_many_passes_is_off_by_millionths_of_its_largest_entry(
     parts = [rows(20, width, -0.5, seed) for seed in range(4)]
     total = summed(make(width, CPU), *(parts * (passes // 4)))
     wanted = sum(part.double().T @ part.double() for part in parts) * (passes // 4)
-    assert isinstance(total, Whole) and width > moment_sums.EXACT_SUM
+    assert isinstance(total, FullSum) and width > moment_sums.EXACT_SUM
     assert (total.matrix() - wanted).abs().max() < 3e-6 * wanted.abs().max()
     assert torch.equal(total.matrix(), total.matrix().T)
 
 
 def test_the_widths_decide() -> None:
-    assert isinstance(make(moment_sums.WHOLE, CPU), Whole)
+    assert isinstance(make(moment_sums.WHOLE, CPU), FullSum)
     assert isinstance(make(moment_sums.WHOLE + 1, CPU), Sketch)
-    assert isinstance(make(moment_sums.WHOLE + 1, CPU, convolution=True), Whole)
+    assert isinstance(make(moment_sums.WHOLE + 1, CPU, convolution=True), FullSum)
     assert isinstance(make(moment_sums.SKETCHED + 1, CPU), moment_sums.TraceOnly)
 
 
@@ -89,7 +89,7 @@ def test_sums_add_up(width: int) -> None:
 def test_the_size_is_told_before_anything_is_summed() -> None:
     for width in (40, 600, WIDE):
         total = summed(make(width, CPU), torch.ones(1, width))
-        held = total._sums if isinstance(total, Whole) else [total._seen]
+        held = total._sums if isinstance(total, FullSum) else [total._seen]
         assert size(width) == sum(t.nbytes for t in held)
 
 

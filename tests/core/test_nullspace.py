@@ -248,7 +248,7 @@ def test_held_by_its_coordinates_a_map_is_where_the_projection_leaves_it(
 @pytest.mark.parametrize("shape", [(), (1,), (6,), (1, 1, 6)])
 @pytest.mark.parametrize("read", [True, False])
 def test_a_lone_row_that_is_read_goes_back(shape: tuple[int, ...], read: bool) -> None:
-    protection = nullspace.Rows(torch.tensor([read]))
+    protection = nullspace.TableRows(torch.tensor([read]))
     weight = torch.randn(shape, dtype=torch.float64)
     before = weight.clone()
     known = protection.remember(weight, None)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aegis_cli.core import curvature, nullspace, stacking
 from aegis_cli.core.curvature import Curvature
-from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Rows
+from aegis_cli.core.nullspace import Dense, Elementwise, Protection, TableRows
 from aegis_cli.core.pairs import Pair, copied
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
@@ -117,7 +117,7 @@ def check_protection(
 
 def test_tables_are_not_stacked() -> None:
     with pytest.raises(TypeError, match="not tables"):
-        nullspace.stacked([Rows(torch.ones(2, dtype=torch.bool))] * 2)
+        nullspace.stacked([TableRows(torch.ones(2, dtype=torch.bool))] * 2)
 
 
 def test_maps_on_two_devices_are_of_two_kinds() -> None:

@@ -364,7 +364,7 @@ def named_groups(policy: Policy) -> dict[str, list[str]]:
 
 def stepped(
     policy: Policy, optimizer: torch.optim.Optimizer
-) -> tuple[step.Gradients, dict[str, Tensor], dict[str, Tensor]]:
+) -> tuple[step.StepGradients, dict[str, Tensor], dict[str, Tensor]]:
     """One unconstrained step: its gradients, and the parameters before and after it."""
     found = gradients(policy, AEGIS)
     before = snapshot(policy.backbone.named_parameters())

@@ -54,7 +54,7 @@ def gradients(
     precision: str = "float32",
     seed: int = 0,
     far: float = 1.0,
-) -> step.Gradients:
+) -> step.StepGradients:
     """One step's, of the dual backward where the method has one.
 
     The seed draws anchor and noise, and `far` scales the anchor's means.

@@ -184,7 +184,7 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 
 def gradients(
     policy: Policy, method: Method, batch: RobotBatch | None = None, **options: Any
-) -> step.Gradients:
+) -> step.StepGradients:
     """One step's gradients in `.grad` of an adapted policy, always of the same noise and batch.
 
     Args:

@@ -142,7 +142,7 @@ def test_it_follows_the_last_good_step_of_a_run_that_diverges(
     """Though the method had not constrained that step before it was known to be the last."""
     compute, good = step.compute_gradients, STEPS - 1
 
-    def spoiled(*args: Any, index: int, **options: Any) -> step.Gradients:
+    def spoiled(*args: Any, index: int, **options: Any) -> step.StepGradients:
         found = compute(*args, index=index, **options)
         return replace(found, loss=found.loss * math.nan) if index == good else found
 

@@ -91,7 +91,7 @@ def test_steps_between_two_lines_read_no_number(
         for index in range(5):
             train.update(run, index, batch, window)
     assert not found and len(run.unread) == 5
-    train.read(run, window)
+    train.read_figures(run, window)
     assert len(run.unread) == 0 and window.loss > 0
     assert len(run.ledger) == (5 if METHODS[method].compares_layers else 0)
 
@@ -124,7 +124,7 @@ def test_no_frame_is_prepared_within_a_step(
             for index, batch in enumerate(batches):
                 bare = replace(batch, prepared=())
                 train.update(run, index, batch if ahead else bare, window)
-        train.read(run, window)
+        train.read_figures(run, window)
         found.append((window.loss, run.ledger.tensors()["w2"].tolist()))
     assert found[0] == found[1]
 
@@ -231,7 +231,7 @@ def test_a_step_that_is_not_finite_moves_nothing_however_late_it_is_read(
     """Neither the weights nor their average, though a constraint may cover that step and others."""
     real = step.compute_gradients
 
-    def broken(*rest: object, index: int, **named: object) -> step.Gradients:
+    def broken(*rest: object, index: int, **named: object) -> step.StepGradients:
         found = real(*rest, index=index, **named)  # type: ignore[arg-type]
         return replace(found, loss=found.loss * math.nan) if index == 3 else found
 

@@ -546,11 +546,11 @@ def test_a_validation_loss_that_is_not_finite_ends_the_run(
     assert_same_run(tmp_path, naive_run)
 
 
-def spoiled(where: str, bad: float, at: int) -> Callable[..., step.Gradients]:
+def spoiled(where: str, bad: float, at: int) -> Callable[..., step.StepGradients]:
     """`compute_gradients` with one figure of the call number `at` replaced."""
     compute, calls = step.compute_gradients, []
 
-    def spoil(policy: Policy, *args: Any, **options: Any) -> step.Gradients:
+    def spoil(policy: Policy, *args: Any, **options: Any) -> step.StepGradients:
         result = compute(policy, *args, **options)
         calls.append(None)
         if len(calls) != at:
