@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from difflib import SequenceMatcher
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +21,19 @@ from aegis_cli.anchors import anchor_file
 from aegis_cli.common.errors import AegisError, few
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.pairs import Pair
-from aegis_cli.guard import wide_step
+from aegis_cli.guard import matching, wide_step
 from aegis_cli.guard.options import load_anchor, method_options
 from aegis_cli.guard.stepper import SlowedStep, overflowed
 from aegis_cli.guard.wide_step import WideStep
-from aegis_cli.methods.base import Parts, Setting, weights
+from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.backbones.base import Backbone
-from aegis_cli.models.structure import digest
 
 CONSTRAINING = ("kfac", "nullspace")
 _PLACE = "aegis_place"  # in a parameter's state: the number of what it is in the base model
 # In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
 _PARTNER = "aegis_partner"
-# In which a program may keep a VLM that is stored in float32, in the order of looking for them.
-_TYPES = (torch.float32, torch.bfloat16, torch.float16)
-# How far a weight that has learned is from what it was, of its own size, at most. Weights that have
-# nothing to do with each other are farther apart than the size of either.
-_NEAR = 0.5
 _log = logging.getLogger(__name__)
 
 
@@ -101,12 +94,12 @@ class ProtectedAdamW(torch.optim.AdamW):
         # in half precision those that stayed within their rounding. Its state, which is still to
         # come, tells what they are; the first step asks again.
         with contextlib.suppress(AegisError):
-            self._found = _match(self._base, self._ordered())
+            self._found = matching.match(self._base, self._ordered())
         # What does not learn, by name, and the VLM's values of what should not and was not found.
         self._frozen: list[tuple[str, Tensor]] = []
         self._lost: dict[str, Tensor] = {}
         if method == "kfac" and self._options["weight"] > 0:
-            self._frozen, self._lost = _freeze(base, self._base, self.param_groups)
+            self._frozen, self._lost = matching.freeze_rest(base, self._base, self.param_groups)
         self._notes: dict[Tensor, dict[str, int]] = {}  # what each parameter's state remembers
         self._stepper: Stepper | None = None
         self._wide = WideStep(self, ())
@@ -191,8 +184,8 @@ class ProtectedAdamW(torch.optim.AdamW):
         known = self._known_again()
         found = self._found | known
         absent = {site: pair for site, pair in self._base.items() if site not in found}
-        found |= _match(absent, self._ordered(), _ids(found))
-        _refuse_half_frozen(found)
+        found |= matching.match(absent, self._ordered(), matching.ids(found))
+        matching.refuse_half_frozen(found)
         learning = {site: pair for site, pair in found.items() if pair[0].requires_grad}
         for site in found.keys() - learning.keys():
             self._frozen.append((site, found[site][0]))
@@ -205,8 +198,8 @@ class ProtectedAdamW(torch.optim.AdamW):
             )
         # Those of a resumed training have learned; it has been asked when it began.
         if not known:
-            _refuse_strays(self._base, found, self._ordered())
-            _refuse_lost(self._lost, self._base, found, self._ordered())
+            matching.refuse_strays(self._base, found, self._ordered())
+            matching.refuse_lost(self._lost, self._base, found, self._ordered())
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
@@ -290,293 +283,7 @@ def _kinds(
 
 def _copied(pair: Pair) -> Pair:
     weight, bias = pair
-    return _on_cpu(weight), None if bias is None else _on_cpu(bias)
-
-
-def _ids(found: Mapping[str, Pair]) -> set[int]:
-    return {id(tensor) for pair in found.values() for tensor in pair if tensor is not None}
-
-
-def _match(
-    base: Mapping[str, Pair], ordered: Sequence[Tensor], claimed: Collection[int] = ()
-) -> dict[str, Pair]:
-    """The parameters that have the values of the base model's sites, by site.
-
-    A program may have rounded the VLM, which is stored in float32: then those that have the rounded
-    values, of sites whose own nothing has.
-
-    Args:
-        claimed: ids of parameters that are known to be something else.
-
-    Raises:
-        AegisError: several sites of equal values, and not as many parameters; a weight without its
-            bias.
-    """
-    shapes = {tensor.shape for pair in base.values() for tensor in pair if tensor is not None}
-    places: dict[str, list[int]] = {}
-    for place, parameter in enumerate(ordered):
-        if parameter.shape in shapes and id(parameter) not in claimed:
-            places.setdefault(_values(parameter), []).append(place)
-    found: dict[str, Pair] = {}
-    for dtype in _TYPES:
-        rest = {site: pair for site, pair in base.items() if site not in found}
-        found |= _match_in(dtype, rest, ordered, places)
-    return found
-
-
-def _match_in(
-    dtype: torch.dtype,
-    base: Mapping[str, Pair],
-    ordered: Sequence[Tensor],
-    places: Mapping[str, Sequence[int]],
-) -> dict[str, Pair]:
-    """The parameters that have the values of the base model's sites in one type, by site.
-
-    Args:
-        places: of the parameters, by their values.
-    """
-    alike: dict[str, list[str]] = {}
-    for site, (weight, _) in base.items():
-        alike.setdefault(_values(weight.to(dtype)), []).append(site)
-    found: dict[str, Pair] = {}
-    for values, sites in alike.items():
-        at = places.get(values, [])
-        if at and len(at) != len(sites):
-            raise AegisError(
-                f"{len(at)} parameters with the values of {few(sites)}",
-                f"{len(sites)}, by which they can be told",
-                "freeze them in the policy, and leave only their kind out of protect=: what "
-                "is left free can undo what the others hold",
-            )
-        # Where there are none, nothing is found: a truncated VLM, or one that has learned.
-        for site, place in zip(sites, at, strict=False):
-            found[site] = (ordered[place], _bias(site, base[site][1], place, ordered, places))
-    return found
-
-
-def _bias(
-    site: str,
-    value: Tensor | None,
-    place: int,
-    ordered: Sequence[Tensor],
-    places: Mapping[str, Sequence[int]],
-) -> Tensor | None:
-    """The bias that belongs to the weight at a place: the next parameter, or the only one alike."""
-    if value is None:
-        return None
-    at = next((places[v] for v in _in_each_type(value) if v in places), ())
-    if place + 1 in at:
-        return ordered[place + 1]
-    if len(at) == 1:
-        return ordered[at[0]]
-    raise AegisError(
-        f"a parameter with the values of {site}.weight, and {len(at)} that may be its bias",
-        "the bias after its weight, as a model has them",
-        "give the optimizer the parameters in the model's order, and of a map both or none",
-    )
-
-
-def _refuse_half_frozen(found: Mapping[str, Pair]) -> None:
-    """Refuse a map of which only one half learns: the other cannot make up for it.
-
-    Raises:
-        AegisError: there is one.
-    """
-    for site, (weight, bias) in found.items():
-        if bias is not None and weight.requires_grad != bias.requires_grad:
-            still = "bias" if weight.requires_grad else "weight"
-            raise AegisError(
-                f"{site} of the base model in the policy, of which only the {still} is frozen",
-                "all or nothing",
-                "freeze both or none",
-            )
-
-
-def _refuse_strays(
-    base: Mapping[str, Pair], found: Mapping[str, Pair], ordered: Sequence[Tensor]
-) -> None:
-    """Refuse learning parameters that belong to a map of the VLM which was not found.
-
-    A map may be missing, as in a VLM with fewer layers. One that is there with other values would
-    learn unprotected, and so would a table with more rows.
-
-    Raises:
-        AegisError: a weight that has moved, a table of another size, or a bias without its weight.
-    """
-    free = _free(found, ordered)
-    for site in sorted(base.keys() - found.keys()):
-        weight, bias = base[site]
-        _refuse_resized(site, weight, free)
-        if any(_near(parameter, weight) for parameter in free.get(weight.shape, ())):
-            raise AegisError(
-                f"a parameter {list(weight.shape)} near {site} of the base model, and "
-                f"{len(found)} of its {len(base)} maps with their own values",
-                "a policy whose VLM still has the base model's weights, in a type that holds them",
-                "name the VLM that the policy begins with as the base, and measure its anchor; or "
-                "resume with the optimizer's state",
-            )
-        # Equal entries, as of biases that began at 0, may be anything's.
-        if bias is None or bool((bias == bias[0]).all()):
-            continue
-        if any(torch.equal(_on_cpu(p), bias) for p in free.get(bias.shape, ())):
-            raise AegisError(
-                f"the bias of {site} of the base model among what learns, and not its weight",
-                "all or nothing",
-                "freeze both or none",
-            )
-
-
-def _refuse_lost(
-    lost: Mapping[str, Tensor],
-    base: Mapping[str, Pair],
-    found: Mapping[str, Pair],
-    ordered: Sequence[Tensor],
-) -> None:
-    """Refuse learning parameters that belong to the VLM and that `kfac` could not freeze.
-
-    Those of a layer of which no map was found are missing, as the layer is.
-
-    Args:
-        lost: values of the VLM's parameters that are of no map, and were not found, by name.
-        base: the VLM's maps, of which some were found.
-
-    Raises:
-        AegisError: one that has moved, or a table of another size.
-    """
-    free = _free(found, ordered)
-    for name, value in lost.items():
-        if not _is_there(name, base.keys(), found.keys()):
-            continue
-        _refuse_resized(name, value, free)
-        if any(_near(parameter, value) for parameter in free.get(value.shape, ())):
-            raise AegisError(
-                f"a parameter {list(value.shape)} near {name} of the base model, which learns, and "
-                "kfac holds linear maps and convolutions alone",
-                "normalisations and tables with the base model's values, which are frozen, or "
-                "frozen ones among the optimizer's parameters",
-                "freeze it; aegis_nullspace protects one that has not learned before",
-            )
-
-
-def _is_there(name: str, sites: Collection[str], found: Collection[str]) -> bool:
-    """Whether maps were found in the innermost part of the VLM that has the parameter and maps."""
-    part = name
-    while part:
-        part = part.rpartition(".")[0]
-        inside = [site for site in sites if not part or site.startswith(f"{part}.")]
-        if inside:
-            return any(site in found for site in inside)
-    return False
-
-
-def _refuse_resized(name: str, table: Tensor, free: Mapping[torch.Size, Sequence[Tensor]]) -> None:
-    """Refuse a table that has rows after those of the VLM's: its own would learn unprotected."""
-    for shape, parameters in free.items():
-        if table.ndim != 2 or shape[1:] != table.shape[1:] or len(shape) != 2:
-            continue
-        if shape[0] > len(table) and any(_near(p[: len(table)], table) for p in parameters):
-            raise AegisError(
-                f"a parameter {list(shape)} whose first rows are near {name} {list(table.shape)} "
-                "of the base model, as resize_token_embeddings leaves it",
-                "a table of the base model's size, or one that is frozen",
-                "freeze it; or give the base model's the same rows, save it, measure its anchor, "
-                "and name it as the base",
-            )
-
-
-def _free(found: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[torch.Size, list[Tensor]]:
-    """What learns and was not found to be the VLM's, by shape."""
-    claimed = _ids(found)
-    free: dict[torch.Size, list[Tensor]] = {}
-    for parameter in ordered:
-        if parameter.requires_grad and id(parameter) not in claimed:
-            free.setdefault(parameter.shape, []).append(parameter)
-    return free
-
-
-def _near(parameter: Tensor, weight: Tensor) -> bool:
-    """Whether a parameter may be this weight after it has learned, or was rounded."""
-    now = _on_cpu(parameter)
-    # Equal entries are those of a normalisation that is new.
-    if bool((now == now.flatten()[0]).all()):
-        return False
-    return bool((now - weight).norm() <= _NEAR * weight.norm())
-
-
-def _on_cpu(tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().float()
-
-
-def _values(tensor: Tensor) -> str:
-    """A digest of shape and values, whatever the type that they are kept in."""
-    return digest({"": tensor})
-
-
-def _in_each_type(tensor: Tensor) -> Iterator[str]:
-    """Digests of its values, and of these rounded to each narrower type."""
-    return (_values(tensor.to(dtype)) for dtype in _TYPES)
-
-
-def _freeze(
-    base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
-) -> tuple[list[tuple[str, Tensor]], dict[str, Tensor]]:
-    """Let nothing learn of the VLM besides its protected maps.
-
-    Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
-    made, may be an expert's too; of these, what is frozen stands in the VLM's order.
-
-    Args:
-        protected: the sites that learn.
-        groups: the optimizer's.
-
-    Returns:
-        What was frozen, with its name; and by name those of the VLM that have too few parameters of
-        their values, on the CPU. They may have learned before.
-    """
-    held = {id(t) for site in protected for t in weights(base, site) if t is not None}
-    in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
-    given = Counter(value for _, values in in_groups for value in values)
-    named, sequence = list(base.named_parameters()), []
-    for _, parameter in named:
-        known = next((v for v in _in_each_type(parameter) if v in given), "")
-        sequence.append((known or _values(parameter), id(parameter) in held))
-    others = Counter(value for value, is_held in sequence if not is_held)
-    held_values = {value for value, is_held in sequence if is_held}
-    lost: dict[str, Tensor] = {}
-    for (name, parameter), (value, is_held) in zip(named, sequence, strict=True):
-        if not is_held and given[value] < others[value]:
-            lost[name] = _on_cpu(parameter)
-    unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
-    names = {value: name for (name, _), (value, _) in zip(named, sequence, strict=True)}
-    frozen: list[tuple[str, Tensor]] = []
-    for parameters, values in in_groups:
-        others_here = _in_order(sequence, values) if unclear & set(values) else set()
-        for place, (parameter, value) in enumerate(zip(parameters, values, strict=True)):
-            is_other = place in others_here if value in unclear else value in others
-            if is_other:
-                parameter.requires_grad_(False)
-                parameter.grad = None  # AdamW would step by one that was there before
-                frozen.append((names[value], parameter))
-    return frozen, lost
-
-
-def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> set[int]:
-    """The places of the VLM's unprotected parameters in a group of the optimizer's.
-
-    Args:
-        sequence: the values of the VLM's parameters, and whether each is protected.
-        values: those of the group, which may have some of them, and others.
-    """
-    here = set(values)
-    expected = [pair for pair in sequence if pair[0] in here]
-    matcher = SequenceMatcher(None, [value for value, _ in expected], values, autojunk=False)
-    found = set()
-    for start, place, length in matcher.get_matching_blocks():
-        for i in range(length):
-            _, is_held = expected[start + i]
-            if not is_held:
-                found.add(place + i)
-    return found
+    return matching.on_cpu(weight), None if bias is None else matching.on_cpu(bias)
 
 
 @contextlib.contextmanager

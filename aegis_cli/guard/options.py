@@ -19,7 +19,8 @@ from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Parts, Setting, weights
+from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.models import structure, wrappers
 from aegis_cli.models.wrappers import PlainNames, plain_names
 from aegis_cli.recipes import policy

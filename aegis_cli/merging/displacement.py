@@ -10,7 +10,7 @@ import torch
 from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.projection import dot
 from aegis_cli.merging.task_factors import dense_sites
-from aegis_cli.methods.base import weights
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones.base import Backbone
 
 # Site, displacement of its weight and bias, strength -> what is kept of the displacement.

@@ -22,7 +22,7 @@ from aegis_cli.merging.displacement import Keep
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.merging.sources import Source, has_moved
 from aegis_cli.merging.task_factors import dense_sites
-from aegis_cli.methods.base import weights
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGE_NEEDS
 

@@ -40,16 +40,8 @@ from aegis_cli.core.curvature import Curvature
 from aegis_cli.core.numerics import ratio
 from aegis_cli.core.pairs import Pair, copied_small, minus
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import (
-    Method,
-    Options,
-    Parts,
-    Setting,
-    Update,
-    pair_here,
-    together,
-    weights,
-)
+from aegis_cli.methods.base import Method, Options, Parts, Setting, Update
+from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
 _LEAST_RATE = 1e-6  # share of the peak learning rate
 
@@ -167,7 +159,7 @@ def _grouped(
 ) -> list[_Group]:
     """The maps in groups, each with what it began with and its curvature."""
     groups = []
-    for names in together(maps, owners, lambda site: found[site].inputs.shape[-1]):
+    for names in stackable(maps, owners, lambda site: found[site].inputs.shape[-1]):
         own = [maps[name] for name in names]
         now = stacking.stacked([pair_here(pair) for pair in own])
         curved = curvature.stacked([found[name] for name in names])

@@ -27,16 +27,8 @@ from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import nullspace, stacking
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Strength, TableRows
 from aegis_cli.core.pairs import Pair, minus
-from aegis_cli.methods.base import (
-    Method,
-    Parts,
-    Setting,
-    Update,
-    pair_here,
-    together,
-    train_all,
-    weights,
-)
+from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
 
 def start(setting: Setting) -> Parts:
@@ -143,7 +135,7 @@ def _grouped(
 
     pairs = {site: weights(backbone, site) for site in protections}
     groups = []
-    for names in together(pairs, owners, directions, alone):
+    for names in stackable(pairs, owners, directions, alone):
         protection = nullspace.stacked([protections[name] for name in names])
         groups.append(_Group(backbone, names, protection))
     return groups

@@ -39,7 +39,8 @@ from aegis_cli.core.pairs import minus
 from aegis_cli.core.spectrum import DENSE
 from aegis_cli.guard.stepper import SlowedStep
 from aegis_cli.methods import kfac
-from aegis_cli.methods.base import Parts, weights
+from aegis_cli.methods.base import Parts
+from aegis_cli.methods.site_weights import weights
 
 MAPS = (
     "vision.0",

@@ -16,7 +16,8 @@ from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import decompose
 from aegis_cli.methods import kfac
-from aegis_cli.methods.base import Parts, Setting, Update, weights
+from aegis_cli.methods.base import Parts, Setting, Update
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.recipes import Kfac
 
 MAPS = ("first", "second")

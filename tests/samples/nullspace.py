@@ -15,7 +15,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import Protection, Strength
 from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import Spectrum, channel_moment, decompose, second_moment
-from aegis_cli.methods.base import weights
+from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones import Backbone
 
 SITE = "map"
