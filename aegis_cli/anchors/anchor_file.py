@@ -1,7 +1,7 @@
 """An anchor as a file: what it holds as named tensors, and back.
 
-Maps with one and the same spectrum have it once, under the first one's name: the header's `shared`
-says of each other one whose it is. Eigenvectors are in float32; those of a model that is too large
+Maps that share a spectrum store it once, under the first one's name; the header's `shared` gives
+that name for each of the others. Eigenvectors are in float32; those of a model that is too large
 for exact spectra of all its maps are in half precision, and are made orthonormal again when they
 are read. The rounding turns a direction by about 2e-4, so it lets through 4e-8 of its energy.
 """

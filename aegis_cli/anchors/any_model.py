@@ -1,4 +1,4 @@
-"""An anchor of a model that is not ours, from VQA passes that its owner makes."""
+"""The anchor of any PyTorch model, measured on VQA passes that the user runs."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class Measurement(Removable):
         # With layers watched, `_count` knows the batch's size from what they return.
         if not self._layers:
             self._add_samples(None if mask is None else len(mask))
-        # What an earlier pass has counted by halves stays in the sums.
+        # An earlier pass that failed half-way is still in the sums.
         self._broken = failed_before
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     from aegis_cli.data.vqa.dataset import VQASet
 
 SIDES = ("inputs", "outputs")
-# Nats a word. At 0.025 `kfac` holds what it should, and at 0.002 it does not: see
+# Nats per word. At 0.025 `kfac` protects VQA, and at 0.002 it does not: see
 # docs/results/transfer.md.
 _SURE = 0.01
 

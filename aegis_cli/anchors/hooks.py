@@ -47,7 +47,7 @@ class Removable(ABC):
 class LayerHooks:
     """Hooks on the layers that keep what they return, while a block is open.
 
-    It knows the model by its hooks alone, so that a copy of the model is not a copy of the hooks'
+    It refers to the model by its hooks alone, so that copying the model does not copy their
     owner.
     """
 

@@ -20,7 +20,7 @@ Readers = tuple[str, ...]  # names of maps that have read the same rows, in alph
 
 
 class SecondMoments:
-    """Sums of second moments, so that neither batch size nor order shows in them.
+    """Sums of second moments, which depend neither on batch size nor on order.
 
     Maps that read the same rows share one sum and, where they always do, one spectrum.
     """

@@ -97,10 +97,10 @@ def on_gpu() -> bool:
 
 
 def reading_stalls(device: torch.device) -> bool:
-    """Whether to read a number of that device is to wait until it has done all it was given.
+    """Whether reading a number of the device is a *sync*: it waits until all queued work is done.
 
-    A GPU then stands still until it is given more. So what a step leaves is read now and then, and
-    what it decides on the way it decides without the number.
+    A GPU then idles until it is given more. So what a step leaves is read now and then, and what
+    depends on a number within a step is computed on the device.
     """
     return device.type != "cpu"
 

@@ -1,4 +1,4 @@
 """The mathematics of Aegis on plain tensors: no I/O, no model, no user interface.
 
-One room has modules: the routed experts of `routing`, which are weights beside a map's own.
+One file is an exception: `routing` defines `nn.Module`s, because its experts have parameters.
 """

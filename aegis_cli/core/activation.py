@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 
 class _SquaredReLU(torch.autograd.Function):
-    """max(x, 0)^2 with the derivative 2 max(x, 0), from the one tensor that it keeps.
+    """max(x, 0)^2 with the derivative 2 max(x, 0); only max(x, 0) is saved for the backward pass.
 
     Forward and backward together take three quarters of the time of `relu(x).square()` on a CPU
     (3.6 against 4.8 ms at [32, 75, 768], 2 cores).
@@ -26,7 +26,7 @@ class _SquaredReLU(torch.autograd.Function):
         return positive * positive
 
     @staticmethod
-    @once_differentiable  # `positive` is no input: a second derivative would silently lack its term
+    @once_differentiable  # `positive` is not an input: a second derivative would miss its term
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (positive,) = ctx.saved_tensors
         return gradient.mul(positive).mul_(2)

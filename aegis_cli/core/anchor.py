@@ -1,4 +1,4 @@
-"""The anchor: what was measured of the pre-trained backbone on VQA, once, before any training."""
+"""The anchor: statistics of the pre-trained backbone on VQA, measured once before training."""
 
 from __future__ import annotations
 

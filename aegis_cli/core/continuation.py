@@ -1,10 +1,10 @@
-"""Real-time chunking: a chunk of actions that continues the one which the robot still executes.
+"""Real-time chunking: predict an action chunk that continues the one still being executed.
 
 Black, Galliker, Levine: Real-Time Execution of Action Chunking Flow Policies (arXiv 2506.07339).
-While a chunk is predicted, the robot goes on with the chunk before. By the time the new one is
-there, it has moved; a chunk that plans another way would then jerk it over. So each step of the
-flow is pulled towards what is left of the old chunk: fully over the actions that will have been
-executed by then, less and less over the others that it has, and not beyond.
+While the policy predicts a chunk, the robot keeps executing the previous one, so it has moved when
+the new chunk arrives. If the new chunk planned another path, the robot would jerk. So each flow
+step is pulled towards the rest of the old chunk: fully for the actions that will have been executed
+by then, with decreasing weight for later ones, and not at all beyond its end.
 
 With t = 1 at the noise and t = 0 at the action, as in `models.flow`, a velocity v(x, t) expects the
 action a(x) = x - t v(x, t). Guidance by pseudo-inverse (the paper's equations 2 to 5, whose time

@@ -14,16 +14,17 @@ In the eigenbases of both factors the product is diagonal, h_ij = g_i c_j. The p
 
     D_ij <- D_ij / (1 + w h_ij)
 
-in closed form. It is stable for any w. It is taken after the optimizer's step, so that no Adam
-rescales it. Two choices are ours: g and c have mean 1, so that w depends neither on the loss's
+in closed form. It is stable for any w. It comes after the optimizer's step, so Adam does not
+rescale it. Two choices are ours: g and c have mean 1, so that w depends neither on the loss's
 scale nor on the map's size, and the outputs are damped,
 
     h_ij = (g_i + damping) c_j
 
-Damping is needed because the Fisher information describes small steps only. A unit that is off has
-no gradient, but a large step turns it on. So an undamped penalty lets the weights run along outputs
-that no answer depends on yet, and there the harm is done (recipes/results/LOG.md). Inputs are not
-damped: what VQA does not read is free. K-FAC damps both factors, because it inverts them.
+Damping is needed because the Fisher information describes small steps only. An inactive unit has no
+gradient, but a large step can activate it. Without damping, the weights may move freely along
+outputs that no answer depends on yet, and that is where VQA was lost (recipes/results/LOG.md).
+Inputs are not damped: directions that VQA does not read may change. K-FAC damps both factors,
+because it inverts them.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ from aegis_cli.core.numerics import ratio, wide_type
 from aegis_cli.core.pairs import Pair
 from aegis_cli.core.spectrum import Spectrum
 
-# A proximal step of this weight takes away all that has a curvature. In float32 a larger one may be
-# infinite, and infinity times a curvature of 0 is no number.
+# The largest weight of a proximal step; it removes everything that has curvature. A larger one may
+# overflow float32, and infinity times a curvature of 0 is NaN.
 _HEAVIEST = 1e30
 
 
@@ -50,8 +51,8 @@ _HEAVIEST = 1e30
 class Curvature:
     """The curvature at one linear map or convolution, or at several that are stacked.
 
-    The matrix h is made anew when it is used, because it is as large as the map. Of n stacked maps
-    (core/stacking.py) every tensor, displacements included, has a first dimension n more.
+    The matrix h is recomputed at each use, because it is as large as the weight. For n stacked maps
+    (core/stacking.py) every tensor, displacements included, has a leading dimension n.
 
     Attributes:
         inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one. They may be in half
@@ -89,7 +90,7 @@ class Curvature:
         Args:
             weight: displacement of the map's weight, [o, ...].
             bias: displacement of its bias, [o].
-            strength: the penalty's weight w, a tensor [] where nobody may read it.
+            strength: the penalty's weight w; a tensor [] is not read, which would force a GPU sync.
         """
         return self._weighed(weight, bias, bounded(strength), taken)
 
@@ -116,8 +117,8 @@ class Curvature:
         rest = self.c_rest
         resolved = not isinstance(rest, Tensor) and rest == 0
         if not resolved:
-            # All inputs have the share of those that were never resolved, and the stored ones what
-            # theirs is more. Else what lies outside them is not read on VQA, and stays.
+            # Every input direction gets the share of the unresolved ones; along the stored ones the
+            # difference to their own share is added below.
             if not isinstance(rest, Tensor):
                 rest = self.c.new_full((1,), rest)
             floor_rest, above_rest = self._shares(strength, rest, factor)
@@ -184,8 +185,8 @@ def curvatures(
             "that of every map that learns",
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
-    # Where some are sketched, the anchor's file has them all in half precision. So they take half
-    # of the memory, and a proximal step is off by a thousandth of what it takes away.
+    # If some factors are sketched, the anchor's file stores all of them in half precision. Keeping
+    # that halves their memory and changes a proximal step by a thousandth of what it removes.
     sketched = not all(spectrum.whole for spectrum in anchor.curvature.values())
     found = {}
     held: dict[tuple[int, torch.device], Tensor] = {}
@@ -194,7 +195,7 @@ def curvatures(
         kept_in = like.half() if sketched else like
         inputs, outputs = (anchor.curvature[name] for name in factors[site])
         for spectrum in (inputs, outputs):
-            # Queries, keys and values read the same, and have one tensor.
+            # Queries, keys and values read the same input and share one tensor.
             if (id(spectrum), like.device) not in held:
                 assert spectrum.vectors is not None
                 held[id(spectrum), like.device] = spectrum.vectors.to(kept_in)
@@ -225,5 +226,5 @@ def bounded(strength: float | Tensor) -> float | Tensor:
 
 def taken(strength: Tensor) -> Tensor:
     """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
-    strength = strength.clamp(max=_HEAVIEST)  # infinity over infinity is no number
+    strength = strength.clamp(max=_HEAVIEST)  # infinity / infinity is NaN
     return strength / (1 + strength)

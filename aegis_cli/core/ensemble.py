@@ -1,8 +1,8 @@
 """Temporal ensembling: an action as the mean of all chunks that have predicted it.
 
 Zhao, Kumar, Levine, Finn: Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware
-(arXiv 2304.13705), Algorithm 2. A chunk of H actions is predicted at every step. A_t[0..n-1] being
-the predictions of the action at step t, the oldest first, n <= H, the action is
+(arXiv 2304.13705), Algorithm 2. A chunk of H actions is predicted at every step. With the n <= H
+predictions A_t[0..n-1] of the action at step t, oldest first, the executed action is
 
     a_t = sum_i w_i A_t[i] / sum_i w_i,    w_i = exp(-m i).
 
@@ -22,7 +22,7 @@ from aegis_cli.common.errors import AegisError
 
 
 def check(decay: float) -> None:
-    """Raise AegisError for a decay that is no finite number."""
+    """Raise AegisError for a decay that is not finite."""
     if not math.isfinite(decay):
         raise AegisError(
             f"a temporal ensemble with decay {decay}", "a finite number", "ACT has 0.01"
@@ -58,8 +58,10 @@ class TemporalEnsemble:
             self._chunks.popleft()
         self._chunks.append(chunk)
         ages = range(len(self._chunks) - 1, -1, -1)
-        told = torch.stack([c[..., age, :] for age, c in zip(ages, self._chunks, strict=True)])
+        predictions = torch.stack(
+            [c[..., age, :] for age, c in zip(ages, self._chunks, strict=True)]
+        )
         # softmax is the same quotient, and finite for any decay.
-        order = torch.arange(len(told), dtype=torch.float64, device=told.device)
+        order = torch.arange(len(predictions), dtype=torch.float64, device=predictions.device)
         weights = torch.softmax(-self._decay * order, 0)
-        return torch.tensordot(weights, told.double(), dims=1).to(chunk.dtype)
+        return torch.tensordot(weights, predictions.double(), dims=1).to(chunk.dtype)

@@ -77,7 +77,7 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     taken = min(rank, size - 1)  # at least one is left, for the noise to be a mean of
     directions = vectors[:, :taken].contiguous()
     variances, noise = values[:taken].clone(), values[taken:].mean()
-    # The density needs no threshold, and the threshold needs the density.
+    # The threshold is a quantile of the densities, which are computed with a placeholder for it.
     found = Gaussian(mean, directions, variances, noise, threshold=values.new_zeros(()))
     return replace(found, threshold=torch.quantile(found.log_density(wide), quantile))
 

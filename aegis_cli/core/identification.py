@@ -1,7 +1,6 @@
 """What a router's weights tell about a new task: which experts it needs, and what is new in it.
 
-All rules here are choices of this package, made from nothing but the abstract of iGSP
-(arXiv 2605.19301).
+The rules here are our own: only the abstract of iGSP (arXiv 2605.19301) was available.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
     """
     charged = passed.weights.new_zeros(passed.weights.shape[-1])
     charged[list(columns)] = price
-    # It holds gradients alone: hooks that hold a tensor of the graph keep the whole graph for good.
+    # Holds gradients only: a hook that held a tensor of the graph would keep the graph alive.
     seen: list[Tensor] = []
 
     def see(gradient: Tensor) -> None:
@@ -145,7 +144,7 @@ def basis(matrices: Sequence[Tensor]) -> Tensor:
     return left[:, values > 1e-6 * largest]
 
 
-def off(matrix: Tensor, columns: Tensor) -> Tensor:
+def without_span(matrix: Tensor, columns: Tensor) -> Tensor:
     """A matrix M [d, n] without its part in the span of `columns` Q: (I - Q Q^T) M, in M's type.
 
     Args:

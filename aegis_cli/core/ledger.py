@@ -1,4 +1,4 @@
-"""The ledger of a training: at each step every group's inner products and every layer's W2^2."""
+"""Per-step record of a training: inner products per parameter group and W2^2 per layer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aegis_cli.core import projection
 from aegis_cli.core.numerics import ratio
 
 COLUMNS = ("tt", "ta", "aa", "w2")
-_LEAST_ROWS = 64  # room that a ledger makes at a time
+_LEAST_ROWS = 64  # rows that a ledger allocates at a time, at least
 
 
 @dataclass(frozen=True)

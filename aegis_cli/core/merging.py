@@ -9,8 +9,8 @@ task are of its loss: an empirical Fisher information. Under the Kronecker-facto
 
     tr(G_r (X - D) C_r (X - D)^T) + s tr(G_v X C_v X^T)
 
-The first term is what the task loses by X instead of D, the second one is what the questions lose
-by X instead of 0, and s says how much the second one counts. X is where the gradient is zero:
+The first term is what the task loses if X replaces D, the second what the questions lose if X
+replaces 0, and s weighs the second. At the minimum the gradient vanishes:
 
     G_r (X - D) C_r + s G_v X C_v = 0
 
@@ -23,10 +23,10 @@ With X = Q Z P^T and D = Q E P^T, multiplying by Q^T from the left and by P from
 
     Z_ij = E_ij b_i a_j / (b_i a_j + s (1 - b_i) (1 - a_j))
 
-So a and b, between 0 and 1, say whose a direction is. Limits: s = 0 keeps D, s -> infinity keeps
-nothing that questions read, and C_r = C_v with G_r = G_v gives D / (1 + s), the straight line
-between both models (WiSE-FT, arXiv 2109.01903). With identities as G_r and G_v, b is 1/2 and
-X = D C_r (C_r + s C_v)^-1, which needs no gradients.
+So a and b, between 0 and 1, say how far a direction belongs to the task. Limits: s = 0 keeps D,
+s -> infinity keeps nothing that questions read, and C_r = C_v with G_r = G_v gives D / (1 + s), the
+straight line between both models (WiSE-FT, arXiv 2109.01903). With identities as G_r and G_v, b is
+1/2 and X = D C_r (C_r + s C_v)^-1, which needs no gradients.
 
 Two choices are ours, as in core/curvature.py. Every moment is divided by its mean eigenvalue, so
 that s depends neither on a loss's scale nor on the map's size, and it is damped: `damping` is then
@@ -114,6 +114,6 @@ def damped(spectrum: Spectrum, damping: float) -> Tensor:
 
 
 def _share(task: Tensor, questions: Tensor, strength: float) -> Tensor:
-    """task / (task + strength * questions); what neither minds is kept."""
+    """task / (task + strength * questions); 1 where neither depends on a direction."""
     against = strength * questions
     return torch.where(against > 0, ratio(task, task + against), 1.0)

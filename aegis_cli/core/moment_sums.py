@@ -11,7 +11,7 @@ Cevher 2017, arXiv 1706.05736, algorithm 3). The trace of C is summed beside it,
 the leading directions lack is known, and becomes one scalar. Both are linear in C: the sums of
 several passes or processes add up.
 
-A side wider than `SKETCHED`, such as the words that a head scores, has its trace alone.
+For a side wider than `SKETCHED`, such as a vocabulary head's outputs, only the trace is kept.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class Sketch(MomentSum):
     def __init__(self, width: int, device: torch.device) -> None:
         self._width, self._device = width, device
         count = columns(width)
-        # Y [d, l], in float32 in a program of another default type too.
+        # Y [d, l], float32 even if the program has set another default dtype.
         self._seen = torch.zeros(width, count, dtype=torch.float32, device=device)
         self._trace = torch.zeros((), dtype=torch.float64, device=device)
 
@@ -193,7 +193,7 @@ class Sketch(MomentSum):
         parts = vectors.split(_WIDE_ROWS)
         for part, half in zip(parts, self._halves(root, count, shift), strict=True):
             part.copy_(half @ scaled[:, :kept])
-        # Rounding may leave less than nothing.
+        # Rounding may make this slightly negative.
         rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
         return with_rest(values[:kept], vectors, rest)
 
@@ -265,7 +265,7 @@ def _strips(width: int) -> list[tuple[int, int]]:
 def _probe(width: int, count: int, device: str) -> Tensor:
     """Random columns [d, l] of length about 1; the same for every map of that width.
 
-    So few of them in so many dimensions are nearly orthogonal, which is all the method asks.
+    So few random vectors in so many dimensions are nearly orthogonal, which is all that is needed.
     """
     generator = torch.Generator("cpu").manual_seed(width)
     drawn = torch.randn(width, count, generator=generator, dtype=torch.float32, device="cpu")

@@ -1,4 +1,11 @@
-"""Mean and variance of hidden states over valid tokens, mergeable or differentiable."""
+"""Mean and variance of hidden states over valid tokens.
+
+masked_moments  of one batch, in float64, to be merged: an anchor is measured so
+batch_moments   of one batch, with its graph: a penalty is made of these
+padded_moments  the same by masking, without a GPU sync
+joint_moments   `padded_moments` of every layer, by few kernels
+shared_moments  of a batch that several processes share
+"""
 
 from __future__ import annotations
 
@@ -101,7 +108,7 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """What `batch_moments` returns, without selecting rows, so that their number is not read.
+    """`batch_moments` by masking instead of selecting rows, which avoids a GPU sync.
 
     Args:
         h: hidden states [B, T, D], or [n, B, T, D] of n layers, whose results are [n, D].
@@ -115,7 +122,7 @@ def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def joint_moments(hidden: Sequence[Tensor], mask: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """What `padded_moments` returns of each layer, by fewer kernels: several layers have one.
+    """`padded_moments` of each layer; layers of one shape are stacked, so that fewer kernels run.
 
     Args:
         hidden: each layer's output, L tensors [B, T, D].
@@ -143,7 +150,7 @@ def shared_moments(
         hidden: each layer's output, L tensors [B, T, D].
         mask: [B, T] bool.
         total: a tensor -> its sum over the processes.
-        reads: whether the number of valid tokens may be read, which on a GPU waits for it.
+        reads: whether the number of valid tokens may be read, which forces a GPU sync.
     """
     if reads:
         rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
@@ -171,7 +178,7 @@ def shared_moments(
 def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
     """Layers that follow each other, stacked [n, B, T, D] while their shapes are alike.
 
-    As many as have `stacking.MOST` entries, since larger ones keep a GPU busy by themselves.
+    A stack has at most `stacking.MOST` entries: larger layers keep a GPU busy by themselves.
     """
     groups: list[list[Tensor]] = []
     for h in hidden:

@@ -33,7 +33,7 @@ class Protection(Protocol):
         """The protected part of an update of the map's weight and bias, in their shapes."""
 
     def of_rows(self, rows: slice) -> Protection:
-        """The protection of these rows of weight and bias, whose parts stand for themselves."""
+        """The protection of these rows alone; each row is protected independently of the others."""
 
     def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
         """What `hold` has to know of the values before an update."""
@@ -85,7 +85,7 @@ class Dense:
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
         """See `Protection.hold`; directions that were never resolved are left as they are.
 
-        To know what has changed along them would take the whole of the values before.
+        To know what changed along them would take a full copy of the old values.
         """
         removed = self._lost(weight, bias, before)  # [o, k]
         width = weight.flatten(1).shape[1]
@@ -200,14 +200,14 @@ class TableRows:
             self.scores.hold(weight, None, tuple(along))
 
     def _read(self, weight: Tensor) -> Tensor:
-        """The rows that VQA reads: a copy, or of a lone row all of the weight, or nothing of it."""
+        """A copy of the rows that VQA reads; of a lone row, its whole weight if it is read."""
         if len(self.used) == 1:
             return weight if len(self._places) else weight.flatten()[:0]
         return weight.index_select(0, self._places)
 
     @cached_property
     def _places(self) -> Tensor:
-        """Which rows VQA reads [n]; on a GPU, to find them waits."""
+        """Indices [n] of the rows that VQA reads; cached, since finding them forces a GPU sync."""
         return self.used.nonzero().squeeze(1)
 
 
@@ -261,7 +261,7 @@ def _dense(spectrum: Spectrum, strength: Strength, like: Tensor) -> Dense:
         energy = spectrum.values.sum()
         factor = _soft(spectrum.values[:stored], energy, strength.soft)
         rest = float(_soft(spectrum.rest, energy, strength.soft))
-        # On the parameters' device and in their type already, U stays the anchor's own.
+        # If device and dtype match already, `to` copies nothing, and U is shared with the anchor.
         return Dense(spectrum.vectors.to(like), factor.to(like), rest)
     count = rank(spectrum.values, strength.energy)
     if count > stored and not spectrum.whole:
@@ -308,7 +308,7 @@ def stacked(found: Sequence[Protection]) -> Protection:
     """The protection of several maps, or normalisations, of one shape; a single one stays as it is.
 
     Raises:
-        TypeError: tables, whose rows that are read are others in each.
+        TypeError: tables; each has another set of rows that are read.
     """
     if len(found) == 1:
         return found[0]

@@ -17,7 +17,7 @@ def copied(pair: Pair) -> Pair:
 
 
 def copied_small(pair: Pair) -> Pair:
-    """A copy in half precision where that holds the same numbers, as of a model of the hub."""
+    """A copy; in bfloat16 if that loses nothing, as for weights that were stored in it."""
     weight, bias = pair
     return _small(weight), None if bias is None else _small(bias)
 

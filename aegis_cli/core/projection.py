@@ -62,12 +62,12 @@ def _inner_by_few_kernels(
 
 
 def _energy(gradients: Gradients, device: torch.device) -> Tensor:
-    """<g, g> over all that are there, a float64 scalar; read once, and not widened in memory."""
+    """<g, g> over the gradients that exist, a float64 scalar, without a float64 copy of them."""
     there = [g for g in gradients if g is not None]
     if not there:
         return torch.zeros((), dtype=torch.float64, device=device)
     norms = torch._foreach_norm(there, dtype=torch.float64)
-    # A loop of somebody else's may have its layers on several GPUs.
+    # In a user's own loop, the layers may be on several GPUs.
     return torch.stack([norm.to(device) for norm in norms]).square().sum()
 
 
@@ -125,7 +125,7 @@ def _device(tensors: Iterable[Tensor | None]) -> torch.device | None:
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
     """The inner products of every group, stacked: tt, ta, aa [G]."""
-    # A group without any gradient does not know where the others are.
+    # A group without gradients has no device of its own: the first gradient of any group tells.
     device = _device(x for gs, as_ in groups for x in (*gs, *as_))
     rows = [torch.stack(inner(gs, as_, device)) for gs, as_ in groups]
     tt, ta, aa = torch.stack(rows).unbind(1)  # of [G, 3]
@@ -155,7 +155,7 @@ def apply(
 
     With weights (1, 0) nothing changes, bit for bit. Where g is None and a is not, the result is a
     new tensor: the projection moves parameters that the task does not. Weights that are tensors []
-    are not read, and so neither saves its work at (1, 0).
+    are not read (no GPU sync), so they do not take the shortcuts at (1, 0).
     """
     there = [g for g in gs if g is not None]
     if there and (isinstance(wg, Tensor) or wg != 1):
@@ -196,12 +196,11 @@ def scaled(y: Tensor, scale: float | Tensor) -> Tensor:
 
 
 def _holds(dtype: torch.dtype, scale: float | Tensor) -> bool:
-    """Whether a type has numbers as large as a finite scale.
+    """Whether a finite scale fits into a type without overflow.
 
-    A small anchor gradient has a large weight, beyond float16 easily, and their product is as small
-    as the task gradient. PyTorch refuses such a number, and makes a tensor of it infinite. A tensor
-    is not read, and may always be too large for float16. For the wider types it is only where the
-    gradients differ by 38 orders of magnitude.
+    A tiny anchor gradient gets a huge weight, which easily overflows float16, although their
+    product is no larger than the task gradient. A tensor is not read, so for float16 it counts as
+    too large. Wider types overflow only if the gradients differ by 38 orders of magnitude.
     """
     if isinstance(scale, Tensor):
         return dtype != torch.float16

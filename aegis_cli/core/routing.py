@@ -51,7 +51,7 @@ class Expert(nn.Module):
     """A low-rank map B A, at first zero.
 
     Attributes:
-        owner: number of the task that brought it, or made it its own.
+        owner: number of the task that added it, or took it over.
         frozen: whether no later task trains it.
     """
 
@@ -162,7 +162,7 @@ class RoutedLinear(nn.Module):
     Attributes:
         active: number of the task whose router is used. With None, or a task that has no router
             here, the map is bare.
-        born: how many experts there ever were; the next one's number.
+        born: how many experts were ever created, which is the next one's number.
         trace: where passes are noted while `traced` is on.
     """
 
@@ -261,7 +261,7 @@ class RoutedLinear(nn.Module):
         return {"born": self.born, "experts": experts, "routers": routers}
 
     def rebuild(self, structure: Mapping[str, Any]) -> None:
-        """Become what `structure` says; the tensors are still to be loaded, and nothing learns."""
+        """Recreate the modules of `structure`, frozen; their tensors are still to be loaded."""
         self.experts, self.routers, self.born = nn.ModuleDict(), nn.ModuleDict(), structure["born"]
         # JSON sorts its keys as text, 10 before 2; `numbers` promises the order of coming.
         for number in sorted(structure["experts"], key=int):

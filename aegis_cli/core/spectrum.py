@@ -3,8 +3,8 @@
 Everything that maps tokens to tokens is linear in its own parameters, so one rule serves all of
 them. A linear map with a bias reads (x, 1). A convolution reads the unfolded patch and 1. A
 normalisation's scale and shift read (x^_c, 1) in each channel c, where x^ is the normalised input.
-A table (word embeddings, positions) reads one-hot rows. A lone row that is a parameter by itself is
-a table of one row, which every question reads.
+A table (word embeddings, positions) reads one-hot rows. A *lone row*, a parameter outside any such
+layer (a class token, say), is a table of one row that every question reads.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Several maps treated as one, where to start a product takes longer than to make it.
+"""Several maps stacked into one, where launching a GPU kernel takes longer than running it.
 
-A GPU runs thousands of small products in less time than a processor needs to start them. Maps of
-one shape [o, d] are stacked to [n, o, d], and their bases with them. Of these some have fewer
-directions than others: zeros stand for what they lack, along which nothing is read or taken.
+Maps of one shape [o, d] are stacked to [n, o, d], and their bases with them. A basis with fewer
+directions than others is padded with zeros, along which nothing is read or removed.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ def groups(
 
     Args:
         kind: what has to be equal within a group.
-        size: a site -> the entries of its weight, and how many directions it has; those with alike
-            numbers come together, so that few zeros are added.
+        size: a site -> the entries of its weight, and how many directions it has; sites
+            with similar counts are grouped, which keeps the padding small.
     """
     by_kind: dict[Hashable, list[str]] = {}
     for site in sites:
@@ -51,7 +50,7 @@ def kind_of(pair: Pair) -> Hashable:
     """What maps have in common that can be stacked."""
     weight, bias = pair
     of_bias = None if bias is None else bias.dtype
-    # A loop of somebody else's may have its layers on several GPUs.
+    # In a user's own loop, the layers may be on several GPUs.
     return _flat(weight).shape, weight.dtype, weight.device, of_bias
 
 
@@ -65,7 +64,7 @@ def stacked(pairs: Sequence[Pair]) -> Pair:
 
 
 def apart(pair: Pair, like: Sequence[Pair]) -> list[Pair]:
-    """What was computed of stacked maps, of each by itself and in its shape."""
+    """Split what was computed for stacked maps: one pair per map, in the map's own shape."""
     if len(like) == 1:
         return [pair]
     weights, biases = pair
@@ -84,7 +83,7 @@ def _flat(weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def subtract(pairs: Sequence[Pair], taken: Pair) -> None:
-    """Take what was computed of stacked maps out of the maps, in place."""
+    """Subtract from each map its part of what was computed for the stack, in place."""
     values, by = [], []
     for own, part in zip(pairs, apart(taken, pairs), strict=True):
         for value, difference in zip(own, part, strict=True):

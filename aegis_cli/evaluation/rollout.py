@@ -30,7 +30,7 @@ from aegis_cli.training import checkpoint
 
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
-DEFAULT = "seen"  # the default colours, and the only word for a task without colours
+DEFAULT = "seen"  # the default, and the only choice for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
 _MOST = 10_000_000  # episodes
 

@@ -1,4 +1,4 @@
-"""AEGIS in a training loop that is not ours."""
+"""The methods in a user's own training loop."""
 
 from aegis_cli.guard.guard import Guard
 

@@ -9,7 +9,7 @@ own share, and projects the new sum.
 Several processes may have a copy of the model each (DistributedDataParallel, which averages what
 arrives in `.grad`). The anchor gradient does not arrive there, so it is averaged here; without that
 each process would project the same task gradient against an anchor gradient of its own, and the
-copies would part.
+copies would diverge.
 """
 
 from __future__ import annotations

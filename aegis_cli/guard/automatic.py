@@ -1,4 +1,4 @@
-"""The guard in a loop that calls nothing of it: a trainer's, which goes back and steps itself.
+"""The guard in a loop that never calls it, such as a trainer's: hooks do all the work.
 
 A forward pass of the model is watched by hooks on its call. The anchor gradient is taken as it
 ends, from the graph that the loop's own backward pass goes through afterwards. When that backward
@@ -31,7 +31,7 @@ Source = str | Callable[[Mapping[str, Any]], Tensor | None] | None
 
 
 class AutomaticLoop:
-    """What the guard does at the moments of a pass that the loop's hooks tell it of."""
+    """What the guard does at each event of the loop that `LoopHooks` reports."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class AutomaticLoop:
             self._dual.reopen()
 
     def left_nothing(self) -> None:
-        """It has ended, and was none of a step's: nothing of it lies in `.grad`."""
+        """The backward pass has ended and left nothing in `.grad`: it belongs to no step."""
         if self._dual is not None:
             self._dual.leave()
 

@@ -65,7 +65,7 @@ class DualBackward:
         self._around = around
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
-        self._step, self._looked = 0, False
+        self._step, self._checkpointing_checked = 0, False
         # Whether the ledger has a row of the last sum, of which a step may still be to come; and
         # whether a scaler may skip that.
         self._row_is_open, self._skips = False, False
@@ -230,7 +230,9 @@ class DualBackward:
             accumulation.grow(total, taken, w2)
         over_rows = self._owners.total if self._owners.several else None
         total.idle = {id(p) for group in groups for p in group if p.grad is None}
-        gram, weights = backward.bend(groups, total.anchor, self._parts.combine, over_rows)
+        gram, weights = backward.combine_gradients(
+            groups, total.anchor, self._parts.combine, over_rows
+        )
         # A further micro-batch of the same step replaces the step's row.
         self._ledger.truncate(self._step - 1)
         numbers = [*gram, total.w2] if loss is None else [loss, *gram, total.w2]
@@ -256,14 +258,14 @@ class DualBackward:
         return groups
 
     def _refuse_reentrant(self, penalty: Tensor) -> None:
-        if not self._looked and backward.uses_reentrant_checkpointing(penalty):
+        if not self._checkpointing_checked and backward.uses_reentrant_checkpointing(penalty):
             raise AegisError(
                 "gradient checkpointing with use_reentrant=True",
                 "use_reentrant=False",
                 "the other knows no second pass; Hugging Face: "
                 'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
-        self._looked = True
+        self._checkpointing_checked = True
 
 
 def _overflowed(groups: Sequence[Sequence[nn.Parameter]]) -> bool:

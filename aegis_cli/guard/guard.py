@@ -1,4 +1,4 @@
-"""AEGIS around the backward pass of any PyTorch loop, or another method around its steps."""
+"""The guard: a method of Aegis in any PyTorch training loop."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image"
 
 
 class Guard(Removable):
-    """Keeps what a model knew while somebody else's loop trains it.
+    """Protects what a model knows while your own loop trains it.
 
         guard = Guard(model, anchor="anchor.safetensors", layers="model.text_model.layers")
         for batch in loader:

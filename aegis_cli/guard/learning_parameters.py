@@ -46,7 +46,7 @@ class LearningParameters:
     def refuse_another_place(self) -> None:
         """Raise AegisError where they are elsewhere now, or of another type.
 
-        What constrains them stayed where they were.
+        The tensors that constrain them did not move with them.
         """
         devices = [p.device for p in self.named.values()]
         if devices != self._devices:

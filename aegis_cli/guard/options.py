@@ -69,7 +69,7 @@ def start(
     owners: Ranks,
     part: str | None = None,
 ) -> StartedMethod:
-    """Check everything against everything, then start the method.
+    """Check options, anchor and model against each other, then start the method.
 
     Args:
         part: the name by which the model was found in a policy, where it was.

@@ -188,15 +188,15 @@ class GuardedStepper:
             _take(optimizer, scaler)
         finally:
             self._taken = None
-            # A scaler leaves a step out that overflowed, and a trainer's optimizer those in
-            # between. What is drawn back in such a step would be so without an update that asked
-            # for it. One that raises an exception may have moved some of the weights.
+            # A scaler skips a step that overflowed, and a trainer's optimizer skips those between
+            # its accumulated ones. A step that moved nothing must not be constrained. One that
+            # raises an exception may have moved some of the weights.
             self._end(slowed, taken.has_moved(optimizer, self._learning))
 
     def _end(self, slowed: SlowedStep, moved: bool) -> None:
         """Constrain a step, if it has moved the weights."""
         if not moved:
-            self._stepper.take_none()
+            self._stepper.cancel()
             return
         slowed.go_back()
         self._count += 1
@@ -416,10 +416,10 @@ class _BufferWatch:
 
 
 class SlowedStep:
-    """An optimizer's step, from which each parameter goes back to its share.
+    """Shrinks each parameter's update to its share, after the optimizer's step.
 
-    An update is linear in the learning rate, so that an interpolation of the weights does what
-    another learning rate would have done.
+    An update is linear in the learning rate, so interpolating between old and new weights has the
+    effect of a lower rate.
     """
 
     @torch.no_grad()
@@ -438,7 +438,7 @@ class SlowedStep:
 
 
 def _read(shares: Mapping[Tensor, float | Tensor]) -> dict[Tensor, float]:
-    """The shares as numbers: those of a GPU by one transfer, where each by itself would wait."""
+    """The shares as numbers; those of a GPU by one transfer instead of one sync each."""
     unread = {p: share for p, share in shares.items() if isinstance(share, Tensor)}
     numbers = torch.stack([*unread.values()]).tolist() if unread else []
     read = dict(zip(unread, numbers, strict=True))

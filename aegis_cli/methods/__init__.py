@@ -2,7 +2,7 @@
 
 A new method is a file with `METHOD = Method(...)`, its name in `recipes.METHODS` (in the order of
 tables), the parts of an anchor that it reads in `recipes.NEEDS`, and a section of options if it has
-any. Recipes are read without torch, which is why they say names and needs themselves.
+any. Recipes are read without torch, so they repeat names and needs.
 """
 
 from collections.abc import Iterable

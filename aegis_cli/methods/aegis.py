@@ -6,13 +6,18 @@ the result would not be orthogonal):
 
     g <- g - (d / <a, a>) a
 
-The options are not in the paper: which tokens are compared, how layers are weighed, which groups
-are projected, a restoring term g + lambda a, and the same projection on the *applied* update D
-(which descends: it conflicts where <D, a> > 0), because Adam's elementwise scaling turns an
-orthogonal gradient into an update that is not. With `idle: kept`, a is 0 wherever g is: what the
-task does not move (an expert that reads keys and values leaves most of the last layer so), the
-projection does not move either, which is else the only thing that does. With `refresh`, a is taken
-at the first of so many steps alone; with `fraction`, on so much of the batch.
+The options are ours, not the paper's:
+
+    scope, weighting  which tokens are compared, and how layers are weighed
+    groups            which parameter groups are projected
+    restoration       lambda of an added restoring term, g + lambda a
+    projects          what is projected: the gradient, the *applied* update D (a conflict is
+                      <D, a> > 0), or both. Adam scales elementwise, so an orthogonal gradient does
+                      not give an orthogonal update.
+    idle: kept        a is 0 wherever g is 0, so that the projection moves nothing that the task
+                      does not: most of the last layer, of which the expert reads keys and values
+    refresh           steps that share one a, taken at the first of them
+    fraction          share of the batch that a is taken on
 """
 
 from __future__ import annotations
@@ -60,7 +65,7 @@ def start(setting: Setting) -> Parts:
             "--set aegis.groups=all, or freeze less",
         )
     like = next(p for group in setting.groups.values() for p in group)
-    # Weights in bfloat16 are compared with an anchor in float32 all the same.
+    # The anchor is compared in float32, also where the weights are bfloat16.
     like = like.new_empty(0, dtype=wide_type(like.dtype))
     return Parts(
         penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
@@ -95,7 +100,7 @@ class _Target:
         """The transport cost of a pass, with its graph, and W2^2 of each layer [L]."""
         self._follow(seen.hidden[0].device)
         inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}
-        # The layers of somebody else's model may lie on several GPUs, their Gaussians lie on one.
+        # In a user's own model the layers may be on several GPUs; the Gaussians are on one.
         at = self.anchor[0].mean.device
         found = [
             (mean.to(at), variance.to(at))
@@ -104,7 +109,7 @@ class _Target:
         return transport_penalty(found, self.anchor, self.weights)
 
     def _follow(self, device: torch.device) -> None:
-        """Go where the hidden states are: somebody may have moved the model meanwhile."""
+        """Move the anchor to the hidden states' device: the model may have been moved since."""
         if self.anchor[0].mean.device != device:
             self.anchor = [layer.to(device) for layer in self.anchor]
             self.weights = self.weights.to(device)
@@ -134,7 +139,7 @@ def _penalty(
     targets = []
     for name in scopes:
         layers = [layer.to(like) for layer in measured[name]]
-        # Once: they are checked, and on a GPU that waits.
+        # Made once, because their checks force a GPU sync.
         targets.append(_Target(name, layers, layer_weights(layers, weighting)))
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
@@ -146,7 +151,7 @@ def _penalty(
 
 def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
     """Mean [D] and variance [D] of each layer over a pass's tokens in the mask [B, T]."""
-    # To select rows on a GPU would wait for their number, once a layer.
+    # On a GPU, selecting rows would force a sync per layer.
     waits = devices.reading_stalls(mask.device)
     if seen.total is not None:
         return shared_moments(seen.hidden, mask, seen.total, reads=not waits)

@@ -38,9 +38,9 @@ def second_backward_of_rows(
 ) -> dict[int, Tensor | None]:
     """The anchor gradient of each parameter by its id, where a process has only rows of it.
 
-    Gradients are summed and cut on their way into `.grad`, so that is where they have to go; the
-    task's, which lie there, are put aside meanwhile. So are those of whatever else the penalty
-    depends on, which is left to the task alone.
+    FSDP reduces and shards a gradient on its way into `.grad`, so this one has to go there too. The
+    task's gradients are put aside meanwhile, also those of other parameters that the penalty
+    reaches: these keep the task's gradient alone.
 
     Args:
         others: further parameters that it may depend on. Leaves of its graph are found, but the
@@ -102,7 +102,7 @@ def _masked(task: Tensor | None, anchor: Tensor | None) -> Tensor | None:
     return anchor.masked_fill(task == 0, 0)
 
 
-def bend(
+def combine_gradients(
     groups: Groups,
     anchor: Mapping[int, Tensor | None],
     combine: projection.Combine,
@@ -116,7 +116,7 @@ def bend(
         combine: the method's rule (AEGIS: arXiv 2604.16067).
         total: a tensor -> its sum over the processes, where each has rows of every parameter; None
             where each has all of them.
-        reads: whether the weights may be read, which on a GPU waits for it.
+        reads: whether the weights may be read, which forces a GPU sync.
 
     Returns:
         The inner products task-task, task-anchor and anchor-anchor [G], and the weight of each
@@ -130,7 +130,7 @@ def bend(
     of_anchor: Weights
     of_task, of_anchor = combine(*gram)
     if reads or _moves_idle(pairs):
-        # One transfer for all groups: on a GPU each number read by itself would wait.
+        # One transfer for all groups: each number read by itself would be a GPU sync.
         of_task, of_anchor = torch.stack((of_task, of_anchor)).tolist()
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
         combined = projection.apply(task, pull, wg, wa)
@@ -142,8 +142,8 @@ def bend(
 def _moves_idle(pairs: Sequence[tuple[projection.Gradients, projection.Gradients]]) -> bool:
     """Whether the projection may move what the task does not.
 
-    Such a parameter gets a gradient where the weight is not 0, and else none: then the optimizer
-    leaves it as it is. So the weight has to be known.
+    Such a parameter gets a gradient only if the weight is not 0; without one the optimizer skips
+    it. So the weight has to be read.
     """
     for task, anchor in pairs:
         for g, a in zip(task, anchor, strict=True):

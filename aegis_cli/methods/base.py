@@ -18,14 +18,14 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a method may draw on, gathered before the first step.
+    """What a method is started with: model, options, anchor and data.
 
     Every tensor is on the device where training runs.
 
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
         groups: every parameter that learns in exactly one group, `layers.{i}` for each language
-            layer; in a loop of somebody else's none for a method that compares no layers.
+            layer; under the guard, empty for a method that compares no layers.
         sites: each map whose inputs an anchor can describe, or lone row that it has used -> its
             kind: maps, norms, embeddings or stem. What the user has frozen is none of them.
         options: the method's own part of the recipe.
@@ -34,9 +34,9 @@ class Setting:
         vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
             its graph; only for a method that trains on questions.
         instructions: every text that the frames come with, so that a method which makes more text
-            of them can refuse it before any work; none in a loop of somebody else's.
+            of them can refuse it before any work; empty under the guard.
         targets: robot frames -> what the expert has to predict of their actions, [B, H, A], on the
-            CPU; None in a loop of somebody else's.
+            CPU; None under the guard.
         actions: A, how many numbers an action has.
         owners: the processes each of which has some rows of every weight; one where each has all.
     """
@@ -74,8 +74,8 @@ class Pass:
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
         image: [T] or [B, T] bool; True at image tokens.
-        frames: what the inputs were prepared from, and the actions that follow; None in a loop of
-            somebody else's.
+        frames: what the inputs were prepared from, and the actions that follow; None under the
+            guard.
         share: which of the step's frames.
         total: a tensor -> its sum over the processes that make this pass; None for one process.
         prepared: what the method's own `prepare` has made of the frames; None where nobody has.
@@ -107,7 +107,7 @@ class Update:
         steps: how many of these steps have moved anything. A tensor [] float64 where a step may
             have moved nothing and reading that would wait; 0 of them change nothing.
         rate_left: share of the peak learning rate that the schedule had left at the last of them; 1
-            until it has reached the peak, and in a loop of somebody else's. A tensor like `steps`.
+            until it has reached the peak, and under the guard. A tensor like `steps`.
     """
 
     before: Mapping[str, Tensor]
@@ -118,12 +118,12 @@ class Update:
 
 @dataclass(frozen=True)
 class Parts:
-    """A method at work in one run; what it leaves out costs nothing.
+    """What a started method does at each stage of a step; what is left out costs nothing.
 
     Attributes:
-        penalty: pass -> what the anchor gradient is the gradient of, a scalar with its graph, and
-            how far each layer is from the anchor, detached [L] (W2^2, where the anchor's moments
-            say so); a second backward pass is paid for it.
+        penalty: pass -> (a scalar with its graph, whose gradient is the anchor gradient; the
+            distance of each layer from the anchor [L], detached, which is W2^2 in `aegis`). It
+            costs a second backward pass.
         combine: inner products of task and anchor gradient, per group -> their weights.
         refresh: steps that share one anchor gradient, taken at the first of them.
         fraction: share of the batch that the anchor gradient is taken on; below 1, from a graph of
@@ -190,7 +190,7 @@ class Method:
         start: the parts at work, from what the run has to offer; called once, after `adapt`.
         needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads.
         vqa_weight: its option that weighs a loss on VQA questions, if it has one. Above 0 it is a
-            ceiling rather than a rival: it trains on the data that the others do without.
+            ceiling (an upper bound): it trains on data that the others do without.
         stop_gradient: the expert's gradient ends at the backbone's keys and values.
         export: turns an adapted copy of the backbone into a plain one; None where it is one
             already.

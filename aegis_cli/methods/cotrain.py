@@ -1,7 +1,7 @@
 """Co-training: loss + weight x cross-entropy of VQA answers, one batch of questions per step.
 
-What robot policies with web data do (RT-2, arXiv 2307.15818). A ceiling rather than a rival: it
-trains on the data that the other methods do without.
+Robot policies with web data are trained so (RT-2, arXiv 2307.15818). It is a ceiling (an upper
+bound): it trains on data that the other methods do without.
 """
 
 from __future__ import annotations

@@ -42,17 +42,17 @@ def start(setting: Setting) -> Parts:
 
 
 def _teacher(backbone: Backbone) -> Backbone:
-    """A copy that stands still, and has what stands still in both in common with the backbone."""
+    """A frozen copy of the backbone, with which it shares the parameters that do not learn."""
     shared = {id(p): p for p in backbone.parameters() if not p.requires_grad}
-    # What the memo has, deepcopy takes as copied already.
+    # deepcopy does not copy what is in its memo.
     return copy.deepcopy(backbone, shared).eval().requires_grad_(False)
 
 
 def _round_alike(frozen: nn.Module, backbone: nn.Module) -> None:
-    """Give the copy's weights the types that the backbone's have in this pass.
+    """Cast the teacher's weights to the dtypes that the backbone's have in this pass.
 
-    A pass may see them rounded (`train.weights: bf16-master`). A copy that is not would teach the
-    rounding away.
+    With `train.weights: bf16-master` a pass sees rounded weights. A teacher in float32 would train
+    the student to undo the rounding.
     """
     own = dict(backbone.named_parameters())
     for name, copied in frozen.named_parameters():
@@ -66,7 +66,7 @@ def relative_distance(
     mask: Tensor,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """Mean over layers of the share of the teacher's variance that the student is off by.
+    """Squared distance of student and teacher over the teacher's variance, averaged over layers.
 
     Args:
         hidden, taught: L tensors [B, T, D] each, of the student and of the teacher.
@@ -76,7 +76,7 @@ def relative_distance(
     """
     layers = []
     if devices.reading_stalls(mask.device):
-        # To select rows would wait for their number.
+        # Selecting rows would force a GPU sync.
         for h, h0 in zip(hidden, taught, strict=True):
             layers.append(_relative_padded(widened(h), widened(h0), mask[..., None], total))
         return torch.stack(layers).mean()

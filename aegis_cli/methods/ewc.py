@@ -57,7 +57,7 @@ def start(setting: Setting) -> Parts:
 
 @dataclass(frozen=True)
 class _Held:
-    """A parameter that is drawn to where it was.
+    """A parameter that is pulled back to its pre-trained value.
 
     Attributes:
         origin: its pre-trained value.

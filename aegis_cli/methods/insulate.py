@@ -1,8 +1,8 @@
 """Knowledge insulation as published (Driess et al. 2025, arXiv 2505.23705).
 
 The expert's gradient ends at the backbone's keys and values, as under `stop-gradient`. The backbone
-learns from robot frames all the same, but by the loss that it was pre-trained with: it is asked the
-instruction, and its answer is to be the actions as text,
+still learns from robot frames, but with its pre-training loss: it is given the instruction, and has
+to answer with the actions as text,
 
     loss + weight * mean(-log p(actions as text | image, instruction)),
 
@@ -34,10 +34,10 @@ class _Written:
     """The actions of some frames as text.
 
     Attributes:
-        asked: what the backbone is asked of each frame.
-        texts: what its answer is to be.
-        numbers: how many numbers all of them have, int64 [].
-        answered: what the backbone has made of all this.
+        asked: the prompt of each frame.
+        texts: the answer to be learned for each.
+        numbers: how many numbers are in all texts together, int64 [].
+        answered: what `Backbone.prepare_answers` has made of them.
     """
 
     asked: Sequence[str]
@@ -93,7 +93,7 @@ def _action_loss(
 
 
 def _writing(setting: Setting) -> Callable[[RobotBatch], _Written]:
-    """Robot frames -> their actions as text, on the CPU, where to read a number makes none wait."""
+    """Robot frames -> their actions as text; on the CPU, so that reading numbers syncs no GPU."""
     backbone, targets = setting.backbone, setting.targets
     limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
     assert targets is not None

@@ -8,10 +8,10 @@ Adam would rescale. It differs from `nullspace` in two ways: directions that VQA
 not change its answers are freer, and it acts on all that has moved since the start, so that what
 the loss does not keep asking for returns.
 
-Between two proximal steps the steepest directions swing, and the loss sees them there: the fewer
-steps they cover the better, and the dearer. Normalisations, tables and lone rows do not learn.
+Between two proximal steps the steepest directions drift, and the loss is taken at drifted weights:
+a lower `every` protects better and costs more. Normalisations, tables and lone rows do not learn.
 
-Two options ask what that choice is worth. `step: gradient` adds the penalty's gradient to the
+Two options measure what that choice is worth. `step: gradient` adds the penalty's gradient to the
 task's instead, as elastic weight consolidation does. `growth` lets the weight grow as the learning
 rate falls from its peak, weight (peak / rate)^growth. With weight alone the proximal step already
 gains on the optimizer's steps as these get shorter; this says how much more it does.
@@ -56,9 +56,9 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
 
 
 def start(setting: Setting) -> Parts:
-    """Draw every map back towards its weights of now, and slow maps with small gradients.
+    """Pull every map back towards its current weights, and slow down maps with small gradients.
 
-    With weight 0 nothing is drawn back.
+    With weight 0 nothing is pulled back.
     """
     options, owners = setting.options, setting.owners
     weight, balance = options["weight"], options["balance"]
@@ -73,7 +73,7 @@ def start(setting: Setting) -> Parts:
     return Parts(
         shares=slowed,
         constrain=_constrain(groups, weight, options["growth"]),
-        compares=False,  # it does so with the start, so no step's weights are copied
+        compares=False,  # the start is the reference, so no weights are copied per step
         every=options["every"],
     )
 
@@ -85,7 +85,7 @@ def _curvatures(setting: Setting, maps: Mapping[str, Pair]) -> dict[str, Curvatu
     assert setting.anchor is not None
     found = curvature.curvatures(setting.anchor, likes, setting.options["damping"])
     if owners.several:
-        # One after the other, so that no more than one map's rows are there twice.
+        # Map by map, so that only one map's rows are in memory twice.
         for site, (weight, _) in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(weight)), owners.total)
     return found
@@ -198,7 +198,7 @@ def _unread_shares(
     counts = devices.send(torch.tensor(entries, dtype=torch.float64, device="cpu"), squares.device)
     rms = (squares / counts).sqrt()
     whole = (squares.sum() / sum(entries)).sqrt()
-    # Where no map has a gradient, so has none of them.
+    # If no map has a gradient, every share is 0.
     found = ratio(rms, rms + balance * whole).float()
     shares: dict[Tensor, float | Tensor] = {}
     for tensors, share in zip(learning, found, strict=True):
@@ -219,7 +219,7 @@ def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
     # All in few kernels, where a GPU would start thousands.
     found = torch._foreach_norm(gradients) if gradients else ()
     for place, norm in zip(places, found, strict=True):
-        # A loop of somebody else's may have its layers on several GPUs.
+        # In a user's own loop, the layers may be on several GPUs.
         norms[place] = norm.to(like.device)
     widest = reduce(torch.promote_types, (norm.dtype for norm in norms))
     both = torch.stack([norm.to(widest) for norm in norms]).double()

@@ -1,7 +1,7 @@
 """The parameters that a method was started with, and refusal where others learn instead.
 
-A method works on the parameters that it found. Where a wrapper has put others in their place, it
-would go on without a word, and hold nothing.
+A method works on the parameters that it found at its start. If a wrapper has replaced them since,
+it would silently protect nothing.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ class KnownParameters:
             )
 
     def _unchanged(self) -> bool:
-        """Whether all that learns is what it was, seen without a name of anything.
+        """Whether the same parameters learn as at the start, told without their names.
 
-        It is asked at every step, and names of a thousand modules take milliseconds.
+        It is asked at every step, and the names of a thousand modules take milliseconds.
         """
         sharding = () if self._may_shard else _sharding_modules()
         waiting: list[nn.Module] = [self._model]

@@ -1,8 +1,8 @@
 """MAPS (arXiv 2511.19878): hold modules near the pixels closest to their pre-trained weights.
 
 Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g,
-theta_before - theta0> < 0, so where the gradient leads back although the step (by its momentum) may
-have led on,
+theta_before - theta0> < 0, that is where the gradient points back to theta0, although momentum may
+have carried the step further away,
 
     theta <- theta - lambda_k r (theta - theta0),
     r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.

@@ -12,7 +12,7 @@ less.
 
 What an update has changed along U is the change of the coordinates W U. `keeps: coordinates`
 remembers these [o, k] in place of the weights [o, d] before the steps that a projection covers. It
-leaves free what no stored direction holds, of which `soft` takes a small share else.
+leaves the unstored directions free, of which `soft` otherwise removes a small share.
 """
 
 from __future__ import annotations

@@ -100,8 +100,8 @@ class Stepper:
         if number % self._parts.every == 0:
             self.settle()
 
-    def take_none(self) -> None:
-        """Forget that a step was begun, in which nothing has moved."""
+    def cancel(self) -> None:
+        """Undo `begin` of a step that has moved nothing."""
         self.pending -= 1
         self._moved = self._moved - 1
         if not self.pending:

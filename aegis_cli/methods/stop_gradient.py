@@ -1,4 +1,4 @@
-"""Knowledge insulation by isolation: the backbone never sees the action loss, and never changes."""
+"""A frozen backbone: no gradient of the action loss reaches it, and it never changes."""
 
 from aegis_cli.methods.base import Method, freeze
 

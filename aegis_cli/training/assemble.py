@@ -63,8 +63,8 @@ class TrainingRun:
         plain: in the first process, a policy of the same shape whose weights are whole, by which a
             sharded one is written; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
-        temporary: the checkpoint of an interruption that the run goes on from; the next one takes
-            its place.
+        temporary: the checkpoint of an interruption, if the run has resumed from one; the next
+            checkpoint replaces it.
         unread: figures of steps that nobody has read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
@@ -256,7 +256,7 @@ def build(
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     masters = _adapted(recipe, method, backbone, on_event)
-    # By a whole copy the first process writes checkpoints.
+    # The first process writes checkpoints from an unsharded copy.
     plain = copy.deepcopy(policy) if shards and ranks.first else None
     owners = ranks if shards else ALONE
     if shards:
@@ -320,7 +320,7 @@ def _read(
         AegisError: inputs that do not fit together.
     """
     device = devices.pick()
-    # What is to be cut stays on the CPU: a GPU may have room for its share alone.
+    # Weights to be sharded stay on the CPU: a GPU may have room for its own shard only.
     backbone = backbones.load(recipe.backbone).to("cpu" if _shards(recipe.train, ranks) else device)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
@@ -345,7 +345,7 @@ def _begun_policy(recipe: Recipe, read: _Read) -> Policy:
 
 
 def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
-    """Let learn what the method trains and nothing freezes; the masters of what is rounded."""
+    """Make trainable what the method trains and `train.freeze` leaves; return the masters."""
     own = list(backbone.parameters())
     freezing.adapt(method, backbone, recipes.options(recipe), recipe.train.freeze, on_event)
     # After it, for adapters are wide anyway, and what does not learn needs no master.
@@ -385,7 +385,7 @@ def _shards(settings: Train, ranks: Ranks) -> bool:
 def _loaded(
     recipe: Recipe, backbone: Backbone, demos: Paths, on_event: OnEvent, ranks: Ranks
 ) -> demonstrations.Demonstrations:
-    """The demonstrations, whose frames one process of each machine decodes, and the others find."""
+    """The demonstrations; one process per machine decodes their frames, the others reuse them."""
     decodes = launch.local_rank() == 0
     found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
     ranks.wait()

@@ -1,4 +1,4 @@
-"""An exponential moving average of the weights, which the policy is made of where it is asked for.
+"""An exponential moving average of the weights; where it is asked for, checkpoints hold it.
 
 The weights of a flow-matching policy jitter with the noise of their batches, and their average
 acts more steadily: diffusion policies and openpi's pi0 are used by it. Training itself goes on from
@@ -22,7 +22,7 @@ from aegis_cli.training.masters import BF16_MASTER
 
 
 class Average:
-    """The average of weights after every step; of none, it costs nothing.
+    """The average of the weights after every step; without parameters it does nothing.
 
     After step n the average moves by 1 - d towards the weights, where d is the smaller of the decay
     and (1 + n) / (10 + n). So it forgets where it began sooner than its decay alone would let it:
@@ -103,7 +103,7 @@ class Average:
     def _exchange(self) -> None:
         """Give the parameters the average's values and the average theirs, one by one.
 
-        Values move and memory stays, for an optimizer, a compiled pass and FSDP know the memory.
+        Values are swapped in place: the optimizer, compiled passes and FSDP hold on to the memory.
         """
         for name, parameter in self._parameters.items():
             own, mean = rows_here(parameter), rows_here(self.weights[name])

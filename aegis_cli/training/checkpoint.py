@@ -99,8 +99,8 @@ def save(
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    What `last` points at already is whole and of this step: it stays, for at no moment may there be
-    none.
+    If `last` already points at a complete checkpoint of this step, that stays: there has to be one
+    at every moment.
 
     Args:
         policy: its weights are those of `state`, or of its average.

@@ -345,8 +345,8 @@ def _bytes_here(tensors: Iterable[Tensor]) -> int:
 def _pass_kept(training: TrainingRun, frames: int) -> tuple[int, int]:
     """Tokens of one frame, and bytes that the forward pass of some keeps for the backward.
 
-    Two frames' pass and three frames' tell what grows with the frames and what does not: the
-    weights that autocast has rounded. A single one would keep less, being no batch.
+    Passes of two and of three frames tell what grows with the frames from what does not (weights
+    that autocast has rounded). A pass of a single frame would keep less, being no batch.
     """
     tokens, of_two = _pass_some(training, 2)
     _, of_three = _pass_some(training, 3)

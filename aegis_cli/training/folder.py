@@ -184,7 +184,7 @@ def _clear(out: Path, ours: bool) -> Path | None:
 
 
 def _free(path: Path) -> Path:
-    """A path at which nothing is, of this name; a clock that was set back tells a time twice."""
+    """A path of this name that does not exist yet; a clock that was set back repeats a time."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(one for one in itertools.chain([path], numbered) if not one.exists())
 

@@ -16,7 +16,7 @@ from aegis_cli.training import eight_bit
 
 WEIGHT = "weight."  # a weight's name in a file begins so
 _OPTIMIZER = "optimizer."
-STATELESS = "stateless"  # in a file's meta: what learns, and of which an optimizer keeps nothing
+STATELESS = "stateless"  # in a file's meta: parameters that learn and have no optimizer state
 # What each kind of optimizer keeps of a parameter: its step count, and tensors of its shape.
 _COUNT = "step"
 _KEPT = {

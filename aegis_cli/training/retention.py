@@ -13,7 +13,7 @@ from aegis_cli.training import checkpoint, folder
 def prune(out: Path, step: int, count: int) -> None:
     """Remove the checkpoints before `step` but for the last ones and the best one.
 
-    Later ones stay: whoever went back to an earlier checkpoint has them still. What is half removed
+    Later ones stay, for a user who went back to an earlier checkpoint. What is half removed
     when the process is killed bears a name that the next checkpoint clears away.
 
     Args:

@@ -40,7 +40,7 @@ def moving_steps(steps: int, backbone_until: float) -> int:
 class BatchOrder:
     """Shuffled epochs of `size` rows, dealt `batch` at a time.
 
-    An epoch's rest is carried into the next.
+    Rows that an epoch leaves over begin the next batch.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ from aegis_cli.data.batch import PreparedPass, RobotBatch, Share, WholeBatch
 from aegis_cli.methods.backward import (
     Gram,
     Groups,
-    bend,
+    combine_gradients,
     second_backward,
     second_backward_of_rows,
     where_task_moves,
@@ -140,7 +140,7 @@ def compute_gradients(
         else:
             taken = parallel.added_up(taken, groups, ranks)
         anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
-        gram = _bend(settings, anchor)
+        gram = _combine_gradients(settings, anchor)
         row = LedgerRow(*gram, w2)
         found = StepGradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
@@ -173,12 +173,12 @@ def _all_passes(
     return torch.stack(losses).sum(), torch.stack(distances).mean(0) if distances else None, taken
 
 
-def _bend(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
+def _combine_gradients(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
     """Bend the task's gradient by the anchor's, group by group; their inner products before."""
     combine = settings.parts.combine or projection.naive
     total = settings.ranks.total if parallel.is_sharded(settings.policy) else None
     reads = not devices.reading_stalls(settings.policy.backbone.device)
-    gram, _ = bend(settings.groups, anchor, combine, total, reads)
+    gram, _ = combine_gradients(settings.groups, anchor, combine, total, reads)
     return gram
 
 

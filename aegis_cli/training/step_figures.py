@@ -1,11 +1,10 @@
-"""What steps leave to be read: losses, norms, and rows of the ledger, kept on the device.
+"""Losses, norms and ledger rows of the last steps, kept on the device until they are read.
 
-To read a number of a GPU is to wait until it has done all it was given, and then it stands still.
-So there the figures of `train.log_every` steps are read at once. A step whose figures are not
-finite must not move the weights all the same: the optimizers are told so by a flag that stays on
-the device, and that step and those after it leave everything as it is, until the figures are read.
-A method that constrains several steps at once and the average of the weights are told in the same
-way how many steps have moved anything.
+Reading a number from a GPU is a *sync*: the program waits for all queued work, and then the GPU
+idles. So on a GPU the figures of `train.log_every` steps are read at once. A step whose figures are
+not finite must not move the weights all the same: a flag on the device tells the optimizers to skip
+that step and those after it, until the figures are read. A count on the device tells the method and
+the weights' average how many steps have moved anything.
 """
 
 from __future__ import annotations
@@ -100,7 +99,7 @@ class UnreadFigures:
         """Let the optimizers leave everything as it is from the first step that is not finite."""
         if self.deferred:
             for optimizer in optimizers:
-                # What a GradScaler tells the fused kernel, which then undoes its count too.
+                # As a GradScaler does: the fused kernel then skips the step and does not count it.
                 optimizer.found_inf = self._broken  # type: ignore[attr-defined]
 
     def taken(self) -> Iterator[StepFigures]:

@@ -96,8 +96,7 @@ def run(
 ) -> TrainReport:
     """Train `recipe.train.steps` steps into the run folder `out`.
 
-    No question is ever read, but by a method that trains on them: the anchor is all that the others
-    know of VQA.
+    Only methods that train on questions read any; all others know VQA from the anchor alone.
 
     Where torchrun has started several processes, each calls this, and they share every step.
 
@@ -172,7 +171,7 @@ def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event:
 
 
 def _says_otherwise(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
-    """Whether a run goes on by other values than its own recipe has, or with inputs elsewhere.
+    """Whether the recipe differs from the one in the run's folder, or its inputs have moved.
 
     Those that shape its weights are the same by now; a longer plan, questions or a gate may not be.
     """
@@ -415,7 +414,7 @@ def _heeds(run: TrainingRun, due: _Due) -> bool:
     # weights than those of a run that nobody interrupts.
     if run.stepper.pending:
         return False
-    # With several processes this is a message, for which a GPU would wait.
+    # With several processes this is a collective, which would force a GPU sync.
     return due.line or not (run.ranks.several and run.unread.deferred)
 
 

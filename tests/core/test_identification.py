@@ -17,10 +17,10 @@ from aegis_cli.core.identification import (
     charge,
     flow,
     needed,
-    off,
     read,
     squared_norm,
     total_variation,
+    without_span,
 )
 from aegis_cli.core.routing import Expert, RoutedLinear, Traced, traced
 
@@ -120,9 +120,9 @@ def test_projections_split_a_matrix(seed: int, scale: float) -> None:
     assert columns.shape == (9, 5)
     torch.testing.assert_close(columns.T @ columns, torch.eye(5).double())
     gradient = torch.randn(9, 4, generator=g)
-    outside = off(gradient, columns)
+    outside = without_span(gradient, columns)
     assert outside.dtype == gradient.dtype and (columns.T @ outside.double()).abs().max() < 1e-6
-    torch.testing.assert_close(off(outside, columns), outside)
+    torch.testing.assert_close(without_span(outside, columns), outside)
     inside = share_inside(gradient, columns)
     assert 0 < inside < 1 and share_inside(outside, columns) < 1e-10
     assert outside.square().sum() / gradient.square().sum() == pytest.approx(1 - inside, rel=1e-4)

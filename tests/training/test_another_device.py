@@ -33,7 +33,7 @@ ANCHOR = "anchor.safetensors"
 STEPS = 3
 PARTS = "moments,inputs,curvature,fisher"
 # What the task leaves alone moves or not by a weight that has to be known: one wait a step.
-WAITS = {"aegis": {"methods/backward.py:bend": STEPS}}
+WAITS = {"aegis": {"methods/backward.py:combine_gradients": STEPS}}
 # It decides by a sign, which the last bit of a gradient may turn.
 TURNS = "maps"
 OF_HF = ("naive", "aegis", "insulate", "distill", "cotrain")

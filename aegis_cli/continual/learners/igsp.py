@@ -44,7 +44,7 @@ from aegis_cli.continual.learners.base import (
     keep_experts,
     route_task,
 )
-from aegis_cli.core.identification import basis, charge, needed, off, squared_norm
+from aegis_cli.core.identification import basis, charge, needed, squared_norm, without_span
 from aegis_cli.core.routing import RoutedLinear, Router
 
 
@@ -124,12 +124,12 @@ def constrain(context: TaskContext) -> Constraint | None:
         for (b, columns), kept in zip(held, before, strict=True):
             kept.copy_(b)
             if b.grad is not None:
-                b.grad.copy_(off(b.grad, columns))
+                b.grad.copy_(without_span(b.grad, columns))
 
     @torch.no_grad()
     def update() -> None:
         for (b, columns), kept in zip(held, before, strict=True):
-            b.copy_(kept + off(b - kept, columns))
+            b.copy_(kept + without_span(b - kept, columns))
 
     return Constraint(gradient, update)
 
