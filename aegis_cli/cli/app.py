@@ -226,7 +226,7 @@ def anchor(
     samples: Annotated[
         int,
         Option(
-            help="Number of (image, question) pairs, or of frames; of files, at most.",
+            help="(image, question) pairs or frames to measure on; fewer if the files hold fewer.",
             callback=positive,
         ),
     ] = 3000,
@@ -338,7 +338,9 @@ def train(
     recipe: RecipeOrRunArg,
     out: Annotated[
         Path | None,
-        Option(metavar="FOLDER", help="Run folder to write; none for a run, which has its own."),
+        Option(
+            metavar="FOLDER", help="Run folder to write; left out, to resume a run by its folder."
+        ),
     ] = None,
     demos: Annotated[
         list[Path] | None,
@@ -366,8 +368,8 @@ def train(
         bool,
         Option(
             "--dry-run",
-            help="Of a policy: check all, estimate memory, disk and hours, write nothing; exit 1 "
-            "if the first two do not fit.",
+            help="Check all inputs, estimate memory, disk and hours, and write nothing (policies "
+            "only); exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     overrides: Set = None,

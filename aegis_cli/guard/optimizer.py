@@ -25,7 +25,7 @@ from aegis_cli.guard import matching, wide_step
 from aegis_cli.guard.options import load_anchor, method_options
 from aegis_cli.guard.stepper import SlowedStep, overflowed
 from aegis_cli.guard.wide_step import WideStep
-from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.backbones.base import Backbone
@@ -206,8 +206,8 @@ class ProtectedAdamW(torch.optim.AdamW):
         anchor = anchor_file.to_device(self._anchor, device)
         self._wide = WideStep(self, model.parameters())
         with self._wide.taken(), _at_origin(learning, self._base):
-            setting = Setting(model, {}, kinds, self._options, anchor)
-            self._parts = methods.get(self._method).start(setting)
+            context = MethodContext(model, {}, kinds, self._options, anchor)
+            self._parts = methods.get(self._method).start(context)
         _report(self._method, learning, self._base.keys() - found.keys())
         self._stepper = Stepper(model, self._parts)
         self._found = learning

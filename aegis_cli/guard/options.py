@@ -19,7 +19,7 @@ from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.models import structure, wrappers
 from aegis_cli.models.wrappers import PlainNames, plain_names
@@ -100,8 +100,8 @@ def start(
             anchor = _renamed(anchor, sites, maps.heads, unmeasured, plain)
     device = next(p for p in model.parameters() if p.requires_grad).device
     held = anchor_file.to_device(anchor, device)
-    setting = Setting(model, groups, sites, chosen, held, owners=owners)
-    parts = methods.get(method).start(setting)
+    context = MethodContext(model, groups, sites, chosen, held, owners=owners)
+    parts = methods.get(method).start(context)
     if parts.constrains:
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         check_precision({name: tensor.dtype for name, tensor in constrained.items()})

@@ -42,21 +42,21 @@ from aegis_cli.core.moments import (
 )
 from aegis_cli.core.numerics import ratio, wide_type
 from aegis_cli.core.transport import layer_weights, transport_penalty
-from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, Update, train_all
 
 LANGUAGE = "layers."
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Start the method of the paper, or a variant of it.
 
     Raises:
         AegisError: options that leave no group to project.
     """
-    options = setting.options
-    assert setting.anchor is not None
+    options = context.options
+    assert context.anchor is not None
     chosen = {
-        name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in setting.groups
+        name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in context.groups
     }
     if not any(chosen.values()):
         raise AegisError(
@@ -64,18 +64,18 @@ def start(setting: Setting) -> Parts:
             "a group to project",
             "--set aegis.groups=all, or freeze less",
         )
-    like = next(p for group in setting.groups.values() for p in group)
+    like = next(p for group in context.groups.values() for p in group)
     # The anchor is compared in float32, also where the weights are bfloat16.
     like = like.new_empty(0, dtype=wide_type(like.dtype))
     return Parts(
-        penalty=_penalty(setting.anchor, options["scope"], options["weighting"], like),
+        penalty=_penalty(context.anchor, options["scope"], options["weighting"], like),
         combine=_combine(
             list(chosen.values()), options["projects"] != "update", options["restoration"]
         ),
         refresh=options["refresh"],
         fraction=options["fraction"],
         keeps_idle=options["idle"] == "kept",
-        constrain=None if options["projects"] == "gradient" else _constrain(setting, chosen),
+        constrain=None if options["projects"] == "gradient" else _constrain(context, chosen),
     )
 
 
@@ -177,11 +177,11 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
     return combine
 
 
-def _constrain(setting: Setting, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
-    names = {id(p): name for name, p in setting.learning().items()}
-    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
+def _constrain(context: MethodContext, chosen: Mapping[str, bool]) -> Callable[[Update], None]:
+    names = {id(p): name for name, p in context.learning().items()}
+    owners = context.owners  # not the context, which would keep the whole anchor in memory
     groups = []
-    for group_name, group in setting.groups.items():
+    for group_name, group in context.groups.items():
         if chosen[group_name]:
             groups.append([p for p in group if id(p) in names])
 

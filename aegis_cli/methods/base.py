@@ -17,7 +17,7 @@ Options = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Setting:
+class MethodContext:
     """What a method is started with: model, options, anchor and data.
 
     Every tensor is on the device where training runs.
@@ -200,7 +200,7 @@ class Method:
     name: str
     summary: str
     adapt: Callable[[nn.Module, Mapping[str, nn.Linear], Options], None]
-    start: Callable[[Setting], Parts] = lambda setting: Parts()
+    start: Callable[[MethodContext], Parts] = lambda context: Parts()
     needs: frozenset[str] = frozenset()
     vqa_weight: str | None = None
     stop_gradient: bool = False

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Add the questions' loss to every step; what is asked is the caller's choice."""
-    weight, vqa_loss = setting.options["weight"], setting.vqa_loss
+    weight, vqa_loss = context.options["weight"], context.vqa_loss
     if weight == 0:
         return Parts()
     assert vqa_loss is not None

@@ -20,16 +20,16 @@ from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.core.numerics import widened
-from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
 from aegis_cli.models.backbones.base import Backbone
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Copy what learns of the backbone, as it is now."""
-    weight = setting.options["weight"]
+    weight = context.options["weight"]
     if weight == 0:  # naive, and no copy to pay for
         return Parts()
-    backbone = setting.backbone  # not the setting, which would keep the whole anchor in memory
+    backbone = context.backbone  # not the context, which would keep the whole anchor in memory
     frozen = _teacher(backbone)
 
     def auxiliary(seen: Pass) -> Tensor:

@@ -27,29 +27,29 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core.curvature import bounded, taken
-from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Update, train_all
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Pull every parameter towards the value it has now, entry by entry.
 
     Raises:
         AegisError: an anchor without the Fisher information of what learns.
     """
-    weight = setting.options["weight"]
+    weight = context.options["weight"]
     if weight == 0:
         return Parts()
-    assert setting.anchor is not None
-    learning, reference = setting.learning(), setting.reference()
-    importance = relative_fisher(setting.anchor.fisher, learning)
-    if setting.owners.several:
+    assert context.anchor is not None
+    learning, reference = context.learning(), context.reference()
+    importance = relative_fisher(context.anchor.fisher, learning)
+    if context.owners.several:
         for name, parameter in learning.items():
-            rows = setting.owners.rows(len(parameter))
+            rows = context.owners.rows(len(parameter))
             importance[name] = importance[name][rows].clone()
     held = []
     for name, parameter in learning.items():
         held.append(_Held(parameter, reference[name], importance[name]))
-    if setting.options["step"] == "gradient":
+    if context.options["step"] == "gradient":
         return Parts(pull=_pull(held, weight))
     # It compares with the start, not with the step before, so no step's weights are copied.
     return Parts(constrain=_constrain(held, weight), compares=False)

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.batch import RobotBatch
-from aegis_cli.methods.base import Method, Parts, Pass, Setting, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
 
 
 @dataclass(frozen=True)
@@ -46,22 +46,22 @@ class _Written:
     answered: Any
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Let the backbone learn actions as text, and questions if they have a weight.
 
     Raises:
         AegisError: more bins than the backbone has texts for, or an instruction that leaves no room
             for its actions.
     """
-    weight, vqa_weight = setting.options["weight"], setting.options["vqa_weight"]
+    weight, vqa_weight = context.options["weight"], context.options["vqa_weight"]
     terms: list[Callable[[Pass], Tensor]] = []
     write = None
     if weight > 0:
-        write = _writing(setting)
-        action_loss = _action_loss(setting, write)
+        write = _writing(context)
+        action_loss = _action_loss(context, write)
         terms.append(lambda seen: weight * action_loss(seen))
     if vqa_weight > 0:
-        vqa_loss = setting.vqa_loss
+        vqa_loss = context.vqa_loss
         assert vqa_loss is not None
         terms.append(lambda seen: vqa_weight * vqa_loss(seen))
     if not terms:
@@ -72,10 +72,10 @@ def start(setting: Setting) -> Parts:
 
 
 def _action_loss(
-    setting: Setting, write: Callable[[RobotBatch], _Written]
+    context: MethodContext, write: Callable[[RobotBatch], _Written]
 ) -> Callable[[Pass], Tensor]:
     """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
-    backbone = setting.backbone
+    backbone = context.backbone
 
     def loss(seen: Pass) -> Tensor:
         frames = seen.frames
@@ -92,13 +92,13 @@ def _action_loss(
     return loss
 
 
-def _writing(setting: Setting) -> Callable[[RobotBatch], _Written]:
+def _writing(context: MethodContext) -> Callable[[RobotBatch], _Written]:
     """Robot frames -> their actions as text; on the CPU, so that reading numbers syncs no GPU."""
-    backbone, targets = setting.backbone, setting.targets
-    limit, horizon, prompt = (setting.options[name] for name in ("limit", "horizon", "prompt"))
+    backbone, targets = context.backbone, context.targets
+    limit, horizon, prompt = (context.options[name] for name in ("limit", "horizon", "prompt"))
     assert targets is not None
-    numbers = _numbers(setting)
-    _check_room(setting, " ".join(numbers[-1:] * (horizon * setting.actions)))
+    numbers = _numbers(context)
+    _check_room(context, " ".join(numbers[-1:] * (horizon * context.actions)))
 
     def write(frames: RobotBatch) -> _Written:
         chosen = spread(frames.actions.shape[1], horizon)
@@ -141,25 +141,25 @@ def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
     return texts
 
 
-def _numbers(setting: Setting) -> Sequence[str]:
+def _numbers(context: MethodContext) -> Sequence[str]:
     """The text of each bin, as the backbone writes numbers."""
-    known = setting.backbone.numbers
-    count = known if setting.options["bins"] is None else setting.options["bins"]
+    known = context.backbone.numbers
+    count = known if context.options["bins"] is None else context.options["bins"]
     if count > known:
         raise AegisError(
             f"insulate.bins: {count} with a backbone that has texts for {known} numbers",
             f"at most {known} bins",
             f"--set insulate.bins={known}",
         )
-    return setting.backbone.number_texts(count)
+    return context.backbone.number_texts(count)
 
 
-def _check_room(setting: Setting, longest: str) -> None:
+def _check_room(context: MethodContext, longest: str) -> None:
     """Raise AegisError for an instruction with which the longest text of actions does not fit."""
-    for instruction in setting.instructions:
-        asked = setting.options["prompt"].replace("{}", instruction)
+    for instruction in context.instructions:
+        asked = context.options["prompt"].replace("{}", instruction)
         try:
-            setting.backbone.check_text(asked, longest)
+            context.backbone.check_text(asked, longest)
         except AegisError as error:
             raise AegisError(
                 f"the actions of '{asked}' as the text '{longest}': {error.found}",

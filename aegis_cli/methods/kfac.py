@@ -40,7 +40,7 @@ from aegis_cli.core.curvature import Curvature
 from aegis_cli.core.numerics import ratio
 from aegis_cli.core.pairs import Pair, copied_small, minus
 from aegis_cli.core.spectrum import DENSE
-from aegis_cli.methods.base import Method, Options, Parts, Setting, Update
+from aegis_cli.methods.base import Method, MethodContext, Options, Parts, Update
 from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
 _LEAST_RATE = 1e-6  # share of the peak learning rate
@@ -55,19 +55,19 @@ def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
                 parameter.requires_grad_(False)
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Pull every map back towards its current weights, and slow down maps with small gradients.
 
     With weight 0 nothing is pulled back.
     """
-    options, owners = setting.options, setting.owners
+    options, owners = context.options, context.owners
     weight, balance = options["weight"], options["balance"]
-    pairs = {site: weights(setting.backbone, site) for site in setting.sites}
+    pairs = {site: weights(context.backbone, site) for site in context.sites}
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
     slowed = (lambda: shares(maps, balance, owners)) if balance > 0 else None
     if weight == 0:
         return Parts(shares=slowed)
-    groups = _grouped(maps, _curvatures(setting, maps), owners)
+    groups = _grouped(maps, _curvatures(context, maps), owners)
     if options["step"] == "gradient":
         return Parts(shares=slowed, pull=_pull(groups, weight))
     return Parts(
@@ -78,12 +78,12 @@ def start(setting: Setting) -> Parts:
     )
 
 
-def _curvatures(setting: Setting, maps: Mapping[str, Pair]) -> dict[str, Curvature]:
+def _curvatures(context: MethodContext, maps: Mapping[str, Pair]) -> dict[str, Curvature]:
     """The curvature of each map's rows that this process has."""
-    owners = setting.owners
+    owners = context.owners
     likes = {site: rows_here(weight) for site, (weight, _) in maps.items()}
-    assert setting.anchor is not None
-    found = curvature.curvatures(setting.anchor, likes, setting.options["damping"])
+    assert context.anchor is not None
+    found = curvature.curvatures(context.anchor, likes, context.options["damping"])
     if owners.several:
         # Map by map, so that only one map's rows are in memory twice.
         for site, (weight, _) in maps.items():

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import torch
 
-from aegis_cli.methods.base import Method, Parts, Setting, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, train_all
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Pull every parameter towards the value it has now."""
-    weight = setting.options["weight"]
+    weight = context.options["weight"]
     if weight == 0:
         return Parts()
-    learning, reference = setting.learning(), setting.reference()
+    learning, reference = context.learning(), context.reference()
 
     @torch.no_grad()
     def pull() -> None:

@@ -24,18 +24,18 @@ from torch import Tensor, nn
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
 from aegis_cli.core.numerics import ratio
-from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Update, train_all
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Hold every parameter to the value it has now, with the strength of its group."""
-    weight = setting.options["weight"]
+    weight = context.options["weight"]
     if weight == 0:
         return Parts()
-    learning, reference = setting.learning(), setting.reference()
-    owners = setting.owners  # not the setting, which would keep the whole anchor in memory
+    learning, reference = context.learning(), context.reference()
+    owners = context.owners  # not the context, which would keep the whole anchor in memory
     # All groups count, so that what is frozen does not change how the others are held.
-    groups = setting.backbone.parameter_groups()
+    groups = context.backbone.parameter_groups()
     of_group = schedule(groups, weight)
     strengths: dict[int, float] = {}
     for group, parameters in groups.items():

@@ -27,27 +27,27 @@ from aegis_cli.common.ranks import Ranks, rows_here
 from aegis_cli.core import nullspace, stacking
 from aegis_cli.core.nullspace import Dense, Elementwise, Protection, Remembered, Strength, TableRows
 from aegis_cli.core.pairs import Pair, minus
-from aegis_cli.methods.base import Method, Parts, Setting, Update, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, Update, train_all
 from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     """Project every site of the kinds in `protect`; energy 0 protects nothing."""
-    options = setting.options
+    options = context.options
     hard = options["energy"]
     if hard == 0:
         return Parts()
     strength = Strength(soft=options["soft"]) if hard is None else Strength(hard)
-    assert setting.anchor is not None
-    chosen = [site for site, kind in setting.sites.items() if kind in options["protect"]]
-    likes = {site: weights(setting.backbone, site)[0] for site in chosen}
+    assert context.anchor is not None
+    chosen = [site for site, kind in context.sites.items() if kind in options["protect"]]
+    likes = {site: weights(context.backbone, site)[0] for site in chosen}
     here = {site: rows_here(like) for site, like in likes.items()}
-    protections = nullspace.protections(setting.anchor, here, strength)
-    if setting.owners.several:
+    protections = nullspace.protections(context.anchor, here, strength)
+    if context.owners.several:
         # Every row is projected by itself, so that sharded weights need nothing of each other.
         for site, like in likes.items():
-            protections[site] = protections[site].of_rows(setting.owners.rows(len(like)))
-    groups = _grouped(setting.backbone, protections, setting.owners)
+            protections[site] = protections[site].of_rows(context.owners.rows(len(like)))
+    groups = _grouped(context.backbone, protections, context.owners)
     if options["keeps"] == "coordinates":
         return _by_coordinates(groups, options["every"])
 
@@ -81,7 +81,7 @@ class _Group:
     """Sites that are projected by one computation: one site, or on a GPU several of one shape.
 
     Attributes:
-        backbone: it, and not the setting, which would keep the whole anchor in memory.
+        backbone: it, and not the context, which would keep the whole anchor in memory.
         protection: that of all of them, stacked.
     """
 

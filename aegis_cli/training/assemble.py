@@ -30,7 +30,7 @@ from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
-from aegis_cli.methods.base import Method, Parts, Pass, Setting
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones, structure
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
@@ -620,7 +620,7 @@ def _start(
 ) -> Parts:
     options, backbone = recipes.options(recipe), policy.backbone
     vqa_loss = None if source is None else _vqa_loss(backbone, recipe, source, on_event)
-    setting = Setting(
+    context = MethodContext(
         backbone=backbone,
         groups=backbone.learning_groups(),
         sites=_learning_sites(backbone, sites, options),
@@ -632,7 +632,7 @@ def _start(
         actions=len(policy.action_scale.mean),
         owners=owners,
     )
-    return method.start(setting)
+    return method.start(context)
 
 
 def _learning_sites(

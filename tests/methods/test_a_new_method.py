@@ -12,16 +12,16 @@ from samples.command_blocks import ROOT
 
 from aegis_cli import methods, recipes
 from aegis_cli.common import artifacts
-from aegis_cli.methods.base import Method, Parts, Pass, Setting
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass
 
 HALF = '''
 """Plain fine-tuning with half the gradient in the backbone."""
 
-from aegis_cli.methods.base import Method, Parts, Setting, train_all
+from aegis_cli.methods.base import Method, Parts, MethodContext, train_all
 
 
-def start(setting: Setting) -> Parts:
-    learning = setting.learning().values()
+def start(context: MethodContext) -> Parts:
+    learning = context.learning().values()
 
     def halve() -> None:
         for parameter in learning:
@@ -39,10 +39,10 @@ AWAY = '''
 import torch
 
 from aegis_cli.core import projection
-from aegis_cli.methods.base import Method, Parts, Setting, train_all
+from aegis_cli.methods.base import Method, Parts, MethodContext, train_all
 
 
-def start(setting: Setting) -> Parts:
+def start(context: MethodContext) -> Parts:
     def penalty(seen):
         each = torch.stack([hidden.square().mean() for hidden in seen.hidden])
         return each.mean(), each.detach()
@@ -102,7 +102,7 @@ def test_a_penalty_needs_no_anchor(tmp_path: Path, tiny_folder: Path, demos_file
     assert bool((kept["aa"] > 0).any()) and bool((kept["w2"] > 0).all())
 
 
-@pytest.mark.parametrize("described", [Method, Parts, Setting, Pass])
+@pytest.mark.parametrize("described", [Method, Parts, MethodContext, Pass])
 def test_the_page_names_every_field(described: type) -> None:
     """What a method may say or use, its author finds on one page."""
     fields = [field.name for field in dataclasses.fields(described)]

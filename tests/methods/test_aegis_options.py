@@ -27,7 +27,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.numerics import ratio
 from aegis_cli.methods import METHODS, aegis
-from aegis_cli.methods.base import Parts, Pass, Setting, Update
+from aegis_cli.methods.base import MethodContext, Parts, Pass, Update
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import IDLE, PROJECTED, SCOPES, WEIGHTINGS
 from aegis_cli.training import step
@@ -71,7 +71,7 @@ def make_pass(seed: int = 0) -> Pass:
 def start(**options: Any) -> Parts:
     module = nn.Linear(1, 1).double()
     return AEGIS.start(
-        Setting(
+        MethodContext(
             module,
             {"layers.0": list(module.parameters())},
             {},

@@ -16,7 +16,7 @@ from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.pairs import Pair, minus
 from aegis_cli.core.spectrum import decompose
 from aegis_cli.methods import kfac
-from aegis_cli.methods.base import Parts, Setting, Update
+from aegis_cli.methods.base import MethodContext, Parts, Update
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.recipes import Kfac
 
@@ -64,11 +64,11 @@ def make_anchor() -> Anchor:
     return Anchor(curvature={f"{site}.inputs": found for site, found in inputs.items()} | outputs)
 
 
-def make_setting(**options: Any) -> Setting:
+def make_setting(**options: Any) -> MethodContext:
     toy = Toy()
     kfac.METHOD.adapt(toy, {}, {})
     chosen = asdict(Kfac(weight=0.3, damping=0.1, balance=0.0, every=1)) | options
-    return Setting(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
+    return MethodContext(toy, {"all": list(toy.parameters())}, SITES, chosen, make_anchor())
 
 
 def values(toy: nn.Module) -> dict[str, Tensor]:
@@ -102,15 +102,15 @@ def test_either_half_works_alone(weight: float, balance: float) -> None:
 @pytest.mark.parametrize("steps", [1, 3])
 def test_all_that_has_moved_is_drawn_back_as_far_as_its_steps_ask(steps: int) -> None:
     """The second window too starts from the pre-trained weights, not from the first's end."""
-    setting = make_setting()
-    toy, origin = setting.backbone, values(setting.backbone)
-    parts = kfac.METHOD.start(setting)
+    context = make_setting()
+    toy, origin = context.backbone, values(context.backbone)
+    parts = kfac.METHOD.start(context)
     constrain = parts.constrain
     optimizer = torch.optim.AdamW(
         [p for p in toy.parameters() if p.requires_grad], lr=0.1, weight_decay=0.5
     )
-    assert constrain is not None and not parts.compares and setting.anchor is not None
-    found = curvatures(setting.anchor, {site: weights(toy, site)[0] for site in MAPS}, 0.1)
+    assert constrain is not None and not parts.compares and context.anchor is not None
+    found = curvatures(context.anchor, {site: weights(toy, site)[0] for site in MAPS}, 0.1)
 
     def displacement(site: str) -> Pair:
         return minus(weights(toy, site), (origin[f"{site}.weight"], origin.get(f"{site}.bias")))
@@ -142,20 +142,20 @@ def move(toy: nn.Module) -> None:
 
 def drawn_back(toy: nn.Module, anchor: Anchor, update: Update, **options: Any) -> dict[str, Tensor]:
     """Where a copy of the toy, moved always alike, is after one constraint."""
-    setting = replace(make_setting(**options), backbone=copy.deepcopy(toy), anchor=anchor)
-    constrain = kfac.METHOD.start(setting).constrain
+    context = replace(make_setting(**options), backbone=copy.deepcopy(toy), anchor=anchor)
+    constrain = kfac.METHOD.start(context).constrain
     assert constrain is not None
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        move(setting.backbone)
+        move(context.backbone)
     constrain(update)
-    return values(setting.backbone)
+    return values(context.backbone)
 
 
 @pytest.mark.parametrize("growth", [0.0, 0.5, 2.0])
 def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
-    setting = make_setting()
-    toy, anchor = setting.backbone, setting.anchor
+    context = make_setting()
+    toy, anchor = context.backbone, context.anchor
     assert anchor is not None
     late = drawn_back(toy, anchor, Update({}, {}, 2, rate_left=0.25), growth=growth)
     heavy = drawn_back(toy, anchor, Update({}, {}, 2), weight=0.3 * 4**growth)
@@ -171,27 +171,27 @@ def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
 @pytest.mark.parametrize("growth", [1.0, 8.0, 80.0])
 @pytest.mark.parametrize("read", [True, False])
 def test_a_rate_of_zero_still_has_a_weight(growth: float, read: bool) -> None:
-    setting = make_setting()
-    assert setting.anchor is not None
+    context = make_setting()
+    assert context.anchor is not None
     rate = 0.0 if read else torch.zeros((), dtype=torch.float64)
     last = Update({}, {}, 1, rate_left=rate)
-    found = drawn_back(setting.backbone, setting.anchor, last, growth=growth)
+    found = drawn_back(context.backbone, context.anchor, last, growth=growth)
     assert all(tensor.isfinite().all() for tensor in found.values())
 
 
 def test_by_its_gradient_the_penalty_is_added_to_the_tasks() -> None:
     """sum_ij w h_ij D_ij^2 / 2 has the gradient that an excess of small weight tends to."""
-    setting = make_setting(step="gradient")
-    toy, origin = setting.backbone, values(setting.backbone)
-    parts = kfac.METHOD.start(setting)
-    assert parts.pull is not None and parts.constrain is None and setting.anchor is not None
+    context = make_setting(step="gradient")
+    toy, origin = context.backbone, values(context.backbone)
+    parts = kfac.METHOD.start(context)
+    assert parts.pull is not None and parts.constrain is None and context.anchor is not None
     move(toy)
     for parameter in toy.parameters():
         parameter.grad = torch.ones_like(parameter) if parameter.requires_grad else None
     toy.second.weight.grad = None
     parts.pull()
     assert toy.second.weight.grad is None
-    found = curvatures(setting.anchor, {"first": weights(toy, "first")[0]}, 0.1)["first"]
+    found = curvatures(context.anchor, {"first": weights(toy, "first")[0]}, 0.1)["first"]
     moved = minus(weights(toy, "first"), (origin["first.weight"], origin["first.bias"]))
     for tensor, small in zip(weights(toy, "first"), found.excess(*moved, 1e-9), strict=True):
         torch.testing.assert_close(tensor.grad - 1, 0.3 * small / 1e-9, rtol=1e-5, atol=1e-7)

@@ -23,7 +23,7 @@ from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question, vocabulary
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Parts, Setting, Update
+from aegis_cli.methods.base import MethodContext, Parts, Update
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 from aegis_cli.models.expert import ActionExpert, ExpertShape
@@ -143,7 +143,7 @@ def protected(policy: Policy, **options: float | tuple[str, ...]) -> Parts:
         "keeps": "weights",
     } | options
     return METHODS["nullspace"].start(
-        Setting(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor)
+        MethodContext(backbone, backbone.parameter_groups(), backbone.sites(), chosen, anchor)
     )
 
 

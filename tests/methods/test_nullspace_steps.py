@@ -23,7 +23,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.nullspace import allowed
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Method, Parts, Setting, Update
+from aegis_cli.methods.base import Method, MethodContext, Parts, Update
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
@@ -45,7 +45,9 @@ def start(
 ) -> Parts:
     options = {"energy": energy, "soft": soft, "every": 1, "protect": ("maps",), "keeps": "weights"}
     return method.start(
-        Setting(toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, Anchor(inputs=inputs))
+        MethodContext(
+            toy, {SITE: list(toy.parameters())}, {SITE: "maps"}, options, Anchor(inputs=inputs)
+        )
     )
 
 
@@ -148,7 +150,7 @@ def test_only_the_kinds_asked_for_are_protected(other: str) -> None:
     (spectrum,) = measure(toy.map, case.vqa()).values()
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": ("maps",), "keeps": "weights"}
     parts = METHODS["nullspace"].start(
-        Setting(
+        MethodContext(
             two,
             {"both": list(two.parameters())},
             kinds,

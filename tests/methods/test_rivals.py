@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.methods import cotrain, distill, ewc, l2sp, maps
-from aegis_cli.methods.base import Method, Parts, Pass, Setting, Update
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, Update
 
 RIVALS = (l2sp.METHOD, maps.METHOD, ewc.METHOD, distill.METHOD, cotrain.METHOD)
 GROUPS = (
@@ -60,24 +60,24 @@ def make_setting(
     anchor: Anchor | None = None,
     vqa_loss: Callable[[Pass], Tensor] | None = None,
     **changes: str,
-) -> Setting:
+) -> MethodContext:
     toy = Toy()
     options = {"weight": weight, "step": "gradient"} | changes
-    return Setting(toy, toy.parameter_groups(), {}, options, anchor, vqa_loss)
+    return MethodContext(toy, toy.parameter_groups(), {}, options, anchor, vqa_loss)
 
 
-def values(setting: Setting) -> dict[str, Tensor]:
-    return {name: p.detach().clone() for name, p in setting.backbone.named_parameters()}
+def values(context: MethodContext) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in context.backbone.named_parameters()}
 
 
 @torch.no_grad()
-def move(setting: Setting, scale: float = 0.3) -> None:
-    for parameter in setting.backbone.parameters():
+def move(context: MethodContext, scale: float = 0.3) -> None:
+    for parameter in context.backbone.parameters():
         parameter += scale * torch.randn_like(parameter)
 
 
-def set_gradients(setting: Setting, gradients: Mapping[str, Tensor]) -> None:
-    for name, parameter in setting.backbone.named_parameters():
+def set_gradients(context: MethodContext, gradients: Mapping[str, Tensor]) -> None:
+    for name, parameter in context.backbone.named_parameters():
         parameter.grad = gradients[name].clone()
 
 
@@ -85,11 +85,11 @@ def draw_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: torch.randn_like(t) for name, t in tensors.items()}
 
 
-def make_fisher(setting: Setting) -> dict[str, Tensor]:
+def make_fisher(context: MethodContext) -> dict[str, Tensor]:
     """Values of very different sizes between parameters, as in a Fisher information."""
     return {
         n: torch.rand_like(p.detach()) * 10.0**-i
-        for i, (n, p) in enumerate(setting.backbone.named_parameters())
+        for i, (n, p) in enumerate(context.backbone.named_parameters())
     }
 
 
@@ -135,8 +135,8 @@ def test_needs_and_ceiling_are_declared() -> None:
     ids=lambda value: getattr(value, "name", value),
 )
 def test_each_adds_one_part(method: Method, part: str) -> None:
-    setting = make_setting(1.0, vqa_loss=lambda seen: torch.zeros(()))
-    parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
+    context = make_setting(1.0, vqa_loss=lambda seen: torch.zeros(()))
+    parts = method.start(replace(context, anchor=Anchor(fisher=make_fisher(context))))
     assert [name for name, value in vars(parts).items() if value != getattr(Parts(), name)] == [
         part
     ]
@@ -146,16 +146,16 @@ def test_each_adds_one_part(method: Method, part: str) -> None:
 
 
 def assert_pull_is_gradient(
-    method: Method, setting: Setting, penalty: Callable[[dict[str, Tensor]], Tensor]
+    method: Method, context: MethodContext, penalty: Callable[[dict[str, Tensor]], Tensor]
 ) -> None:
     """`pull` adds the gradient of a penalty of the parameters' distances from their start."""
-    parts, origin = method.start(setting), values(setting)
+    parts, origin = method.start(context), values(context)
     assert parts.pull is not None
-    move(setting)
+    move(context)
     task = draw_like(origin)
-    set_gradients(setting, task)
+    set_gradients(context, task)
     parts.pull()
-    learning = setting.learning()
+    learning = context.learning()
     expected = torch.autograd.grad(
         penalty({n: p - origin[n] for n, p in learning.items()}), list(learning.values())
     )
@@ -177,13 +177,13 @@ def test_l2sp_pulls_by_the_gradient_of_its_penalty(weight: float) -> None:
 def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(
     weight: float, scale: float
 ) -> None:
-    setting = make_setting(weight)
-    fisher = make_fisher(setting)
+    context = make_setting(weight)
+    fisher = make_fisher(context)
     mean = torch.cat([f.flatten() for f in fisher.values()]).mean()
     scaled = Anchor(fisher={name: f * scale for name, f in fisher.items()})
     assert_pull_is_gradient(
         ewc.METHOD,
-        replace(setting, anchor=scaled),
+        replace(context, anchor=scaled),
         lambda moved: (
             weight / 2 * sum((fisher[n] / mean * d.square()).sum() for n, d in moved.items())
         ),
@@ -192,27 +192,27 @@ def test_ewc_pulls_by_the_gradient_of_its_penalty_whatever_the_scale_of_fisher(
 
 @pytest.mark.parametrize("method", [l2sp.METHOD, ewc.METHOD], ids=lambda method: method.name)
 def test_a_parameter_without_a_gradient_gets_none(method: Method) -> None:
-    setting = make_setting(1.0)
-    parts = method.start(replace(setting, anchor=Anchor(fisher=make_fisher(setting))))
-    move(setting)
-    set_gradients(setting, draw_like(values(setting)))
-    for parameter in setting.groups["final_norm"]:
+    context = make_setting(1.0)
+    parts = method.start(replace(context, anchor=Anchor(fisher=make_fisher(context))))
+    move(context)
+    set_gradients(context, draw_like(values(context)))
+    for parameter in context.groups["final_norm"]:
         parameter.grad = None
     parts.pull()
-    assert all(p.grad is None for p in setting.groups["final_norm"])
+    assert all(p.grad is None for p in context.groups["final_norm"])
 
 
 def test_ewc_leaves_what_has_no_fisher_information_alone() -> None:
-    setting = make_setting(5.0)
-    fisher = make_fisher(setting)
+    context = make_setting(5.0)
+    fisher = make_fisher(context)
     fisher["layers.1.weight"].zero_()
     fisher["stem.weight"][1:].zero_()
-    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
-    move(setting)
-    task = draw_like(values(setting))
-    set_gradients(setting, task)
+    parts = ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
+    move(context)
+    task = draw_like(values(context))
+    set_gradients(context, task)
     parts.pull()
-    gradients = {name: p.grad for name, p in setting.backbone.named_parameters()}
+    gradients = {name: p.grad for name, p in context.backbone.named_parameters()}
     assert torch.equal(gradients["layers.1.weight"], task["layers.1.weight"])
     assert torch.equal(gradients["stem.weight"][1:], task["stem.weight"][1:])
     assert not torch.isclose(gradients["stem.weight"][0], task["stem.weight"][0]).any()
@@ -222,16 +222,16 @@ def test_ewc_leaves_what_has_no_fisher_information_alone() -> None:
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_proximal_ewc_minimises_distance_and_penalty(weight: float, steps: int) -> None:
     """The closed form is where (theta - moved) + w F (theta - theta0) is 0."""
-    setting = make_setting(weight, step="proximal")
-    fisher = make_fisher(setting)
-    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+    context = make_setting(weight, step="proximal")
+    fisher = make_fisher(context)
+    parts = ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
     assert parts.constrain is not None and parts.pull is None and not parts.compares
-    origin = values(setting)
-    move(setting)
-    moved = values(setting)
+    origin = values(context)
+    move(context)
+    moved = values(context)
     parts.constrain(Update({}, {}, steps))
-    relative = ewc.relative_fisher(fisher, setting.learning())
-    for name, parameter in setting.backbone.named_parameters():
+    relative = ewc.relative_fisher(fisher, context.learning())
+    for name, parameter in context.backbone.named_parameters():
         found = parameter.detach()
         pulled = steps * weight * relative[name] * (found - origin[name])
         torch.testing.assert_close(found - moved[name] + pulled, torch.zeros_like(found))
@@ -240,40 +240,40 @@ def test_a_proximal_ewc_minimises_distance_and_penalty(weight: float, steps: int
 
 
 def test_a_weight_past_float32_holds_what_has_fisher_information_and_frees_the_rest() -> None:
-    setting = make_setting(1e39, step="proximal")
-    setting.backbone.float()
-    fisher = {name: torch.zeros_like(p) for name, p in setting.backbone.named_parameters()}
+    context = make_setting(1e39, step="proximal")
+    context.backbone.float()
+    fisher = {name: torch.zeros_like(p) for name, p in context.backbone.named_parameters()}
     fisher["stem.weight"][0] = 1.0
-    origin = values(setting)
-    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
-    move(setting)
-    moved = values(setting)
+    origin = values(context)
+    parts = ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
+    move(context)
+    moved = values(context)
     parts.constrain(Update({}, {}))
-    after = values(setting)
+    after = values(context)
     torch.testing.assert_close(after["stem.weight"][0], origin["stem.weight"][0])
     assert torch.equal(after["stem.weight"][1:], moved["stem.weight"][1:])
     assert torch.equal(after["layers.0.weight"], moved["layers.0.weight"])
 
 
 def test_a_proximal_ewc_leaves_what_has_no_fisher_information_alone() -> None:
-    setting = make_setting(5.0, step="proximal")
-    fisher = make_fisher(setting)
+    context = make_setting(5.0, step="proximal")
+    fisher = make_fisher(context)
     fisher["layers.1.weight"].zero_()
-    parts = ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
-    move(setting)
-    moved = values(setting)
+    parts = ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
+    move(context)
+    moved = values(context)
     parts.constrain(Update({}, {}))
-    after = values(setting)
+    after = values(context)
     assert torch.equal(after["layers.1.weight"], moved["layers.1.weight"])
     assert not torch.isclose(after["stem.weight"], moved["stem.weight"]).any()
 
 
 def test_ewc_averages_over_what_learns_alone() -> None:
-    setting = make_setting(1.0)
-    fisher = make_fisher(setting)
-    for parameter in setting.groups["stem"]:
+    context = make_setting(1.0)
+    fisher = make_fisher(context)
+    for parameter in context.groups["stem"]:
         parameter.requires_grad_(False)
-    relative = ewc.relative_fisher(fisher, setting.learning())
+    relative = ewc.relative_fisher(fisher, context.learning())
     assert not any(name.startswith("stem.") for name in relative)
     torch.testing.assert_close(
         torch.cat([f.flatten() for f in relative.values()]).mean().item(), 1.0
@@ -281,20 +281,20 @@ def test_ewc_averages_over_what_learns_alone() -> None:
 
 
 def test_ewc_names_a_parameter_that_the_anchor_lacks() -> None:
-    setting = make_setting(1.0)
-    fisher = make_fisher(setting)
+    context = make_setting(1.0)
+    fisher = make_fisher(context)
     del fisher["layers.1.bias"]
     with pytest.raises(AegisError) as caught:
-        ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+        ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
     assert "'layers.1.bias'" in caught.value.found
 
 
 @pytest.mark.parametrize("value", [0.0, float("nan")])
 def test_ewc_refuses_a_fisher_information_that_says_nothing(value: float) -> None:
-    setting = make_setting(1.0)
-    fisher = {name: torch.full_like(f, value) for name, f in make_fisher(setting).items()}
+    context = make_setting(1.0)
+    fisher = {name: torch.full_like(f, value) for name, f in make_fisher(context).items()}
     with pytest.raises(AegisError) as caught:
-        ewc.METHOD.start(replace(setting, anchor=Anchor(fisher=fisher)))
+        ewc.METHOD.start(replace(context, anchor=Anchor(fisher=fisher)))
     assert "0" in caught.value.found or "nan" in caught.value.found
 
 
@@ -310,20 +310,20 @@ class Stepped:
     """
 
     def __init__(self, weight: float, *, sign: float = 1.0, growth: float = 0.2) -> None:
-        setting = make_setting(weight)
-        self.setting, self.origin = setting, values(setting)
-        parts = maps.METHOD.start(setting)
+        context = make_setting(weight)
+        self.context, self.origin = context, values(context)
+        parts = maps.METHOD.start(context)
         assert parts.constrain is not None
-        move(setting)
-        self.before = values(setting)
+        move(context)
+        self.before = values(context)
         outwards = {name: t - self.origin[name] for name, t in self.before.items()}
         with torch.no_grad():  # on by `growth`, and a little sideways
-            for name, parameter in setting.backbone.named_parameters():
+            for name, parameter in context.backbone.named_parameters():
                 parameter += growth * outwards[name] + 0.02 * torch.randn_like(parameter)
-        self.free = values(setting)
-        set_gradients(setting, {name: sign * d for name, d in outwards.items()})
+        self.free = values(context)
+        set_gradients(context, {name: sign * d for name, d in outwards.items()})
         parts.constrain(Update(self.before, {}))
-        self.after = values(setting)
+        self.after = values(context)
 
     def distances(self, tensors: Mapping[str, Tensor]) -> dict[str, float]:
         return {name: (t - self.origin[name]).norm().item() for name, t in tensors.items()}
@@ -363,13 +363,13 @@ def test_maps_counts_groups_of_other_names_as_vision() -> None:
 
 
 def test_maps_leaves_the_first_step_alone() -> None:
-    setting = make_setting(1.0)
-    parts, before = maps.METHOD.start(setting), values(setting)
-    move(setting)
-    free = values(setting)
-    set_gradients(setting, draw_like(before))
+    context = make_setting(1.0)
+    parts, before = maps.METHOD.start(context), values(context)
+    move(context)
+    free = values(context)
+    set_gradients(context, draw_like(before))
     parts.constrain(Update(before, {}))
-    assert all(torch.equal(t, free[name]) for name, t in values(setting).items())
+    assert all(torch.equal(t, free[name]) for name, t in values(context).items())
 
 
 @pytest.mark.parametrize("weight", [0.5, 1.0, 3.2])
@@ -385,20 +385,20 @@ def test_maps_never_projects_a_step_that_comes_back(weight: float) -> None:
 
 
 def test_maps_projects_each_parameter_by_its_own_gradient() -> None:
-    setting = make_setting(1.0)
-    parts, origin = maps.METHOD.start(setting), values(setting)
-    move(setting)
-    before = values(setting)
+    context = make_setting(1.0)
+    parts, origin = maps.METHOD.start(context), values(context)
+    move(context)
+    before = values(context)
     with torch.no_grad():
-        for name, parameter in setting.backbone.named_parameters():
+        for name, parameter in context.backbone.named_parameters():
             parameter += 0.2 * (before[name] - origin[name])
-    free = values(setting)
+    free = values(context)
     signs = {name: -1.0 if name.endswith("bias") else 1.0 for name in before}
     set_gradients(
-        setting, {name: sign * (before[name] - origin[name]) for name, sign in signs.items()}
+        context, {name: sign * (before[name] - origin[name]) for name, sign in signs.items()}
     )
     parts.constrain(Update(before, {}))
-    moved = {name for name, t in values(setting).items() if not torch.equal(t, free[name])}
+    moved = {name for name, t in values(context).items() if not torch.equal(t, free[name])}
     assert moved == {
         name for name in before if name.endswith("weight") and not name.startswith("final_norm")
     }
@@ -413,7 +413,7 @@ def test_maps_ends_between_the_step_and_the_distance_before_it(weight: float) ->
     assert all(before[name] < free[name] for name in free)
     assert all(before[name] - 1e-12 <= after[name] <= free[name] for name in free)
     # of the way out, each group keeps 1 - lambda_k
-    strengths = maps.schedule(stepped.setting.groups, weight)
+    strengths = maps.schedule(stepped.context.groups, weight)
     for name in free:
         kept = (after[name] - before[name]) / (free[name] - before[name])
         torch.testing.assert_close(
@@ -452,12 +452,12 @@ def test_maps_stays_between_the_pre_trained_weights_and_the_step(weight: float) 
 
 
 def test_maps_leaves_a_parameter_without_a_gradient_alone() -> None:
-    setting = make_setting(1.0)
-    parts = maps.METHOD.start(setting)
-    move(setting)
-    before = values(setting)
+    context = make_setting(1.0)
+    parts = maps.METHOD.start(context)
+    move(context)
+    before = values(context)
     parts.constrain(Update(before, {}))
-    assert all(torch.equal(t, before[name]) for name, t in values(setting).items())
+    assert all(torch.equal(t, before[name]) for name, t in values(context).items())
 
 
 # --- distill --------------------------------------------------------------------------------------
@@ -470,8 +470,8 @@ def make_mask() -> Tensor:
     return mask
 
 
-def see(setting: Setting, inputs: Tensor, step: int = 0) -> Pass:
-    hidden = setting.backbone.encode(inputs).hidden
+def see(context: MethodContext, inputs: Tensor, step: int = 0) -> Pass:
+    hidden = context.backbone.encode(inputs).hidden
     return Pass(step, inputs, hidden, make_mask(), torch.arange(TOKENS) < 2)
 
 
@@ -479,36 +479,36 @@ def draw_inputs() -> Tensor:
     return torch.randn(BATCH, TOKENS, WIDTH, dtype=torch.float64)
 
 
-def started(weight: float) -> tuple[Setting, Callable[[Pass], Tensor]]:
-    setting = make_setting(weight)
-    auxiliary = distill.METHOD.start(setting).auxiliary
+def started(weight: float) -> tuple[MethodContext, Callable[[Pass], Tensor]]:
+    context = make_setting(weight)
+    auxiliary = distill.METHOD.start(context).auxiliary
     assert auxiliary is not None
-    return setting, auxiliary
+    return context, auxiliary
 
 
 def test_distill_begins_at_zero_and_with_no_gradient() -> None:
-    setting, auxiliary = started(2.0)
-    loss = auxiliary(see(setting, draw_inputs()))
+    context, auxiliary = started(2.0)
+    loss = auxiliary(see(context, draw_inputs()))
     loss.backward()
     assert loss.item() == 0
     gradients = [
         p.grad
-        for name, p in setting.backbone.named_parameters()
+        for name, p in context.backbone.named_parameters()
         if not name.startswith("final_norm.")
     ]
     assert all(gradient is not None and not gradient.any() for gradient in gradients)
 
 
 def test_distill_falls_under_descent_and_its_teacher_does_not_move() -> None:
-    setting, auxiliary = started(2.0)
+    context, auxiliary = started(2.0)
     inputs = draw_inputs()
-    first = see(setting, inputs)
+    first = see(context, inputs)
     taught = [h.detach() for h in first.hidden]
-    move(setting)
-    optimizer, losses = torch.optim.SGD(setting.backbone.parameters(), lr=0.005), []
+    move(context)
+    optimizer, losses = torch.optim.SGD(context.backbone.parameters(), lr=0.005), []
     for _ in range(20):
         optimizer.zero_grad()
-        loss = auxiliary(see(setting, inputs))
+        loss = auxiliary(see(context, inputs))
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
@@ -519,11 +519,11 @@ def test_distill_falls_under_descent_and_its_teacher_does_not_move() -> None:
 
 
 def test_distill_is_the_mean_over_layers_of_the_relative_squared_distance() -> None:
-    setting, auxiliary = started(3.0)
+    context, auxiliary = started(3.0)
     inputs, mask = draw_inputs(), make_mask()
-    taught = setting.backbone.encode(inputs).hidden
-    move(setting)
-    seen = see(setting, inputs)
+    taught = context.backbone.encode(inputs).hidden
+    move(context)
+    seen = see(context, inputs)
     layers = []
     for h, h0 in zip(seen.hidden, taught, strict=True):
         tokens = [(b, t) for b in range(BATCH) for t in range(TOKENS) if mask[b, t]]
@@ -534,15 +534,15 @@ def test_distill_is_the_mean_over_layers_of_the_relative_squared_distance() -> N
 
 
 def test_distill_does_not_count_padding() -> None:
-    setting, auxiliary = started(1.0)
+    context, auxiliary = started(1.0)
     inputs = draw_inputs()
-    move(setting)
-    seen = see(setting, inputs)
+    move(context)
+    seen = see(context, inputs)
     pad = ~make_mask()[..., None]
     elsewhere = [torch.where(pad, 100 * torch.randn_like(h), h) for h in seen.hidden]
     assert torch.equal(auxiliary(replace(seen, hidden=elsewhere)), auxiliary(seen))
     other = torch.where(pad, torch.randn_like(inputs), inputs)
-    assert torch.equal(auxiliary(see(setting, other)), auxiliary(seen))
+    assert torch.equal(auxiliary(see(context, other)), auxiliary(seen))
     valid = [torch.where(pad, h, h + 1) for h in seen.hidden]
     assert not torch.isclose(auxiliary(replace(seen, hidden=valid)), auxiliary(seen))
 
@@ -566,11 +566,11 @@ def test_distill_computes_half_precision_in_float32() -> None:
 
 
 def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
-    setting, auxiliary = started(1.0)
-    parameters = list(setting.backbone.parameters())
-    move(setting)
-    auxiliary(see(setting, draw_inputs())).backward()
-    assert list(map(id, setting.backbone.parameters())) == list(
+    context, auxiliary = started(1.0)
+    parameters = list(context.backbone.parameters())
+    move(context)
+    auxiliary(see(context, draw_inputs())).backward()
+    assert list(map(id, context.backbone.parameters())) == list(
         map(id, parameters)
     )  # the copy is not among what is trained or saved
     assert all(p.requires_grad for p in parameters)
@@ -580,20 +580,20 @@ def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
 
 
 def test_cotrain_adds_weight_times_the_gradient_of_the_questions_of_this_step() -> None:
-    setting = make_setting(0.25)
+    context = make_setting(0.25)
     inputs, asked = draw_inputs(), []
 
     def vqa_loss(seen: Pass) -> Tensor:
         asked.append(seen.step)
-        return (seen.step + 1) * setting.backbone.encode(inputs).hidden[-1].square().mean()
+        return (seen.step + 1) * context.backbone.encode(inputs).hidden[-1].square().mean()
 
-    auxiliary = cotrain.METHOD.start(replace(setting, vqa_loss=vqa_loss)).auxiliary
+    auxiliary = cotrain.METHOD.start(replace(context, vqa_loss=vqa_loss)).auxiliary
     assert auxiliary is not None and asked == []
     parameters = [
-        p for name, p in setting.backbone.named_parameters() if not name.startswith("final_norm.")
+        p for name, p in context.backbone.named_parameters() if not name.startswith("final_norm.")
     ]
     for step in (0, 7):
-        seen = see(setting, inputs, step)
+        seen = see(context, inputs, step)
         added = torch.autograd.grad(auxiliary(seen), parameters)
         expected = torch.autograd.grad(vqa_loss(seen), parameters)
         for gradient, of_questions in zip(added, expected, strict=True):

@@ -18,7 +18,7 @@ from aegis_cli.core import stacking
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import channel_moment, decompose, lone_row, second_moment
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Setting, Update
+from aegis_cli.methods.base import MethodContext, Update
 from aegis_cli.recipes import Kfac, Nullspace
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
@@ -79,8 +79,8 @@ def trained(method: str, options: dict[str, Any], together: bool) -> tuple[Toy, 
         found.adapt(toy, {}, options)
         sites = dict.fromkeys((*LAYERS, "stem"), "maps")
         sites |= dict.fromkeys(("first", "second"), "norms") | {"row": "embeddings"}
-        setting = Setting(toy, {"all": list(toy.parameters())}, sites, options, make_anchor())
-        parts = found.start(setting)
+        context = MethodContext(toy, {"all": list(toy.parameters())}, sites, options, make_anchor())
+        parts = found.start(context)
         assert parts.constrain is not None
         learning = {name: p for name, p in toy.named_parameters() if p.requires_grad}
         optimizer = torch.optim.SGD(learning.values(), lr=0.1)

@@ -18,7 +18,7 @@ from aegis_cli.core.spectrum import DENSE, second_moment
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Setting, Update
+from aegis_cli.methods.base import MethodContext, Update
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.models.backbones.hf import HFBackbone
 from aegis_cli.recipes import SITE_KINDS, Kfac
@@ -188,7 +188,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
     METHODS["kfac"].adapt(other, {}, {})
     options = asdict(Kfac(weight=weight, damping=0.0, balance=0.0, every=1))
     constrain = (
-        METHODS["kfac"].start(Setting(other, {}, other.sites(), options, measured)).constrain
+        METHODS["kfac"].start(MethodContext(other, {}, other.sites(), options, measured)).constrain
     )
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
     for parameter in (p for p in other.parameters() if p.requires_grad):
@@ -205,7 +205,9 @@ def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFB
     """A copy with every parameter moved, as far as the null-space method lets these sites go."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS, "keeps": "weights"}
-    constrain = METHODS["nullspace"].start(Setting(other, {}, sites, options, measured)).constrain
+    constrain = (
+        METHODS["nullspace"].start(MethodContext(other, {}, sites, options, measured)).constrain
+    )
     before = {name: p.detach().clone() for name, p in other.named_parameters()}
     for parameter in other.parameters():
         parameter += 0.05 * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)

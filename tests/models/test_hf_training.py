@@ -36,7 +36,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import masked_moments
 from aegis_cli.core.projection import inner
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Pass, Setting
+from aegis_cli.methods.base import MethodContext, Pass
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.families import FAMILIES
@@ -70,7 +70,7 @@ def gradients(
     measured = Anchor(image, text)
     chosen, options = METHODS[method], options_of(METHODS[method])
     chosen.adapt(backbone, backbone.language_maps(), options)
-    setting = Setting(
+    context = MethodContext(
         backbone,
         backbone.parameter_groups(),
         {},
@@ -80,7 +80,7 @@ def gradients(
         targets=policy.targets,
         actions=len(policy.action_scale.mean),
     )
-    parts = chosen.start(setting)
+    parts = chosen.start(context)
     policy.train()
     generator = torch.Generator().manual_seed(seed)
     return step.compute_gradients(
@@ -333,10 +333,10 @@ def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
     with torch.no_grad():
         seen = encode(backbone, images(3), TEXTS[:3])
     own = [masked_moments(h, seen.mask) for h in seen.hidden]
-    setting = Setting(
+    context = MethodContext(
         backbone, backbone.parameter_groups(), {}, options_of(METHODS["aegis"]), of_all_tokens(own)
     )
-    penalty = METHODS["aegis"].start(setting).penalty
+    penalty = METHODS["aegis"].start(context).penalty
     assert penalty is not None
     _, w2 = penalty(Pass(0, None, seen.hidden, seen.mask, seen.image))
     size = torch.stack([m.mean.square().sum() + m.var.sum() for m in own])

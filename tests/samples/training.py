@@ -18,7 +18,7 @@ from aegis_cli.core.moments import Moments, empty
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
-from aegis_cli.methods.base import Method, Parts, Pass, Setting
+from aegis_cli.methods.base import Method, MethodContext, Parts, Pass
 from aegis_cli.models.backbones.base import Backbone, Batch
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
@@ -162,7 +162,7 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
         return -backbone.answer_log_likelihood(images(1), [text], [answer]).mean()
 
     return method.start(
-        Setting(
+        MethodContext(
             backbone,
             backbone.learning_groups(),
             sites,

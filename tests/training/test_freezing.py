@@ -32,7 +32,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Warned
 from aegis_cli.core.ledger import conflict_share
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Setting
+from aegis_cli.methods.base import MethodContext
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.hf import HFBackbone
@@ -156,7 +156,9 @@ def _with_frozen(method: str, freeze: str | Sequence[str]) -> Policy:
     freezing.adapt(chosen, backbone, options, freeze, heard()[1])
     groups = backbone.learning_groups()
     policy.parts = chosen.start(  # type: ignore[assignment]
-        Setting(backbone, groups, {}, options, make_anchor(), None, (), policy.targets_on_cpu(), 2)
+        MethodContext(
+            backbone, groups, {}, options, make_anchor(), None, (), policy.targets_on_cpu(), 2
+        )
     )
     return policy
 
@@ -432,7 +434,7 @@ def test_what_distill_shares_with_its_teacher_is_what_it_would_have_copied() -> 
         if not shares:
             backbone.requires_grad_(True)  # so that all is copied
         policy.parts = chosen.start(  # type: ignore[assignment]
-            Setting(backbone, backbone.learning_groups(), {}, options_of(chosen))
+            MethodContext(backbone, backbone.learning_groups(), {}, options_of(chosen))
         )
         freezing.adapt(chosen, backbone, options_of(chosen), ("stem", "layers.0"), heard()[1])
         with torch.no_grad():

@@ -23,7 +23,7 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core.anchor import Anchor as CoreAnchor
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Pass, Setting
+from aegis_cli.methods.base import MethodContext, Pass
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
@@ -132,7 +132,7 @@ def test_a_copy_that_teaches_is_rounded_like_its_student(hf_backbone: Loaded) ->
     method.adapt(backbone, backbone.language_maps(), options_of(method))
     masters = Masters.of(own)
     groups = backbone.parameter_groups()
-    parts = method.start(Setting(backbone, groups, {}, options_of(method)))
+    parts = method.start(MethodContext(backbone, groups, {}, options_of(method)))
     assert parts.auxiliary is not None
     with masters.rounded():
         inputs = backbone.prepare(images(2), TEXTS[:2])
@@ -201,8 +201,8 @@ def test_kfac_without_a_penalty_is_adamw_on_the_masters_bit_for_bit(hf_backbone:
     wanted = by_hand(copy.deepcopy(policy), batch, steps=3)
 
     masters = Masters.of(own)
-    setting = Setting(backbone, backbone.parameter_groups(), {}, options, CoreAnchor())
-    parts = method.start(setting)
+    context = MethodContext(backbone, backbone.parameter_groups(), {}, options, CoreAnchor())
+    parts = method.start(context)
     learning = {name: p for name, p in policy.named_parameters() if p.requires_grad}
     optimizer = torch.optim.AdamW(learning.values(), lr=1e-3, fused=True)
     stepper = Stepper(backbone, parts)

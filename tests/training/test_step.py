@@ -27,7 +27,7 @@ from aegis_cli.core import projection
 from aegis_cli.core.moments import Moments, batch_moments
 from aegis_cli.core.transport import WEIGHTINGS, layer_weights, transport_penalty
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Method, Parts, Setting, train_all
+from aegis_cli.methods.base import Method, MethodContext, Parts, train_all
 from aegis_cli.models.policy import Policy
 
 NAIVE, AEGIS = METHODS["naive"], METHODS["aegis"]
@@ -234,8 +234,8 @@ def test_any_combination_is_a_line() -> None:
     def weigh(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
         return torch.ones_like(tt), torch.full_like(tt, 0.1)
 
-    def started(setting: Setting) -> Parts:
-        return replace(AEGIS.start(replace(setting, options=options_of(AEGIS))), combine=weigh)
+    def started(context: MethodContext) -> Parts:
+        return replace(AEGIS.start(replace(context, options=options_of(AEGIS))), combine=weigh)
 
     method = Method("penalty", "", train_all, start=started)
     gradients(adapt(method, policy, of_all_tokens(anchor)), method)

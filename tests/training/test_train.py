@@ -34,7 +34,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods import METHODS
-from aegis_cli.methods.base import Parts, Setting
+from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
@@ -304,8 +304,8 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
     chosen = "layers.0.up.weight"
     for share in (1.0, 0.0):
 
-        def begin(setting: Setting, share: float = share) -> Parts:
-            return Parts(shares=lambda: {setting.learning()[chosen]: share})
+        def begin(context: MethodContext, share: float = share) -> Parts:
+            return Parts(shares=lambda: {context.learning()[chosen]: share})
 
         monkeypatch.setitem(METHODS, "naive", replace(METHODS["naive"], start=begin))
         start("naive", tmp_path / str(share))
