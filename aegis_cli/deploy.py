@@ -235,7 +235,14 @@ class DeployedPolicy:
                 f"({self.actions},): {', '.join(self.action_names)}",
                 "give one action; a chunk has one a row",
             )
-        return {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
+        found = {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
+        if len(found) < len(action):
+            raise AegisError(
+                f"a policy with several actions of one name among {', '.join(self.action_names)}",
+                "a name of its own for each number",
+                "name the numbers in your program, in the demonstrations' order",
+            )
+        return found
 
     @devices.cpu_by_default()
     def predict(self, seen: Seen, continued: Continued | None = None) -> np.ndarray:

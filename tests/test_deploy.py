@@ -390,6 +390,9 @@ def test_an_action_has_the_names_that_a_robot_takes() -> None:
         own.named(np.zeros((4, 2)))
     with pytest.raises(AegisError, match="names of its actions"):
         deployed().named(np.zeros(2))
+    alike = deployed(recorded=NAMES | {"action_names": ["waist", "waist"]})
+    with pytest.raises(AegisError, match="several actions of one name"):
+        alike.named(np.zeros(2))
 
 
 @pytest.mark.parametrize(
@@ -400,7 +403,7 @@ def test_an_action_has_the_names_that_a_robot_takes() -> None:
         (({"top": frame()}, TEXT), "the positions (none)"),
         ((motors(),), "no instruction"),
         ((motors() | {"b.pos": math.nan}, TEXT), "not finite"),
-        ((motors() | {"wrist": frame()}, TEXT), "the cameras top, wrist"),
+        ((motors() | {"wrist": frame(), "elbow.pos": 1.0}, TEXT), "the positions"),
         ((motors() | {"top": frame()[0]}, TEXT), "a picture of shape (64, 3)"),
         ((lemotors() | {"observation.state": POSITIONS[:2]},), "positions of shape (2,)"),
         ((lemotors() | {"task": "go to the xylophone"},), "xylophone"),

@@ -87,6 +87,14 @@ def places(
             f"actions that say which positions to take: {', '.join(positions)}",
             "name what stays absolute in train.relative_exclude, or delete train.relative_actions",
         )
+    twice = [name for name in moved if moved.count(name) > 1 or positions.count(name) > 1]
+    if twice:
+        raise AegisError(
+            f"train.relative_actions: true, and several actions or positions named '{twice[0]}'",
+            "names that say which position an action is relative to",
+            "give each its own name in the feature's names in info.json, or delete "
+            "train.relative_actions",
+        )
     return tuple(
         None if stay else positions.index(name) for name, stay in zip(actions, stays, strict=True)
     )

@@ -156,7 +156,7 @@ def run(
     told = {"target": target, **settings, "anchor": None if anchor is None else str(anchor)}
     report = replace(report, asked=told)
     _warn_of_little_knowledge(report, target if baseline is None else baseline, on_event)
-    warn_of_few_questions(report, max_drop, on_event)
+    warn_of_few_questions(report.questions, report.drop_interval, max_drop, "probe", on_event)
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
         files.write_text(predictions, "".join(lines))
@@ -227,23 +227,29 @@ def _warn_of_little_knowledge(report: ProbeReport, model: str, on_event: OnEvent
     on_event(Warned("probe", text))
 
 
-def warn_of_few_questions(report: ProbeReport, max_drop: float | None, on_event: OnEvent) -> None:
+def warn_of_few_questions(
+    questions: int,
+    drop_interval: tuple[float, float] | None,
+    max_drop: float | None,
+    stage: str,
+    on_event: OnEvent,
+) -> None:
     """Warn where the questions tell the drop less finely than its gate asks, and chance decides.
 
     A drop that is far past the gate is settled by few. None of 0 points can be told by any number.
     """
-    if not max_drop or report.drop_interval is None:
+    if not max_drop or drop_interval is None:
         return
-    low, high = report.drop_interval
+    low, high = drop_interval
     apart = (high - low) / 2
     if apart <= max_drop or not low <= max_drop <= high:
         return
     text = (
-        f"{report.questions:,} questions tell the drop to ±{apart:.2f} points, too coarsely for a "
+        f"{questions:,} questions tell the drop to ±{apart:.2f} points, too coarsely for a "
         f"gate at {max_drop:g}: whether it passes is up to chance, or to how few they are. Ask "
         "more (--questions, probe.questions of a recipe), or allow a larger drop"
     )
-    on_event(Warned("probe", text))
+    on_event(Warned(stage, text))
 
 
 def _warn_of_another_start(

@@ -135,6 +135,11 @@ def _run(
         judge = _Judge(source, settings, on_event)
         tried = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
         chosen = _weakest(tried.points, max_drop, gate)
+        # The one that passes, or the strongest, which comes nearest to it.
+        judged_by = next((p for p in tried.points if p.strength == chosen), tried.points[-1])
+        probe.warn_of_few_questions(
+            tried.questions, judged_by.drop_interval, max_drop, "merge", on_event
+        )
         if chosen == 0:
             said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
             on_event(Warned("merge", said))

@@ -87,43 +87,48 @@ class Reader:
 
     def _seen(self, message: Mapping[Any, Any]) -> Observation:
         """The pictures, the instruction and the positions of a message."""
-        if STATE not in message and observation.is_one(message, self._policy.state_names):
+        policy = self._policy
+        if STATE not in message and observation.is_one(message, policy.state_names, policy.state):
             return self._lerobots(message)
+        sent = ", ".join(sorted(map(str, message))) or "nothing"
         if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
             message = {next(iter(self.images)): message[IMAGE], **message}  # its own key wins
-        wanted = [*self.images, STATE, *([PROMPT] if self._prompt is None else [])]
-        missing = [key for key in wanted if key not in message]
-        if missing:
-            has = ", ".join(sorted(map(str, message))) or "nothing"
-            raise self._wrong(f"no '{missing[0]}' in an observation with {has}")
+        text = self._text(message)
+        missing = [key for key in (*self.images, STATE) if key not in message]
+        if text is None:
+            missing.append(PROMPT)
+        if missing or text is None:
+            raise self._wrong(f"no '{missing[0]}' in an observation with {sent}")
         named = {name: self._array(key, message[key]) for key, name in self.images.items()}
         pictures = named if len(named) > 1 else next(iter(named.values()))
-        return Observation(pictures, self._text(message), self._positions(message[STATE]))
+        return Observation(pictures, text, self._positions(message[STATE]))
 
     def _lerobots(self, message: Mapping[Any, Any]) -> Observation:
         """The observation of a message with LeRobot's keys, or with the motors' names."""
         policy = self._policy
-        seen = observation.read(message, policy.cameras, policy.state_names, policy.state)
-        if seen.task is None and PROMPT not in message and self._prompt is None:
+        robots = {key: value for key, value in message.items() if key != PROMPT}
+        seen = observation.read(robots, policy.cameras, policy.state_names, policy.state)
+        text = self._text(message) if seen.task is None else seen.task
+        if text is None:
             raise AegisError(
                 f"no instruction in an observation of {', '.join(map(str, message))}",
                 f"a text at '{observation.TASK}' or '{PROMPT}'",
                 "send one, or give aegis serve --prompt",
             )
-        text = self._text(message if seen.task is None else {PROMPT: seen.task})
         return Observation(seen.pictures, text, self._finite("positions", seen.positions))
 
-    def _text(self, message: Mapping[Any, Any]) -> str:
-        text = message.get(PROMPT, self._prompt)
-        if not isinstance(text, str):
+    def _text(self, message: Mapping[Any, Any]) -> str | None:
+        """The message's instruction, or the server's where it has none or a blank one."""
+        text = message.get(PROMPT)
+        if text is not None and not isinstance(text, str):
             raise self._wrong(f"'{PROMPT}' is {type(text).__name__}")
-        return text
+        return text if text and text.strip() else self._prompt
 
     def _positions(self, state: Any) -> np.ndarray:
         return self._finite(f"'{STATE}'", self._array(STATE, state))
 
     def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
-        if found.dtype.kind not in "iuf":
+        if found.dtype.kind not in "biuf":
             raise self._wrong(f"{what} of type {found.dtype}, which is no number's")
         if not np.isfinite(found).all():
             raise AegisError(

@@ -654,7 +654,9 @@ class PolicyRunner:
             after, before, layers, settings.max_drop, asked.skipped, between, settings.gate
         )
         probe.check_trained(report, recipe.train.steps)
-        probe.warn_of_few_questions(report, settings.max_drop, on_event)
+        probe.warn_of_few_questions(
+            report.questions, report.drop_interval, settings.max_drop, "probe", on_event
+        )
         wrong = {"wrong": wrong_answers.examples(after, asked, image_size)}
         return report, probe.by_image(after, before, asked.names) | wrong
 

@@ -59,6 +59,8 @@ def test_nameless_actions_belong_to_positions_by_their_order() -> None:
         (("x", "y"), (), (), "not all of which have names"),
         (("x", "dy"), ("x", "y"), (), "no position is named dy"),
         (("x", "y"), ("x", "y"), ("hand",), "'hand', which no action's name has"),
+        (("x", "x"), ("x", "y"), (), "several actions or positions named 'x'"),
+        (("x", "y"), ("x", "x"), ("y",), "several actions or positions named 'x'"),
     ],
 )
 def test_what_belongs_to_no_position_is_refused(

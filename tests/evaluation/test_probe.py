@@ -309,7 +309,9 @@ def test_a_gate_that_the_questions_cannot_tell_is_warned_of(
 ) -> None:
     report = probe.compare(graded(after), graded(before), [], max_drop, gate=gate)
     seen: list[Event] = []
-    probe.warn_of_few_questions(report, max_drop, seen.append)
+    probe.warn_of_few_questions(
+        report.questions, report.drop_interval, max_drop, "probe", seen.append
+    )
     assert bool(seen) is warns
     if seen:
         (warned,) = seen

@@ -170,6 +170,39 @@ def test_other_pictures_are_refused_with_the_names_of_training(plugin: Any) -> N
         plugin.AegisPolicy(config(plugin, model, WRIST), model=model, meta=meta)
 
 
+# --- scales ---------------------------------------------------------------------------------------
+
+STILL = {  # the third number never moved; LeRobot then says a deviation of 0, or of rounding
+    "action": {
+        "mean": [0.5, -1.0, 0.25],
+        "std": [0.2, 1e-4, 1e-9],
+        "min": [0.0, -1.001, 0.25],
+        "max": [1.0, -0.999, 0.25],
+        "q01": [0.1, -1.0, 0.25],  # the second one closes in less than one frame of a hundred
+        "q99": [0.9, -1.0, 0.25],
+    }
+}
+
+
+@pytest.mark.parametrize("normalization", ["mean_std", "quantiles"])
+def test_an_action_that_never_moved_is_not_predicted_as_noise(
+    plugin: Any, normalization: str
+) -> None:
+    """As in `aegis train`: a scale of 0 gives its one value, whatever is predicted."""
+    scale = plugin._scale(STILL, "action", normalization)
+    assert (scale.std == 0).tolist() == [False, False, True]
+    predicted = scale.invert(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)))
+    assert (predicted[:, 2] == 0.25).all() and predicted[:, 1].std() > 0
+    assert plugin._spread(STILL, "action").tolist() == [0.2, 1e-4, 0.0]
+
+
+def test_statistics_without_extremes_say_of_nothing_that_it_never_moved(plugin: Any) -> None:
+    told = {name: STILL["action"][name] for name in ("mean", "std")}
+    scale = plugin._scale({"action": told}, "action", "mean_std")
+    assert (scale.std != 0).all()
+    assert plugin._spread({"action": {"mean": [0.0]}}, "action") is None
+
+
 # --- acting ---------------------------------------------------------------------------------------
 
 TEXT, OTHER = "go to the red target", "go to the blue target"

@@ -81,6 +81,34 @@ def test_a_missing_key_is_named_with_those_that_are_there(missing: str) -> None:
     assert all(f"'{key}'" in caught.value.expected for key in several())
 
 
+@pytest.mark.parametrize("blank", ["", "  ", None])
+def test_a_blank_prompt_is_none(blank: str | None) -> None:
+    """The server's own stands in for it, where there is one."""
+    policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
+    for seen in (several(), LEROBOTS | {"task": ""}, ROBOTS):
+        assert Reader(policy, "hold").read(seen | {"prompt": blank}).prompt == "hold"
+        with pytest.raises(AegisError, match="no 'prompt'|no instruction"):
+            Reader(policy).read(seen | {"prompt": blank})
+
+
+def test_the_error_of_a_missing_key_names_what_was_sent() -> None:
+    seen = observation() | {"prompt": ""}
+    with pytest.raises(AegisError) as caught:
+        Reader(deployed(cameras=("top",))).read(seen)
+    assert "with observation/image, observation/state, prompt" in caught.value.found
+
+
+def test_a_frame_of_features_that_the_policy_names_is_read() -> None:
+    """As of LIBERO's datasets, whose names do not begin as LeRobot's do."""
+    cameras = ("image", "wrist_image")
+    recorded = {"state": ["state"]}
+    policy = DeployedPolicy(make_policy().eval(), None, cameras, 2, recorded=recorded)
+    pictures = dict(zip(cameras, (several()["observation/top"], several()["observation/wrist"])))
+    frame = pictures | {"state": [1, 2, 3], "task": TEXT}
+    found = Reader(policy).read(frame)
+    assert list(found.pictures) == list(cameras) and found.state.tolist() == [1, 2, 3]
+
+
 def test_other_keys_are_ignored() -> None:
     seen = observation() | {"observation/wrist_image": 1, "extra": None}
     assert Reader(deployed()).read(seen).prompt == TEXT

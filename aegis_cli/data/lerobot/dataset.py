@@ -109,7 +109,8 @@ class Dataset:
                 "the features with the robot's positions and with its actions",
                 "name them: --set demos.state=NAME, --set demos.action=NAME",
             )
-        if len(found.shape) != 1 or not found.dtype.startswith(("float", "int", "uint")):
+        numeric = found.dtype.startswith(("float", "int", "uint", "bool"))
+        if len(found.shape) != 1 or not numeric:
             shape = " x ".join(map(str, found.shape))
             what = f"'{feature}' in '{self.folder}' is {found.dtype} of shape {shape}"
             raise AegisError(
@@ -120,20 +121,40 @@ class Dataset:
     def names(self, features: Sequence[str]) -> tuple[str, ...]:
         """What the numbers of features side by side are called; empty where one has no names.
 
+        Where two features use one name, as those of two arms do, all but LeRobot's own features of
+        state and action put theirs before it: `left_arm.gripper`.
+
         Raises:
-            AegisError: two of them would be called alike.
+            AegisError: a renaming would give two of them one name.
         """
         named = [self.info.features[self.own(feature)].components for feature in features]
         if not all(map(any, named)):
             return ()
-        return renaming.joints(self.rename, tuple(itertools.chain(*named)), f"'{self.folder}'")
+        where = f"'{self.folder}'"
+        own = [renaming.joints(self.rename, components, where) for components in named]
+        alone = tuple(itertools.chain(*own))
+        if len({*alone}) == len(alone) or len(own) == 1:
+            renaming.check_apart(self.rename, tuple(itertools.chain(*named)), alone, where)
+            return alone
+        within = [_within(*pair) for pair in zip(features, own, strict=True)]
+        return renaming.joints(self.rename, tuple(itertools.chain(*within)), where)
 
     @property
     def all_names(self) -> set[str]:
         """The dataset's own names of its features, its cameras in short, and its numbers."""
         features = self.info.features
-        numbers = (f.components for name, f in features.items() if name not in self.info.cameras)
-        return {*features, *map(layout.short, self.info.cameras), *itertools.chain(*numbers)}
+        numbers = {name: f for name, f in features.items() if name not in self.info.cameras}
+        plain = itertools.chain(*(f.components for f in numbers.values()))
+        within = itertools.chain(*(_within(name, f.components) for name, f in numbers.items()))
+        return {*features, *map(layout.short, self.info.cameras), *plain, *within}
+
+
+def _within(feature: str, components: Sequence[str]) -> tuple[str, ...]:
+    """The names of a feature's numbers with the feature's before them, except of LeRobot's own."""
+    if feature in (layout.STATE, layout.ACTION):
+        return tuple(components)
+    short = feature.removeprefix("observation.").removeprefix("action.")
+    return tuple(f"{short}.{name}" if name else name for name in components)
 
 
 def _list(cameras: tuple[str, ...]) -> str:

@@ -9,6 +9,7 @@ deleting it costs the decoding.
 
 from __future__ import annotations
 
+import bisect
 import hashlib
 import math
 import mmap
@@ -30,6 +31,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped, worker_count
 from aegis_cli.data.lerobot import layout, pictures, video
+from aegis_cli.data.lerobot.dataset import Dataset
 from aegis_cli.data.lerobot.rows import Index
 from aegis_cli.data.lerobot.source import DataFile, Source
 
@@ -242,12 +244,14 @@ def _video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPar
     """Episodes that follow each other, also in one file, are read in one go."""
     dataset = source.dataset
     tolerance = 0.5 / dataset.info.fps
+    ends = _clip_ends(dataset, camera)
     starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)]).tolist()
     first, path = 0, Path()
     times: list[float] = []
     for number in source.episodes:
         frame, clip = starts[number], dataset.episodes[number].clips[camera]
         own = clip.start_s + index.timestamp[frame : starts[number + 1]]
+        _check_within_clip(own, ends[number], number, source, camera)
         goes_on = clip.file == path and frame == first + len(times)
         if times and (not goes_on or own[0] <= times[-1] or len(times) >= _PART):
             yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
@@ -256,6 +260,45 @@ def _video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPar
             first, path = frame, clip.file
         times += own.tolist()
     yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
+
+
+def _clip_ends(dataset: Dataset, camera: str) -> list[float]:
+    """Where the clip of each episode ends in its file, in seconds: the next begins there at last.
+
+    Infinity for the last one of a file of which the meta folder does not tell the end.
+    """
+    clips = [episode.clips[camera] for episode in dataset.episodes]
+    begun: dict[Path, list[float]] = {}
+    for clip in clips:
+        begun.setdefault(clip.file, []).append(clip.start_s)
+    for times in begun.values():
+        times.sort()
+    ends = []
+    for clip in clips:
+        times = begun[clip.file]
+        later = bisect.bisect_right(times, clip.start_s)
+        ends.append(min(clip.end_s, times[later] if later < len(times) else math.inf))
+    return ends
+
+
+def _check_within_clip(
+    times: np.ndarray, end_s: float, number: int, source: Source, camera: str
+) -> None:
+    """Raise AegisError where an episode's times in its file [L] are nearest to another's frames.
+
+    So they are where its timestamps have a gap, or the camera has lost frames.
+    """
+    last_s = end_s - 0.5 / source.dataset.info.fps
+    past = int((times > last_s).sum())
+    if past:
+        whose = "1 frame" if past == 1 else f"{past} frames"
+        raise AegisError(
+            f"{whose} of episode {number} in '{source.dataset.folder}' whose timestamps are past "
+            f"the end of its video of '{layout.short(camera)}', where another episode's begins",
+            "timestamps that begin at 0 and have no gap that the video has not",
+            f"mend that episode's timestamps, or leave it out: --only (demos.only; of aegis "
+            f"evaluate --episodes) without {number}",
+        )
 
 
 def _write(

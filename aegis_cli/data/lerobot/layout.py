@@ -131,10 +131,14 @@ class Info:
 
 @dataclass(frozen=True)
 class Clip:
-    """The video file that an episode is in, and where it begins there, in seconds."""
+    """The video file that an episode is in, and where it begins and ends there, in seconds.
+
+    The end is infinity where the meta folder does not tell it.
+    """
 
     file: Path
     start_s: float
+    end_s: float = math.inf
 
 
 @dataclass(frozen=True)

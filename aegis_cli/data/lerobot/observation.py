@@ -42,11 +42,16 @@ class Observed:
     task: str | None
 
 
-def is_one(mapping: Mapping[Any, Any], state_names: Sequence[str] | None) -> bool:
-    """Whether a mapping has a key of LeRobot's observation, or that of a motor."""
+def is_one(
+    mapping: Mapping[Any, Any],
+    state_names: Sequence[str] | None,
+    state: Sequence[str] = (layout.STATE,),
+) -> bool:
+    """Whether a mapping has a key of LeRobot's observation, that of a motor, or all of `state`."""
     motors = state_names or ()
-    keys = (key for key in mapping if isinstance(key, str))
-    return any(key.startswith(_OBSERVED) or key in motors for key in keys)
+    keys = [key for key in mapping if isinstance(key, str)]
+    named = any(key.startswith(_OBSERVED) or key in motors for key in keys)
+    return named or all(name in keys for name in state)
 
 
 def read(
@@ -57,8 +62,8 @@ def read(
 ) -> Observed:
     """The pictures, the positions and the task of an observation of either kind.
 
-    Other texts than the task are ignored, and of LeRobot's observation every key that is no
-    picture, such as `action` or `timestamp` of a dataset's frame.
+    Pictures of further cameras and other texts than the task are ignored, and of LeRobot's
+    observation every key that is no picture, such as `action` or `timestamp` of a dataset's frame.
 
     Args:
         cameras: the policy's, in its order; empty for one picture of any name.
@@ -75,6 +80,7 @@ def read(
         parts = [_unbatched(_array(observation[name]), 1) for name in read_from]
         positions = parts[0] if len(parts) == 1 else np.concatenate([p.reshape(-1) for p in parts])
         shown = {name: v for name, v in observation.items() if _is_picture(name, cameras)}
+        shown = _known(shown, cameras)
         _check(shown, cameras, [layout.STATE], [layout.STATE])
     else:
         if state_names is None:
@@ -87,6 +93,7 @@ def read(
             )
         kinds = {name: _dimensions(value) for name, value in observation.items()}
         shown = {name: observation[name] for name, count in kinds.items() if count > 1}
+        shown = _known(shown, cameras)
         told = [name for name, count in kinds.items() if 0 <= count < 2 and name != TASK]
         _check(shown, cameras, told, state_names)
         positions = np.array([_number(name, observation[name]) for name in state_names], np.float32)
@@ -124,6 +131,13 @@ def picture(name: str, given: Any) -> np.ndarray:
 def _is_picture(name: str, cameras: Sequence[str]) -> bool:
     """Whether a key of LeRobot's observation is that of a picture."""
     return name.startswith(_PICTURES) or name in cameras
+
+
+def _known(shown: dict[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
+    """The pictures of the policy's cameras where all are there, which a robot may have more of."""
+    wanted = {layout.short(name) for name in cameras}
+    known = {name: value for name, value in shown.items() if layout.short(name) in wanted}
+    return known if wanted and wanted <= {*map(layout.short, known)} else shown
 
 
 def _array(given: Any) -> np.ndarray:

@@ -83,4 +83,6 @@ def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
     start_s = float(row[f"videos/{key}/from_timestamp"])
     if not math.isfinite(start_s):
         raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
-    return Clip(path, start_s)
+    end_s = row.get(f"videos/{key}/to_timestamp")
+    told = isinstance(end_s, int | float) and math.isfinite(end_s) and end_s > start_s
+    return Clip(path, start_s, float(end_s) if told else math.inf)

@@ -121,6 +121,7 @@ class Listed:
             by_image.setdefault(entry.picture.key, []).append(entry)
         mine = [key for key in by_image if self.holds(part, key)]
         mine.sort(key=lambda key: _digest(f"{seed} {key}"))
+        most = min(questions, sum(len(by_image[key]) for key in mine))
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
@@ -130,7 +131,7 @@ class Listed:
             if sound:
                 kept.append(sound)
                 count += len(sound)
-                on_event(Progress("questions", count, questions, "questions"))
+                on_event(Progress("questions", count, most, "questions"))
             if count == questions:
                 break
         if not kept:

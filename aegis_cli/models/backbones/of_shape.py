@@ -139,5 +139,5 @@ class _Words:
     def convert_ids_to_tokens(self, token: int) -> str:
         return _MARKER if token == _IMAGE else str(token)
 
-    def batch_decode(self, ids: torch.Tensor, **_: Any) -> list[str]:
-        return [" ".join(map(str, row)) for row in ids.tolist()]
+    def batch_decode(self, ids: Sequence[Sequence[int]], **_: Any) -> list[str]:
+        return [" ".join(map(str, row)) for row in ids]

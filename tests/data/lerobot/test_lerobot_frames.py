@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import sys
@@ -14,14 +15,18 @@ import pytest
 from numpy.lib import format as npy
 from PIL import Image
 from pyarrow import parquet
-from samples.lerobot import episodes, frames, read, save
+from samples.lerobot import edit_table, episodes, frames, read, replaced, save
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import GREY
 from aegis_cli.data.lerobot import dataset, rows, source, video
 from aegis_cli.data.lerobot import frames as camera_frames
+from aegis_cli.data.lerobot.write import NewEpisode
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
+
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+DATA = "data/chunk-000/file-000.parquet"
 
 # --- video ---------------------------------------------------------------------------------------
 
@@ -110,8 +115,72 @@ def test_the_tolerance_is_half_a_frame(shift: float, fine: bool, tmp_path: Path)
     if fine:
         np.testing.assert_allclose(read(folder).mean((1, 2)), frames(made).mean((1, 2)), atol=12)
         return
+    with pytest.raises(AegisError, match="1 frame of episode 0 .* past the end of its video"):
+        read(folder)
+    table = parquet.read_table(path)
+    end = "videos/observation.images.top/to_timestamp"
+    parquet.write_table(table.drop_columns([end]), path)  # as where nobody tells the end
     with pytest.raises(AegisError, match=r"no frame at 0\.460 s"):
         read(folder)
+
+
+@pytest.mark.parametrize(
+    ("what", "past"),
+    [("a gap", 10), ("a late begin", 2), ("lost frames", 2), ("a slow clock", 1), (None, 0)],
+)
+def test_no_episode_has_pictures_of_another_one(
+    what: str | None, past: int, tmp_path: Path
+) -> None:
+    """The episodes' videos lie in one file, one after the other."""
+    made = [whole(number) for number in range(3)]
+    folder = save(tmp_path / "d", made, as_video=True)
+    times = np.arange(20) / 10
+    if what == "a gap":
+        times[10:] += 1.0
+    elif what == "a late begin":
+        times += 0.2
+    elif what == "a slow clock":
+        times *= 1.05
+    elif what == "lost frames":
+        edit_table(folder / EPISODES, lambda table: ending(table, 1, -0.2))
+    edit_table(folder / DATA, lambda table: timed(table, 1, times))
+    if what is None:
+        np.testing.assert_allclose(read(folder).mean((1, 2)), frames(made).mean((1, 2)), atol=12)
+        return
+    said = "1 frame" if past == 1 else f"{past} frames"
+    with pytest.raises(AegisError, match=f"{said} of episode 1 .* another episode's begins"):
+        read(folder)
+    found = source.find(dataset.load(folder))
+    with pytest.raises(AegisError, match="another episode's begins"):
+        list(camera_frames.pick(found, rows.read_index(found), "observation.images.top", [0]))
+    found = source.find(dataset.load(folder), [0, 2])  # without it
+    assert list(camera_frames.split(found, rows.read_index(found), "observation.images.top"))
+
+
+def whole(number: int) -> NewEpisode:
+    """An episode of 20 frames, all of a colour that says which it is."""
+    (plain,) = episodes(1, size=(16, 16), smooth=True, seed=number)
+    return dataclasses.replace(
+        plain,
+        frames={"top": np.full((20, 16, 16, 3), 40 + 80 * number, np.uint8)},
+        state=np.resize(plain.state, (20, plain.state.shape[1])),
+        actions=np.resize(plain.actions, (20, plain.actions.shape[1])),
+    )
+
+
+def ending(table: pa.Table, episode: int, later_s: float) -> pa.Table:
+    """The same episodes, of which one's video ends later."""
+    name = "videos/observation.images.top/to_timestamp"
+    ends = table[name].to_pylist()
+    ends[episode] += later_s
+    return replaced(table, name, pa.array(ends))
+
+
+def timed(table: pa.Table, episode: int, times: np.ndarray) -> pa.Table:
+    """The same frames, those of one episode at these times."""
+    own = np.array(table["timestamp"].to_pylist(), np.float32)
+    own[np.array(table["episode_index"].to_pylist()) == episode] = times
+    return replaced(table, "timestamp", pa.array(own))
 
 
 # --- sizes ---------------------------------------------------------------------------------------

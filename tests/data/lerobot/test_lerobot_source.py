@@ -289,6 +289,61 @@ def test_several_features_are_joined_in_their_order(folder: Path) -> None:
     assert found.proprio_names == ("dx", "dy", "x", "y", "z")
 
 
+def arms(folder: Path, names: dict[str, str]) -> None:
+    """State and action twice, once for each arm, with the same names of joints."""
+    for path in data_files(folder):
+
+        def doubled(table: pa.Table) -> pa.Table:
+            for old, new in names.items():
+                table = table.append_column(new, table[old])
+            return table
+
+        edit_table(path, doubled)
+    edit_info(
+        folder,
+        lambda info: info["features"].update(
+            {new: info["features"][old] for old, new in names.items()}
+        ),
+    )
+
+
+def test_joints_of_one_name_in_several_features_are_told_apart(folder: Path) -> None:
+    """Each arm's actions are relative to that arm's positions."""
+    edit_info(folder, lambda info: info["features"]["action"].update(names=["x", "y"]))
+    arms(folder, {"observation.state": "observation.left", "action": "action.left"})
+    arms(folder, {"observation.state": "observation.right", "action": "action.right"})
+    state, action = ("observation.left", "observation.right"), ("action.left", "action.right")
+    found = loaded(folder, selection=Selection(state=state, action=action))
+    assert found.proprio_names == ("left.x", "left.y", "left.z", "right.x", "right.y", "right.z")
+    assert found.action_names == ("left.x", "left.y", "right.x", "right.y")
+    assert found.relative_places(()) == (0, 1, 3, 4)
+    # LeRobot's own features keep their names: what is beside them is something else of the joints.
+    found = loaded(folder, selection=Selection(state=("observation.left", "observation.state")))
+    assert found.proprio_names == ("left.x", "left.y", "left.z", "x", "y", "z")
+    assert found.relative_places(()) == (3, 4)
+    rename = (("left.x", "near.x"),)
+    found = loaded(folder, selection=Selection(state=state, action=action, rename=rename))
+    assert found.action_names == ("near.x", "left.y", "right.x", "right.y")
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_gripper_that_is_open_or_not_is_a_number(folder: Path, listed: bool) -> None:
+    for path in data_files(folder):
+
+        def gripper(table: pa.Table) -> pa.Table:
+            own = [row % 3 == 0 for row in range(len(table))]
+            cells = pa.array([[x] for x in own] if listed else own)
+            return table.append_column("observation.gripper", cells)
+
+        edit_table(path, gripper)
+    said = {"dtype": "bool", "shape": [1], "names": ["gripper"]}
+    edit_info(folder, lambda info: info["features"].update({"observation.gripper": said}))
+    state = ("observation.state", "observation.gripper")
+    found = loaded(folder, selection=Selection(state=state))
+    assert found.proprio_names == ("x", "y", "z", "gripper")
+    assert set(found.tensors["proprio"][:, 3].tolist()) == {0.0, 1.0}
+
+
 def nameless(folder: Path, feature: str) -> None:
     edit_info(folder, lambda info: info["features"][feature].update(names=None))
 

@@ -92,6 +92,13 @@ def test_the_only_picture_of_a_policy_without_names_may_have_any(key: str) -> No
     np.testing.assert_array_equal(found.pictures, TOP)
 
 
+@pytest.mark.parametrize("given", [robots(side=TOP), lerobots(**{"observation.images.side": TOP})])
+def test_a_robot_may_have_more_cameras_than_the_policy(given: dict[str, Any]) -> None:
+    found = observation.read(given, ("top", "wrist"), JOINTS)
+    assert sorted(found.pictures) == ["top", "wrist"]
+    assert np.array_equal(found.pictures["top"], observation.picture("top", TOP))
+
+
 def without(given: dict[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in given.items() if name not in names}
 
@@ -101,13 +108,12 @@ def without(given: dict[str, Any], *names: str) -> dict[str, Any]:
     [
         (without(robots(), "wrist"), "add wrist"),
         (without(robots(), "lift.pos", "top"), "add top, lift.pos"),
-        (robots(side=TOP), "leave out or rename side"),
         (robots(**{"elbow.pos": 1.0}), "leave out or rename elbow.pos"),
         (
             without(robots(**{"lift": 1.0}), "lift.pos"),
             "add lift.pos; leave out or rename lift",
         ),
-        (lerobots(**{"observation.images.side": TOP}), "leave out or rename side"),
+        (without(robots(side=TOP), "top"), "add top; leave out or rename side"),
         (without(lerobots(), "observation.images.top"), "add top"),
         (lerobots(top=TOP), "give each camera once"),
     ],

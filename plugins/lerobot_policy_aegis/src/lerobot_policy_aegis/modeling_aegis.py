@@ -20,7 +20,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
-from aegis_cli.data.batch import Images, Normalizer, RobotBatch
+from aegis_cli.data.batch import Images, Normalizer, RobotBatch, least_spread
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy, check_actions
@@ -66,6 +66,8 @@ class AegisPolicy(PreTrainedPolicy):
         self.config: AegisConfig = config
         self.model = model or _new(config, dataset_stats)
         self._meta = dict(meta or {"task": None, "normalization": config.normalization})
+        if model is None and (spread := _spread(dataset_stats, ACTION)) is not None:
+            self._meta["action_std"] = spread.tolist()
         self._cameras = self._in_order()
         if model is None and self.model.backbone.image_size is None:
             features = config.image_features
@@ -450,10 +452,32 @@ def _scale(statistics: Statistics, name: str, normalization: str) -> Normalizer:
             f"those that normalization {normalization} needs",
             "--policy.normalization=mean_std, or compute the dataset's statistics anew",
         )
-    first, second = (torch.as_tensor(np.asarray(values)).double().flatten() for values in found)
-    if normalization == "mean_std":
-        return Normalizer.scaled(first, second)
-    return Normalizer.scaled((first + second) / 2, (second - first) / 2)
+    first, second = map(_numbers, found)
+    middle, scale = first, second
+    if normalization != "mean_std":
+        middle, scale = (first + second) / 2, (second - first) / 2
+    return Normalizer.scaled(middle, scale, _never_varies(statistics.get(name, {})))
+
+
+def _numbers(values: Any) -> Tensor:
+    return torch.as_tensor(np.asarray(values)).double().flatten()
+
+
+def _never_varies(of: Mapping[str, Any]) -> Tensor | None:
+    """Which numbers [D] of a feature have one value in the dataset; None where it does not say."""
+    if any(of.get(name) is None for name in ("min", "max", "mean")):
+        return None
+    low, high, mean = (_numbers(of[name]) for name in ("min", "max", "mean"))
+    return high - low <= least_spread(mean)
+
+
+def _spread(statistics: Statistics | None, name: str) -> Tensor | None:
+    """The standard deviations [D] of a feature, 0 where it never varies; None if not told."""
+    of = (statistics or {}).get(name, {})
+    if of.get("std") is None:
+        return None
+    spread, still = _numbers(of["std"]), _never_varies(of)
+    return spread if still is None else torch.where(still, 0.0, spread)
 
 
 def _check_sizes(config: AegisConfig, model: Policy) -> None:
