@@ -296,6 +296,14 @@ def test_what_passes_as_it_is_is_said_not_to_have_moved(
     assert "itself loses no more than 100 points: nothing is moved" in " ".join(err.split())
 
 
+def test_a_gate_that_the_questions_cannot_tell_is_warned_of(
+    aegis: Aegis, merge_place: Place, tmp_path: Path
+) -> None:
+    given = ("--method", "linear", "--sweep", "1", "--max-drop", 1, "--out", tmp_path / "merged")
+    _, _, err = aegis("merge", merge_place.run, *given, *SMALL, "--json")
+    assert "too coarsely for a gate at 1" in " ".join(err.split())
+
+
 def test_a_gate_fails_where_no_strength_passes(
     aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:
