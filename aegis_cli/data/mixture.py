@@ -246,8 +246,9 @@ def _counted(sets: int) -> str:
 
 
 def _check_each_once(paths: Sequence[Path]) -> None:
+    found = [path.resolve() for path in paths]
     for place, path in enumerate(paths):
-        if path in paths[:place]:
+        if found[place] in found[:place]:
             raise AegisError(
                 f"the demonstrations '{path}' twice",
                 "each set once",

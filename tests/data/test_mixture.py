@@ -142,6 +142,8 @@ def test_frames_that_stay_in_videos_are_joined(tmp_path: Path) -> None:
 
 def test_the_same_set_twice_is_refused(demos_file: Path) -> None:
     assert "twice" in refused((demos_file, demos_file)).found
+    again = demos_file.parent / "." / ".." / demos_file.parent.name / demos_file.name
+    assert "twice" in refused((demos_file, again)).found
 
 
 def test_episodes_are_chosen_of_one_set(demos_file: Path, tmp_path: Path) -> None:

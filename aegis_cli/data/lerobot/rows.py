@@ -48,7 +48,8 @@ def read_index(source: Source) -> Index:
         if ((task < 0) | (task >= texts)).any():
             tasks, *_ = source.dataset.table_files
             found = f"'{file.path}' has a task_index that '{tasks}' lacks"
-            raise AegisError(found, f"0 to {texts - 1}", layout.AGAIN)
+            known = f"0 to {texts - 1}" if texts else "a table with the tasks' texts"
+            raise AegisError(found, known, layout.AGAIN)
         steps.append(np.diff(time)[frame[1:] > 0])  # those between frames of one episode
         _put(index.timestamp, file, time)
         _put(index.task, file, task.astype(np.int64))

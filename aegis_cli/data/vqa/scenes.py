@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import math
+import os
 import threading
 from dataclasses import dataclass
 
@@ -267,11 +268,13 @@ _of_thread = threading.local()
 def renderer_of_thread() -> SceneRenderer:
     """The calling thread's renderer.
 
-    To make an OpenGL context takes a tenth of a second, and none can be current in two threads.
+    To make an OpenGL context takes a tenth of a second, and none can be current in two threads, or
+    be used by a process that was forked since.
     """
-    if not hasattr(_of_thread, "renderer"):
-        _of_thread.renderer = SceneRenderer()
-        atexit.register(_of_thread.renderer.close)  # while EGL is still there
+    if getattr(_of_thread, "process", None) != os.getpid():
+        renderer = SceneRenderer()
+        atexit.register(renderer.close)  # while EGL is still there
+        _of_thread.renderer, _of_thread.process = renderer, os.getpid()
     return _of_thread.renderer
 
 

@@ -172,7 +172,8 @@ class Prompter:
         found = next((marker for marker in self._markers if marker in text), None)
         if found is not None:
             raise _refused(f"{_quoted(text)} holds {found}, which stands for an image")
-        if len(text.encode()) > self._longest:  # else it has no more tokens than the model reads
+        # A text of fewer bytes has no more tokens than the model reads.
+        if len(text.encode("utf-8", "surrogatepass")) > self._longest:
             with self._processors.one() as processor:
                 own = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
             self._check_length(len(own), text)
