@@ -9,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -261,8 +262,12 @@ class _OnCpu(Mapping[str, Tensor]):
 
 
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
+    known = [
+        (re.compile(fnmatch.translate(pattern)).match, unit) for pattern, unit in units.items()
+    ]
+
     def spec(name: str, tensor: Tensor) -> TensorSpec:
-        unit = next((u for pattern, u in units.items() if fnmatch.fnmatchcase(name, pattern)), "1")
+        unit = next((unit for matches, unit in known if matches(name)), "1")
         return TensorSpec(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), unit)
 
     return {name: spec(name, tensor) for name, tensor in tensors.items()}
