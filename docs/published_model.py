@@ -267,7 +267,7 @@ def _leave_maps_alone_learning(model: nn.Module) -> None:
 
 
 @dataclass(frozen=True)
-class MethodContext:
+class Setting:
     """How a run trains."""
 
     method: str
@@ -281,51 +281,51 @@ class MethodContext:
         return f"{self.method}_{self.rate:g}_{self.seed}"
 
 
-def train(context: MethodContext, folder: Path) -> dict[str, float]:
+def train(setting: Setting, folder: Path) -> dict[str, float]:
     """Train one policy, and measure what it knows and how well it acts."""
-    torch.manual_seed(context.seed)
-    model, tokenizer = load_model(context.device)
-    if context.method == "frozen":
+    torch.manual_seed(setting.seed)
+    model, tokenizer = load_model(setting.device)
+    if setting.method == "frozen":
         model.requires_grad_(False)
     else:  # of the same parameters for all methods, those that `kfac` can hold
         _leave_maps_alone_learning(model)
-    policy = Policy(model, Expert(model.config.hidden_size).to(context.device), tokenizer)
+    policy = Policy(model, Expert(model.config.hidden_size).to(setting.device), tokenizer)
     guard = None
-    if context.method not in ("frozen", "naive"):
-        method = context.method.removesuffix("-without-first")
+    if setting.method not in ("frozen", "naive"):
+        method = setting.method.removesuffix("-without-first")
         options: dict[str, Any] = {} if method == "aegis" else {"every": 4}
-        anchor = anchor_of(context.method, folder, context.device)
+        anchor = anchor_of(setting.method, folder, setting.device)
         guard = Guard(policy.backbone, anchor, LAYERS, method=method, **options)
     learning = [p for p in model.parameters() if p.requires_grad]
     groups = [{"params": policy.expert.parameters(), "lr": 1e-3, "weight_decay": 0.0}]
     if learning:
-        groups.append({"params": learning, "lr": context.rate, "weight_decay": 0.0})
+        groups.append({"params": learning, "lr": setting.rate, "weight_decay": 0.0})
     optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.95))
-    warm = context.steps // 10
+    warm = setting.steps // 10
 
     def share(step: int) -> float:
         """Of the rate: a tenth of the steps up, then down to zero."""
-        return min((step + 1) / warm, (context.steps - step) / (context.steps - warm))
+        return min((step + 1) / warm, (setting.steps - step) / (setting.steps - warm))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
     began = time.perf_counter()
-    for i, loss in enumerate(_steps(context, policy, guard, optimizer, schedule)):
+    for i, loss in enumerate(_steps(setting, policy, guard, optimizer, schedule)):
         if i % 20 == 0:
             took = time.perf_counter() - began
-            print(f"{context.name}: step {i}, loss {loss:.4f}, {took:.0f} s", flush=True)
+            print(f"{setting.name}: step {i}, loss {loss:.4f}, {took:.0f} s", flush=True)
     return measure(policy)
 
 
 def _steps(
-    context: MethodContext, policy: Policy, guard: Guard | None, optimizer: Any, schedule: Any
+    setting: Setting, policy: Policy, guard: Guard | None, optimizer: Any, schedule: Any
 ) -> Iterator[float]:
-    generator = torch.Generator().manual_seed(context.seed)
-    for _ in range(context.steps):
+    generator = torch.Generator().manual_seed(setting.seed)
+    for _ in range(setting.steps):
         batch = frames(BATCH, COLORS, generator)
         ids, mask = policy.read(batch.texts)
         watched = contextlib.nullcontext()
         if guard is not None:
-            watched = guard.watch(compared(mask, context.method))
+            watched = guard.watch(compared(mask, setting.method))
         with watched:
             hidden = policy.hidden(ids, mask)
         loss = policy.loss(hidden, mask, batch.actions, generator)
@@ -461,10 +461,10 @@ def main() -> None:
         }
     for seed in map(int, chosen.seeds.split(",")):
         for method in chosen.methods.split(","):
-            context = MethodContext(method, chosen.rate, seed, chosen.steps, chosen.device)
-            if context.name not in done:
-                figures = train(context, chosen.out)
-                done[context.name] = {**figures, "steps": context.steps}
+            setting = Setting(method, chosen.rate, seed, chosen.steps, chosen.device)
+            if setting.name not in done:
+                figures = train(setting, chosen.out)
+                done[setting.name] = {**figures, "steps": setting.steps}
                 cells.write_text(json.dumps(done, indent=1) + "\n")
     print(table(done))
 

@@ -294,7 +294,7 @@ def _check_within_clip(
         whose = "1 frame" if past == 1 else f"{past} frames"
         raise AegisError(
             f"{whose} of episode {number} in '{source.dataset.folder}' whose timestamps are past "
-            f"the end of its video of '{layout.short(camera)}', where another episode's begins",
+            f"the end of its video of '{layout.short(camera)}', where no picture is of it",
             "timestamps that begin at 0 and have no gap that the video has not",
             f"mend that episode's timestamps, or leave it out: --only (demos.only; of aegis "
             f"evaluate --episodes) without {number}",
