@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,7 @@ class Measurement(Removable):
         self._removed = False
 
     @contextlib.contextmanager
-    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
+    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Generator[None]:
         """Count the forward pass inside the block.
 
         Args:

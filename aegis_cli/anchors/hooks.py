@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
@@ -78,7 +78,7 @@ class LayerHooks:
     @contextlib.contextmanager
     def watch(
         self, mask: Tensor | None, image: Tensor | None, done: Callable[[Pass], None]
-    ) -> Iterator[None]:
+    ) -> Generator[None]:
         """Hand what the layers return inside the block to `done`, unless it ends by an exception.
 
         Args:
@@ -307,7 +307,7 @@ def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def watch_uses(model: nn.Module, report: Report) -> Iterator[None]:
+def watch_uses(model: nn.Module, report: Report) -> Generator[None]:
     """Report each use of a parameter inside the block while its module's forward is not running.
 
     No hook on a module sees such a use. It is a function that is given the parameter and returns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -123,7 +123,7 @@ class InputRecorder:
         }
 
     @contextlib.contextmanager
-    def watch(self, mask: Tensor | None) -> Iterator[None]:
+    def watch(self, mask: Tensor | None) -> Generator[None]:
         """Count what is read inside the block.
 
         Args:

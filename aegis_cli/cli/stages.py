@@ -7,7 +7,7 @@ OpenGL.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple
 
@@ -95,7 +95,7 @@ def joined(device: str | None) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _joined(device: str | None) -> Iterator[None]:
+def _joined(device: str | None) -> Generator[None]:
     from aegis_cli.common import ranks  # with it comes torch
 
     with computing_on(device), ranks.joined():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ EXPECTED = "auto, cpu, cuda, or cuda:N with the number of a GPU"
 
 
 @contextlib.contextmanager
-def chosen(name: str | None) -> Iterator[None]:
+def chosen(name: str | None) -> Generator[None]:
     """Inside the block, `pick` takes this device; None leaves the choice as it is.
 
     Raises:
@@ -41,7 +41,7 @@ def chosen(name: str | None) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def cpu_by_default() -> Iterator[None]:
+def cpu_by_default() -> Generator[None]:
     """Inside the block, or a function that it decorates, what names no device is on the CPU.
 
     A caller of the library may have set another one by `torch.set_default_device`. Where none is
@@ -154,7 +154,7 @@ def multiplies_bf16(device: torch.device) -> bool:
 
 
 @contextlib.contextmanager
-def single_threaded() -> Iterator[None]:
+def single_threaded() -> Generator[None]:
     """Use one CPU thread inside the block.
 
     LAPACK's eigensolver waits at thousands of small barriers. On two cores that other work shares,

@@ -13,7 +13,7 @@ import secrets
 import shutil
 import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -97,7 +97,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 @contextlib.contextmanager
-def aside(path: Path) -> Iterator[tuple[Path, BinaryIO]]:
+def aside(path: Path) -> Generator[tuple[Path, BinaryIO]]:
     """A new file beside `path`, to be filled and renamed; where it is not renamed it is removed.
 
     What killed processes have left of the same file is removed first. Everybody else who writes it
@@ -115,7 +115,7 @@ def aside(path: Path) -> Iterator[tuple[Path, BinaryIO]]:
 
 
 @contextlib.contextmanager
-def folder_aside(path: Path) -> Iterator[Path]:
+def folder_aside(path: Path) -> Generator[Path]:
     """A new folder beside `path`, as `aside` makes a file."""
     sweep(path)
     with contextlib.ExitStack() as stack:
@@ -380,7 +380,7 @@ def refuse_pointer(path: str | Path) -> None:
 
 
 @contextlib.contextmanager
-def reading(path: str | Path, fix: str) -> Iterator[None]:
+def reading(path: str | Path, fix: str) -> Generator[None]:
     """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one.
 
     Raises:

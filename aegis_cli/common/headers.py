@@ -6,7 +6,7 @@ Nothing here loads torch, so that `aegis inspect` answers at once.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -89,7 +89,7 @@ def is_artifact(path: str | Path) -> bool:
 @contextlib.contextmanager
 def opened(
     path: str | Path, kind: str | None, framework: Literal["np", "pt"] = "np"
-) -> Iterator[safe_open]:
+) -> Generator[safe_open]:
     """The open file.
 
     Args:

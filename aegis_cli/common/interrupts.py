@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
@@ -51,7 +51,7 @@ def leave_at_ctrl_c() -> None:
 
 
 @contextmanager
-def listening() -> Iterator[None]:
+def listening() -> Generator[None]:
     """Let SIGINT, SIGTERM and SIGHUP raise Stopped inside the block.
 
     One that is ignored, as SIGHUP is under nohup, or that somebody handles, is left as it is.
@@ -79,7 +79,7 @@ def listening() -> Iterator[None]:
 
 
 @contextmanager
-def ending_at_once() -> Iterator[None]:
+def ending_at_once() -> Generator[None]:
     """Let a signal that would raise Stopped end the process at once inside the block.
 
     A handler of Python's runs only when a call into C has come back, which one that waits for
@@ -97,7 +97,7 @@ def ending_at_once() -> Iterator[None]:
 
 
 @contextmanager
-def _sending_again() -> Iterator[None]:
+def _sending_again() -> Generator[None]:
     """Send a signal again whose exception was dropped inside the block.
 
     A library in C or Rust that is called at that moment, and cannot pass an exception on, drops it.
@@ -153,7 +153,7 @@ class Deferred:
 
 
 @contextmanager
-def deferred() -> Iterator[Deferred]:
+def deferred() -> Generator[Deferred]:
     """Hold back the signals that would raise, until the block calls `leave`, or ends.
 
     A signal with another handler, or none, keeps it.

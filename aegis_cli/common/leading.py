@@ -7,7 +7,7 @@ others wait, as long as it takes, until it names a function that all call.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -59,7 +59,7 @@ class _Lead:
         self.ranks.agree(word)
 
     @contextmanager
-    def calling(self) -> Iterator[None]:
+    def calling(self) -> Generator[None]:
         """Do the block together with the others, which are called to it."""
         self.listening = False
         with among(self.ranks):
@@ -98,7 +98,7 @@ def _led(job: Callable[[], T], lead: _Lead) -> T:
 
 
 @contextmanager
-def _leading(lead: _Lead) -> Iterator[None]:
+def _leading(lead: _Lead) -> Generator[None]:
     """Let `together` find the others inside the block."""
     global _lead
     _lead = lead

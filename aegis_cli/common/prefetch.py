@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
@@ -27,7 +27,7 @@ def workers() -> int:
 @contextmanager
 def for_device(
     make: Callable[[Item], T], items: Iterable[Item], device: torch.device
-) -> Iterator[Iterator[T]]:
+) -> Generator[Iterator[T]]:
     """`map(make, items)`, where `make` prepares on the CPU what the device is to work on.
 
     For a GPU several threads call `make`, as a model's own processor can take longer for a batch
@@ -44,7 +44,7 @@ def for_device(
 @contextmanager
 def ahead(
     fetch: Callable[[Item], T], items: Iterable[Item], depth: int = DEPTH, workers: int = 1
-) -> Iterator[Iterator[T]]:
+) -> Generator[Iterator[T]]:
     """`map(fetch, items)`, up to `depth` calls ahead in threads of their own.
 
     One thread makes the calls one after the other, so that `fetch` may keep state; with several

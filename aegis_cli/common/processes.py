@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -177,7 +177,7 @@ def mapped(
     name: str,
     fix: str,
     chunk: int = 1,
-) -> Iterator[Iterator[Result]]:
+) -> Generator[Iterator[Result]]:
     """Give `map(work, items)`, from a pool if there is to be more than one worker.
 
     The results can be left early. For the arguments see `WorkerPool` and `WorkerPool.map`.
@@ -210,7 +210,7 @@ def _cores() -> int:
 
 
 @contextmanager
-def interrupts_held() -> Iterator[None]:
+def interrupts_held() -> Generator[None]:
     """Hold signals back; processes started inside never see those of a terminal.
 
     A terminal sends Ctrl-C, and SIGHUP when it closes, to each of its processes. Workers leave them

@@ -7,7 +7,7 @@ process adds what its own frames contribute to the whole batch's mean, and contr
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, TypeVar
@@ -116,7 +116,7 @@ _met: Ranks | None = None  # whom `joined` has met, or who a block works among
 
 
 @contextlib.contextmanager
-def joined() -> Iterator[Ranks]:
+def joined() -> Generator[Ranks]:
     """Meet the other processes that the launcher has started, until the block ends.
 
     Who is inside such a block already finds the same processes there.
@@ -153,7 +153,7 @@ def joined() -> Iterator[Ranks]:
 
 
 @contextlib.contextmanager
-def among(ranks: Ranks) -> Iterator[None]:
+def among(ranks: Ranks) -> Generator[None]:
     """Let `joined` find these processes inside the block, or none but this with `ALONE`."""
     global _met
     before, _met = _met, ranks

@@ -7,7 +7,7 @@ and an optimizer writes outside a state that is smaller than its parameter.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,7 +67,7 @@ def _quoted(names: set[str]) -> str:
 
 
 @contextlib.contextmanager
-def reading_meta(path: Path) -> Iterator[None]:
+def reading_meta(path: Path) -> Generator[None]:
     """Turn what wrong types, missing keys and impossible sizes in a header raise into one error."""
     try:
         yield
@@ -135,7 +135,7 @@ class _NothingDrawn(TorchFunctionMode):
 
 
 @contextlib.contextmanager
-def outline(path: Path) -> Iterator[None]:
+def outline(path: Path) -> Generator[None]:
     """Make modules inside the block without memory, to compare a file with them before it is used.
 
     Raises:

@@ -25,7 +25,7 @@ this package. `top` selects the usual linear router instead, with one gate per s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -302,7 +302,7 @@ def activate(sites: Routed, task: int | None) -> None:
 
 
 @contextmanager
-def traced(sites: Routed) -> Iterator[dict[str, list[Traced]]]:
+def traced(sites: Routed) -> Generator[dict[str, list[Traced]]]:
     """Note the passes of each map inside the block, with their graphs."""
     found: dict[str, list[Traced]] = {name: [] for name in sites}
     for name, site in sites.items():

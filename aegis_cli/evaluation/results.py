@@ -14,7 +14,7 @@ import itertools
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,7 +110,7 @@ def _in_utf8(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _soon_alone(folder: Path) -> Iterator[None]:
+def _soon_alone(folder: Path) -> Generator[None]:
     """Be the only process that writes there, after some seconds at most: others do not take long.
 
     Raises:

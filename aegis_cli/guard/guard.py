@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -156,7 +156,7 @@ class Guard(Removable):
     # --- the loop ---------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Iterator[None]:
+    def watch(self, mask: Tensor | None, image: Tensor | None = None) -> Generator[None]:
         """Compare the forward pass inside the block with the anchor.
 
         Each `backward` needs one block; evaluation needs none. `nullspace` and `kfac` compare

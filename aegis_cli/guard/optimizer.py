@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -287,7 +287,7 @@ def _copied(pair: Pair) -> Pair:
 
 
 @contextlib.contextmanager
-def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Iterator[None]:
+def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Generator[None]:
     """Give the parameters the VLM's values inside the block, and then back their own."""
     pairs = [
         (parameter, value)

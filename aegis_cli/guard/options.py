@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Generator, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -190,7 +190,7 @@ def _check_layers(
 
 
 @contextlib.contextmanager
-def naming_its_part(model: nn.Module, path: Path, part: str | None) -> Iterator[None]:
+def naming_its_part(model: nn.Module, path: Path, part: str | None) -> Generator[None]:
     """Advise `part=` where a model does not fit an anchor, and a part of it does.
 
     Raises:

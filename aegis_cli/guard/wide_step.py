@@ -8,7 +8,7 @@ optimizer's state, so that a resumed training has them.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ class WideStep:
                 self._half.append(parameter)
 
     @contextlib.contextmanager
-    def taken(self) -> Iterator[None]:
+    def taken(self) -> Generator[None]:
         """Let the parameters be their masters inside the block, and then those rounded.
 
         A parameter that somebody has changed since has its master anew, from what it is now.
@@ -94,7 +94,7 @@ class WideStep:
 
 
 @contextlib.contextmanager
-def loading(optimizer: Optimizer, state: Mapping[str, Any]) -> Iterator[None]:
+def loading(optimizer: Optimizer, state: Mapping[str, Any]) -> Generator[None]:
     """Let parameters with masters be float32 while their state is loaded.
 
     PyTorch casts what it loads to the type of the parameter.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import attrgetter
@@ -433,7 +433,7 @@ SITES: dict[type[nn.Module], str] = {
 
 
 @contextlib.contextmanager
-def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Iterator[None]:
+def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Generator[None]:
     """Let parameters have another type inside the block, and then their own values again.
 
     They must have no gradient, which is of a parameter's type.

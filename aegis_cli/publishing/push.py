@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -238,7 +238,7 @@ def _is_of_a_backbone(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def _reaching(repo: str) -> Iterator[None]:
+def _reaching(repo: str) -> Generator[None]:
     """What the hub or the network refuses, as the one error that a user sees."""
     from huggingface_hub.errors import HfHubHTTPError, HTTPError, OfflineModeIsEnabled
 

@@ -71,9 +71,9 @@ FOLDER_NAME = Check("letters, digits, '.', '_', '-'", lambda v: bool(re.fullmatc
 
 def key(
     check: Check | None = None,
+    *,
     default: Any = dataclasses.MISSING,
     first: Any = dataclasses.MISSING,
-    *,
     factory: Any = dataclasses.MISSING,
     later: bool = False,
     shapes: bool = True,

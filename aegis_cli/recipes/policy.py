@@ -97,47 +97,47 @@ _ASK = (
 class Demos:
     """The demonstrations that are recorded, or that exist already."""
 
-    episodes: int = key(POSITIVE, 300, doc="Number of episodes that are recorded.")
+    episodes: int = key(POSITIVE, default=300, doc="Number of episodes that are recorded.")
     noise: float = key(
         NOT_NEGATIVE,
-        0.3,
+        default=0.3,
         doc="Standard deviation of the noise on executed actions; 1 is their full range.",
     )
-    seed: int = key(SEED, 0, doc="Seed of the recording; equal seeds give equal bytes.")
+    seed: int = key(SEED, default=0, doc="Seed of the recording; equal seeds give equal bytes.")
     path: str | tuple[str, ...] | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Demonstrations to use instead of recording: a file, the folder of a LeRobot dataset, "
         "or its id on the hub; a list has several sets of one robot learned from together.",
     )
     weights: tuple[float, ...] | None = key(
         POSITIVE_EACH,
-        None,
+        default=None,
         later=True,
         doc="Shares of the training frames that come from each of several sets in `path`, such as "
         "[2, 1] for twice as many from the first. Null: each frame comes equally often.",
     )
     camera: str | tuple[str, ...] | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Camera of a LeRobot dataset that has several; a list gives the policy one image of "
         "each.",
     )
     state: str | tuple[str, ...] = key(
         NOT_EMPTY,
-        "observation.state",
+        default="observation.state",
         later=True,
         doc="Feature of a LeRobot dataset that has the robot's positions; a list joins several.",
     )
     action: str | tuple[str, ...] = key(
         NOT_EMPTY,
-        "action",
+        default="action",
         later=True,
         doc="Feature of a LeRobot dataset that has the actions; a list joins several.",
     )
     rename: dict[str, str] | None = key(
         NAMES,
-        None,
+        default=None,
         later=True,
         doc="Names of cameras, features or joints in the demonstrations, each with the policy's, "
         "such as {overhead: top}. Each is renamed in every set where it occurs; `camera`, `state` "
@@ -145,7 +145,7 @@ class Demos:
     )
     only: str | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         later=True,
         doc="Episodes of a single set in `path` to learn from and validate on; null: all. Numbers "
         "from 0 and ranges such as '0-39,45', or the name of a split in a LeRobot dataset's "
@@ -160,7 +160,7 @@ class Demos:
     )
     drop_below: float | None = key(
         BELOW_ONE,
-        None,
+        default=None,
         doc="Suite tasks only: episodes whose return is below this quantile of all returns are "
         "dropped. Null drops the lowest quarter.",
     )
@@ -178,56 +178,58 @@ class Anchor:
 
     source: str = key(
         choice(*ANCHOR_SOURCES),
-        "questions",
+        default="questions",
         later=True,
         doc="What the backbone reads while it is measured: questions, or the frames of the "
         "demonstrations with their instructions, of which only moments are measured.",
     )
     vqa: str = key(
         NOT_EMPTY,
-        "scenes",
+        default="scenes",
         doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file, folder or hub id of "
         "questions, of whose images anchors get a share.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
+    ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
     samples: int = key(
-        POSITIVE, 3000, doc="Number of pairs of an image and a question, or of frames."
+        POSITIVE, default=3000, doc="Number of pairs of an image and a question, or of frames."
     )
-    batch_size: int = key(POSITIVE, 64, doc="Questions, or frames, per forward pass.")
-    seed: int = key(SEED, 0, doc="Seed of the choice of questions, or of frames.")
+    batch_size: int = key(POSITIVE, default=64, doc="Questions, or frames, per forward pass.")
+    seed: int = key(SEED, default=0, doc="Seed of the choice of questions, or of frames.")
     parts: tuple[str, ...] = key(
         choice(*ANCHOR_PARTS),
-        ("moments", "inputs"),
+        default=("moments", "inputs"),
         doc="What is measured: activations per layer (moments, for aegis), the directions that "
         "each map reads (inputs, for nullspace), the answers' curvature "
         "(kfac), and their Fisher information (ewc).",
     )
     energy: float = key(
         SHARE_OR_ONE,
-        0.9999,
+        default=0.9999,
         doc="Share of the energy of each map's inputs up to which eigenvectors are kept.",
     )
-    fisher_samples: int = key(POSITIVE, 1000, doc="Number of questions for the Fisher information.")
+    fisher_samples: int = key(
+        POSITIVE, default=1000, doc="Number of questions for the Fisher information."
+    )
     exact_width: int = key(
         POSITIVE,
-        1024,
+        default=1024,
         later=True,
         doc="Widest linear map whose directions are found exactly; those of wider ones are found "
         "by a random sketch.",
     )
     tokens: float = key(
         SHARE_OR_ONE,
-        1.0,
+        default=1.0,
         later=True,
         doc="Share of the tokens and patches that inputs are measured on, drawn anew in each pass; "
         "less takes less time, and blurs the weakest directions.",
     )
     temperature: float = key(
         POSITIVE,
-        1.0,
+        default=1.0,
         later=True,
         doc="What the scores of answers are divided by before the curvature's words are drawn from "
         "them. A backbone that is sure of its answers gives gradients to few questions alone; 4 "
@@ -235,7 +237,7 @@ class Anchor:
     )
     memory: int | None = key(
         POSITIVE,
-        None,
+        default=None,
         later=True,
         doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
         "in groups, each with passes of its own. Null measures all at once.",
@@ -248,52 +250,59 @@ class Train:
 
     method: str = key(
         choice(*METHODS),
-        "naive",
+        default="naive",
         doc="How the backbone is fine-tuned by `aegis train`; `aegis run` goes through `methods`.",
     )
-    steps: int = key(POSITIVE, 1500, doc="Optimizer steps.")
+    steps: int = key(POSITIVE, default=1500, doc="Optimizer steps.")
     extended_from: tuple[int, ...] | None = key(
         POSITIVE,
-        None,
+        default=None,
         later=True,
         doc="Numbers of steps that were planned before, where `aegis train --resume --set "
         "train.steps=N` has made a run longer: it writes them here. The learning rate follows each "
         "plan up to its end, and the next from there.",
     )
-    batch_size: int = key(POSITIVE, 32, doc="Frames per step.")
-    chunk: int = key(POSITIVE, 8, doc="Actions that are predicted at once.")
+    batch_size: int = key(POSITIVE, default=32, doc="Frames per step.")
+    chunk: int = key(POSITIVE, default=8, doc="Actions that are predicted at once.")
     flow_samples: int = key(
-        POSITIVE, 8, doc="Flow times, each with its noise, that are drawn per image."
+        POSITIVE, default=8, doc="Flow times, each with its noise, that are drawn per image."
     )
-    backbone_lr: float = key(NOT_NEGATIVE, 1e-4, doc="Peak learning rate of the backbone.")
-    expert_lr: float = key(NOT_NEGATIVE, 1e-3, doc="Peak learning rate of the action expert.")
+    backbone_lr: float = key(NOT_NEGATIVE, default=1e-4, doc="Peak learning rate of the backbone.")
+    expert_lr: float = key(
+        NOT_NEGATIVE, default=1e-3, doc="Peak learning rate of the action expert."
+    )
     warmup: int = key(
-        NOT_NEGATIVE, 100, doc="Steps over which the learning rates rise to their peaks."
+        NOT_NEGATIVE, default=100, doc="Steps over which the learning rates rise to their peaks."
     )
     optimizer: str = key(
         choice(*OPTIMIZERS),
-        "adamw",
+        default="adamw",
         later=True,
         doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are "
         "some thirty times larger. The expert, which begins from nothing, always has AdamW.",
     )
     momentum: float = key(
-        BELOW_ONE, 0.9, later=True, doc="Momentum of `optimizer: sgd`; AdamW has none to set."
+        BELOW_ONE,
+        default=0.9,
+        later=True,
+        doc="Momentum of `optimizer: sgd`; AdamW has none to set.",
     )
     states: str = key(
         choice(*STATES),
-        "float32",
+        default="float32",
         later=True,
         doc="Number format of AdamW's two moments; 8bit takes a quarter of their memory and needs "
         "the extra low-memory.",
     )
     weight_decay: float = key(
-        NOT_NEGATIVE, 0.01, doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient."
+        NOT_NEGATIVE,
+        default=0.01,
+        doc="Weight decay: AdamW's, or under SGD an L2 term of the gradient.",
     )
-    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
+    clip_norm: float = key(POSITIVE, default=1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
         choice(*NORMALIZATIONS),
-        "mean_std",
+        default="mean_std",
         doc="How proprioception and actions are scaled: to mean 0 and standard deviation 1, or "
         "by their 1 % and 99 % quantiles.",
     )
@@ -306,75 +315,77 @@ class Train:
     )
     relative_exclude: tuple[str, ...] | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         later=True,
         doc="Words in the names of actions that stay absolute under `relative_actions`, such as "
         "gripper.",
     )
     final_lr_share: float = key(
-        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at the last step."
+        UP_TO_ONE,
+        default=0.1,
+        doc="Share of the peak learning rates that is left at the last step.",
     )
     ema_decay: float | None = key(
         SHARE,
-        None,
+        default=None,
         later=True,
         doc="Decay of an exponential moving average of the weights, such as 0.99: checkpoints hold "
         "the average, and training goes on from the weights themselves. Null keeps none.",
     )
     backbone_until: float = key(
         SHARE_OR_ONE,
-        1.0,
+        default=1.0,
         later=True,
         doc="Share of the steps after which the backbone stands still and the expert alone goes "
         "on.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,
-        None,
+        default=None,
         later=True,
         doc="Parts of the backbone that do not learn, whatever the method: names or patterns of "
         "them, such as vision, or [vision, embeddings, layers.0-11], each with all that is below "
         "it. Null: all learns that the method trains.",
     )
     validation_share: float = key(
-        SHARE, 0.05, doc="Share of the episodes that is kept for the validation loss."
+        SHARE, default=0.05, doc="Share of the episodes that is kept for the validation loss."
     )
-    validate_every: int = key(POSITIVE, 250, doc="Steps between two validation losses.")
-    checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
+    validate_every: int = key(POSITIVE, default=250, doc="Steps between two validation losses.")
+    checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
     keep_checkpoints: int | None = key(
         POSITIVE,
-        None,
+        default=None,
         shapes=False,
         doc="How many of the last checkpoints stay, beside the one with the least validation loss; "
         "others are removed. Null keeps all. A validation loss counts for a checkpoint of the same "
         "step.",
     )
-    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
+    log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
     # They belonged to a figure that is no longer measured.
-    leak_every: int = key(POSITIVE, 10, retired=True)
-    leak_energy: float = key(SHARE_OR_ONE, 0.999, retired=True)
+    leak_every: int = key(POSITIVE, default=10, retired=True)
+    leak_energy: float = key(SHARE_OR_ONE, default=0.999, retired=True)
     augment: tuple[str, ...] | None = key(
         choice(*AUGMENTATIONS),
-        None,
+        default=None,
         later=True,
         doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
         "none. Anchors, probes and the validation loss see frames as they are.",
     )
     augment_count: int = key(
         POSITIVE,
-        3,
+        default=3,
         later=True,
         doc="How many of `augment` change one image, drawn anew each time.",
     )
     precision: str = key(
         choice(*PRECISIONS),
-        "auto",
+        default="auto",
         doc="Number format of the forward and backward pass; auto is bf16 where the hardware "
         "multiplies in it, else float32.",
     )
     weights: str = key(
         choice(*WEIGHTS),
-        "float32",
+        default="float32",
         doc="Number format of a Hugging Face backbone's weights; bf16 takes half the memory, and "
         "small steps are lost. bf16-master rounds them for the forward and backward pass alone: "
         "the optimizer and the method work on float32 weights.",
@@ -391,20 +402,20 @@ class Train:
     )
     accumulate: int = key(
         POSITIVE,
-        1,
+        default=1,
         later=True,
         doc="Passes in which a step's frames are taken, for less memory.",
     )
     parallel: str = key(
         choice(*PARALLEL),
-        "ddp",
+        default="ddp",
         later=True,
         doc="How processes that torchrun has started share a training: each with all weights "
         "(ddp), or with some rows of each (fsdp).",
     )
     track: tuple[str, ...] | None = key(
         choice(*TRACKERS),
-        None,
+        default=None,
         shapes=False,
         doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
         "environment variables say otherwise.",
@@ -420,11 +431,11 @@ class Train:
 class Expert:
     """The action expert; its heads and their size are those of the backbone that it reads."""
 
-    width: int = key(EVEN, 128, doc="Width of the expert's layers.")
-    mlp_ratio: int = key(POSITIVE, 4, doc="Width of its MLPs, as a multiple of `width`.")
+    width: int = key(EVEN, default=128, doc="Width of the expert's layers.")
+    mlp_ratio: int = key(POSITIVE, default=4, doc="Width of its MLPs, as a multiple of `width`.")
     start: str | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         later=True,
         doc="Folder of a run, checkpoint or exported policy of the same robot, with whose expert "
         "this training begins; null begins with a new one. The backbone is still `backbone`, which "
@@ -436,9 +447,11 @@ class Expert:
 class Lora:
     """Options of the method lora."""
 
-    rank: int = key(POSITIVE, 16, doc="Rank of each low-rank update.")
+    rank: int = key(POSITIVE, default=16, doc="Rank of each low-rank update.")
     alpha: float = key(
-        POSITIVE, 32.0, doc="Scale of the low-rank updates, which are multiplied by alpha / rank."
+        POSITIVE,
+        default=32.0,
+        doc="Scale of the low-rank updates, which are multiplied by alpha / rank.",
     )
 
 
@@ -448,49 +461,49 @@ class Aegis:
 
     weighting: str = key(
         choice(*WEIGHTINGS),
-        "none",
+        default="none",
         doc="How the layers are weighted in the transport penalty: all alike, or each "
         "divided by its anchor's variance.",
     )
     scope: str = key(
         choice(*SCOPES),
-        "all",
+        default="all",
         doc="Tokens whose activations are compared; 'each' compares image and text tokens, each "
         "with a Gaussian of their own.",
     )
     projects: str = key(
         choice(*PROJECTED),
-        "gradient",
+        default="gradient",
         doc="What the conflict is removed from: the gradient, the optimizer's update, or both.",
     )
     restoration: float = key(
         NOT_NEGATIVE,
-        0.0,
+        default=0.0,
         doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is "
         "far the longer one: on the embedded VLM its norm began at 8,405, the task's at 4.7, so "
         "1e-5 to 1e-2 is the range to try.",
     )
     groups: str = key(
         choice(*GROUPS),
-        "all",
+        default="all",
         doc="Parameter groups that are projected: all, or only the language model's layers.",
     )
     idle: str = key(
         choice(*IDLE),
-        "moved",
+        default="moved",
         later=True,
         doc="What becomes of parameters that the task's gradient does not reach: the projection "
         "moves them along the anchor gradient, or they are kept as naive has them.",
     )
     refresh: int = key(
         POSITIVE,
-        1,
+        default=1,
         later=True,
         doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
     )
     fraction: float = key(
         SHARE_OR_ONE,
-        1.0,
+        default=1.0,
         later=True,
         doc="Share of the batch that the anchor gradient is taken on. Below 1, these frames pass "
         "the backbone once more, in a small graph of their own.",
@@ -503,27 +516,27 @@ class Nullspace:
 
     soft: float = key(
         POSITIVE,
-        1e-4,
+        default=1e-4,
         first=0.0,
         doc="Share of the energy of a map's VQA inputs at which a direction is half protected.",
     )
     energy: float | None = key(
         UP_TO_ONE,
-        None,
+        default=None,
         doc="Instead of `soft`: the leading directions that hold this share of the energy are "
         "protected wholly.",
     )
     protect: tuple[str, ...] = key(
-        choice(*SITE_KINDS), SITE_KINDS, doc="Kinds of modules that are protected."
+        choice(*SITE_KINDS), default=SITE_KINDS, doc="Kinds of modules that are protected."
     )
     every: int = key(
         POSITIVE,
-        4,
+        default=4,
         doc="Steps between two projections, each of all the steps since the last.",
     )
     keeps: str = key(
         choice(*KEPT),
-        "weights",
+        default="weights",
         later=True,
         doc="What a projection knows of the weights before its steps: the weights themselves, or "
         "their coordinates along the protected directions, which take less memory and more time.",
@@ -536,36 +549,36 @@ class Kfac:
 
     weight: float = key(
         NOT_NEGATIVE,
-        0.03,
+        default=0.03,
         first=0.05,
         doc="Weight of the penalty per step; its curvature has mean 1 in each map.",
     )
     damping: float = key(
         NOT_NEGATIVE,
-        0.1,
+        default=0.1,
         first=0.0,
         doc="Added to the curvature of each output, whose mean is 1.",
     )
     balance: float = key(
         NOT_NEGATIVE,
-        1.0,
+        default=1.0,
         doc="How much less maps of small gradients move; 0 takes Adam's steps as they are.",
     )
     every: int = key(
         POSITIVE,
-        4,
+        default=4,
         doc="Steps between two proximal steps, each of all the steps since the last.",
     )
     step: str = key(
         choice(*PENALTY_STEPS),
-        "proximal",
+        default="proximal",
         later=True,
         doc="How the penalty acts: by a proximal step on the weights after the optimizer's, or by "
         "its gradient, which is added to the task's.",
     )
     growth: float = key(
         NOT_NEGATIVE,
-        0.0,
+        default=0.0,
         later=True,
         doc="Power by which the weight grows as the learning rate falls: it is multiplied by "
         "(peak rate / rate) ** growth once the peak is reached.",
@@ -578,7 +591,7 @@ class L2sp:
 
     weight: float = key(
         NOT_NEGATIVE,
-        0.1,
+        default=0.1,
         first=0.01,
         doc="Weight of the squared distance to the pre-trained weights.",
     )
@@ -590,7 +603,7 @@ class Maps:
 
     weight: float = key(
         NOT_NEGATIVE,
-        2.0,
+        default=2.0,
         first=1.0,
         doc="Weight of the penalty at the first module; it falls linearly to 0 at the last.",
     )
@@ -602,13 +615,13 @@ class Ewc:
 
     weight: float = key(
         NOT_NEGATIVE,
-        0.1,
+        default=0.1,
         first=100.0,
         doc="Weight of the penalty, in which each parameter counts by its Fisher information.",
     )
     step: str = key(
         choice(*PENALTY_STEPS),
-        "gradient",
+        default="gradient",
         later=True,
         doc="How the penalty acts: by its gradient, which is added to the task's, or by a proximal "
         "step on the weights after the optimizer's.",
@@ -620,7 +633,9 @@ class Distill:
     """Options of the method distill."""
 
     weight: float = key(
-        NOT_NEGATIVE, 1.0, doc="Weight of the distance to the pre-trained backbone's features."
+        NOT_NEGATIVE,
+        default=1.0,
+        doc="Weight of the distance to the pre-trained backbone's features.",
     )
 
 
@@ -630,69 +645,69 @@ class Insulate:
 
     weight: float = key(
         NOT_NEGATIVE,
-        1.0,
+        default=1.0,
         doc="Weight of the cross-entropy of actions as text. The backbone has no other loss of "
         "robot frames, so its learning rate decides more.",
     )
     bins: int | None = key(
         TWO_OR_MORE,
-        None,
+        default=None,
         doc="Number of equal bins that a normalised action can fall into. Null: as many as the "
         "backbone has numbers for, 256, or 64 of an embedded VLM.",
     )
     limit: float = key(
         POSITIVE,
-        2.0,
+        default=2.0,
         doc="The bins lie between -limit and limit, in normalised units; the outer ones are open.",
     )
     horizon: int = key(
         POSITIVE,
-        2,
+        default=2,
         doc="Number of the chunk's actions that are written, the first and others evenly after it; "
         "all of a shorter chunk.",
     )
     prompt: str = key(
         WITH_PLACE,
-        "{}",
+        default="{}",
         doc="What the backbone is asked for the actions, with {} for the instruction; words that "
         "no question has tell the two apart.",
     )
     vqa_weight: float = key(
         NOT_NEGATIVE,
-        0.0,
+        default=0.0,
         doc="Weight of the cross-entropy on questions. Above 0 the method trains on VQA data, and "
         "is a ceiling.",
     )
     vqa: str = key(
         NOT_EMPTY,
-        "scenes",
+        default="scenes",
         doc="Questions that are trained on, with `vqa_weight`; of files, those of the anchor's "
         "share of the images.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
-    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
-    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
+    ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
+    questions: int = key(POSITIVE, default=14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, default=32, doc="Questions per step.")
 
 
 @section
 class Cotrain:
     """Options of the method cotrain."""
 
-    weight: float = key(NOT_NEGATIVE, 0.1, doc="Weight of the cross-entropy on questions.")
+    weight: float = key(NOT_NEGATIVE, default=0.1, doc="Weight of the cross-entropy on questions.")
     vqa: str = key(
         NOT_EMPTY,
-        "scenes",
+        default="scenes",
         doc="Questions that are trained on; of files, those of the anchor's share of the images.",
     )
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
-    questions: int = key(POSITIVE, 14_000, doc="Number of questions that are drawn from.")
-    batch_size: int = key(POSITIVE, 32, doc="Questions per step.")
+    ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
+    questions: int = key(POSITIVE, default=14_000, doc="Number of questions that are drawn from.")
+    batch_size: int = key(POSITIVE, default=32, doc="Questions per step.")
 
 
 @section
@@ -701,7 +716,7 @@ class Probe:
 
     vqa: str | tuple[str, ...] = key(
         NOT_EMPTY,
-        "scenes",
+        default="scenes",
         doc="Questions that are asked; they may be the anchor's, since probes get other images. "
         "Each set of a list is probed, reported and held to `max_drop` on its own; knobs are "
         "chosen by the first.",
@@ -709,19 +724,19 @@ class Probe:
     skip_bad: bool = key(
         default=False, doc="Leave bad questions of files out and count them, instead of refusing."
     )
-    ask: str = key(WITH_PLACE, "{}", later=True, doc=_ASK)
-    questions: int = key(POSITIVE, 5000, doc="Number of questions; of files, at most.")
-    seed: int = key(SEED, 0, doc="Seed of the choice of questions.")
-    batch_size: int = key(POSITIVE, 64, doc="Questions per forward pass.")
+    ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
+    questions: int = key(POSITIVE, default=5000, doc="Number of questions; of files, at most.")
+    seed: int = key(SEED, default=0, doc="Seed of the choice of questions.")
+    batch_size: int = key(POSITIVE, default=64, doc="Questions per forward pass.")
     max_drop: float | None = key(
         NOT_NEGATIVE,
-        None,
+        default=None,
         doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1, and "
         "`aegis probe` of the run.",
     )
     gate: str = key(
         choice("mean", "upper"),
-        "mean",
+        default="mean",
         later=True,
         doc="What of the drop `max_drop` limits: mean, the drop as measured, or upper, the upper "
         "end of its 95 % interval, so that too few questions cannot pass.",
@@ -749,12 +764,18 @@ class Probe:
 class Rollout:
     """How a policy's success is measured."""
 
-    episodes: int = key(POSITIVE, 50, doc="Number of episodes for each set of colours.")
-    seed: int = key(SEED, 0, doc="Seed of the episodes, none of which is a demonstration's.")
-    colors: tuple[str, ...] = key(
-        choice(*COLOR_SETS), COLOR_SETS, doc="Sets of colours that the targets are drawn from."
+    episodes: int = key(POSITIVE, default=50, doc="Number of episodes for each set of colours.")
+    seed: int = key(
+        SEED, default=0, doc="Seed of the episodes, none of which is a demonstration's."
     )
-    replan: int = key(POSITIVE, 4, doc="Actions that are executed before the next prediction.")
+    colors: tuple[str, ...] = key(
+        choice(*COLOR_SETS),
+        default=COLOR_SETS,
+        doc="Sets of colours that the targets are drawn from.",
+    )
+    replan: int = key(
+        POSITIVE, default=4, doc="Actions that are executed before the next prediction."
+    )
     ensemble: float | None = key(
         default=None,
         later=True,
@@ -773,18 +794,22 @@ class Merge:
 
     method: str | None = key(
         choice(*MERGES),
-        None,
+        default=None,
         doc="What is kept of how far the backbone has moved; null keeps all and merges nothing.",
     )
     strength: float = key(
         NOT_NEGATIVE,
-        10.0,
+        default=10.0,
         doc="How far back; for linear the share of the way, from 0 to 1.",
     )
     damping: float = key(
-        SHARE_OR_ONE, 0.01, doc="Added to each eigenvalue of every curvature, whose mean is 1."
+        SHARE_OR_ONE,
+        default=0.01,
+        doc="Added to each eigenvalue of every curvature, whose mean is 1.",
     )
-    frames: int = key(POSITIVE, 1000, doc="Robot frames that the task's factors are measured on.")
+    frames: int = key(
+        POSITIVE, default=1000, doc="Robot frames that the task's factors are measured on."
+    )
 
 
 @section
@@ -792,16 +817,16 @@ class Recipe:
     """Fine-tunes a backbone on the demonstrations of one task, by each of several methods."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run; `aegis run` writes runs/NAME.")
-    task: str = key(TASK, "reach", doc="Task that is demonstrated and rolled out.")
+    task: str = key(TASK, default="reach", doc="Task that is demonstrated and rolled out.")
     backbone: str = key(
         NOT_EMPTY,
-        "embedded",
+        default="embedded",
         doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
         "of a Hugging Face model.",
     )
-    seed: int = key(SEED, 0, doc="Seed of the training.")
+    seed: int = key(SEED, default=0, doc="Seed of the training.")
     methods: tuple[str, ...] = key(
-        choice(*METHODS), METHODS[:5], doc="Methods that `aegis run` trains and compares."
+        choice(*METHODS), default=METHODS[:5], doc="Methods that `aegis run` trains and compares."
     )
     demos: Demos = Demos()
     anchor: Anchor = Anchor()

@@ -20,19 +20,21 @@ from aegis_cli.recipes.policy import PRECISIONS
 class Model:
     """The size of the embedded VLM."""
 
-    width: int = key(POSITIVE, 192, doc="Width of the layers; the heads divide it.")
-    depth: int = key(POSITIVE, 6, doc="Number of layers.")
-    heads: int = key(POSITIVE, 6, doc="Attention heads per layer.")
+    width: int = key(POSITIVE, default=192, doc="Width of the layers; the heads divide it.")
+    depth: int = key(POSITIVE, default=6, doc="Number of layers.")
+    heads: int = key(POSITIVE, default=6, doc="Attention heads per layer.")
 
 
 @section
 class Towers:
     """The size of the embedded dual encoder's two towers."""
 
-    width: int = key(POSITIVE, 128, doc="Width of both towers' layers; the heads divide it.")
-    depth: int = key(POSITIVE, 3, doc="Number of layers of the image tower.")
-    text_depth: int = key(POSITIVE, 2, doc="Number of layers of the text tower.")
-    heads: int = key(POSITIVE, 4, doc="Attention heads per layer.")
+    width: int = key(
+        POSITIVE, default=128, doc="Width of both towers' layers; the heads divide it."
+    )
+    depth: int = key(POSITIVE, default=3, doc="Number of layers of the image tower.")
+    text_depth: int = key(POSITIVE, default=2, doc="Number of layers of the text tower.")
+    heads: int = key(POSITIVE, default=4, doc="Attention heads per layer.")
 
 
 @section
@@ -40,33 +42,33 @@ class PretrainRecipe:
     """Trains an embedded VLM on questions about drawn scenes, and about easy-VQA's pictures."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
-    seed: int = key(SEED, 0, doc="Seed of the scenes, the weights and the training.")
-    scenes: int = key(POSITIVE, 50_000, doc="Number of scenes that are trained on.")
+    seed: int = key(SEED, default=0, doc="Seed of the scenes, the weights and the training.")
+    scenes: int = key(POSITIVE, default=50_000, doc="Number of scenes that are trained on.")
     probe_questions: int = key(
-        POSITIVE, 7000, doc="Number of questions that the finished model is asked."
+        POSITIVE, default=7000, doc="Number of questions that the finished model is asked."
     )
     start: str | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Embedded VLM whose weights it begins with, such as 'embedded'; words that it does not "
         "know begin with drawn ones. Null begins from nothing.",
     )
-    steps: int = key(POSITIVE, 4000, doc="Optimizer steps.")
-    batch_size: int = key(POSITIVE, 48, doc="Scenes per step, each with all its questions.")
+    steps: int = key(POSITIVE, default=4000, doc="Optimizer steps.")
+    batch_size: int = key(POSITIVE, default=48, doc="Scenes per step, each with all its questions.")
     easy_vqa: int = key(
         NOT_NEGATIVE,
-        0,
+        default=0,
         doc="Pictures of easy-VQA per step beside the scenes, each with its questions. Above 0 the "
         "model's vocabulary is the wide one: words of easy-VQA and of robot instructions too.",
     )
-    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate.")
+    lr: float = key(NOT_NEGATIVE, default=2e-3, doc="Peak learning rate.")
     warmup: int = key(
-        NOT_NEGATIVE, 100, doc="Steps over which the learning rate rises to its peak."
+        NOT_NEGATIVE, default=100, doc="Steps over which the learning rate rises to its peak."
     )
-    weight_decay: float = key(NOT_NEGATIVE, 0.02, doc="AdamW's weight decay.")
-    precision: str = key(choice(*PRECISIONS), "bf16", doc="Number format of training.")
+    weight_decay: float = key(NOT_NEGATIVE, default=0.02, doc="AdamW's weight decay.")
+    precision: str = key(choice(*PRECISIONS), default="bf16", doc="Number format of training.")
     compile: bool = key(default=False, doc="Compile the model with torch.compile.")
-    checkpoint_every: int = key(POSITIVE, 1000, doc="Steps between two checkpoints.")
+    checkpoint_every: int = key(POSITIVE, default=1000, doc="Steps between two checkpoints.")
     model: Model = Model()
 
 
@@ -75,20 +77,20 @@ class DualRecipe:
     """Trains the embedded dual encoder on drawn pictures and their captions."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
-    seed: int = key(SEED, 0, doc="Seed of the pictures, the weights and the training.")
-    pictures: int = key(POSITIVE, 60_000, doc="Number of pictures that are trained on.")
+    seed: int = key(SEED, default=0, doc="Seed of the pictures, the weights and the training.")
+    pictures: int = key(POSITIVE, default=60_000, doc="Number of pictures that are trained on.")
     tasks: tuple[str, ...] = key(
         choice(*STREAM_TASKS),
-        tuple(STREAM_TASKS),
+        default=tuple(STREAM_TASKS),
         doc="Tasks whose validation parts the finished model classifies.",
     )
-    steps: int = key(POSITIVE, 3000, doc="Optimizer steps.")
-    batch_size: int = key(POSITIVE, 256, doc="Pictures per step, each with one caption.")
-    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate.")
+    steps: int = key(POSITIVE, default=3000, doc="Optimizer steps.")
+    batch_size: int = key(POSITIVE, default=256, doc="Pictures per step, each with one caption.")
+    lr: float = key(NOT_NEGATIVE, default=2e-3, doc="Peak learning rate.")
     warmup: int = key(
-        NOT_NEGATIVE, 100, doc="Steps over which the learning rate rises to its peak."
+        NOT_NEGATIVE, default=100, doc="Steps over which the learning rate rises to its peak."
     )
-    weight_decay: float = key(NOT_NEGATIVE, 0.02, doc="AdamW's weight decay.")
-    precision: str = key(choice(*PRECISIONS), "auto", doc="Number format of training.")
-    checkpoint_every: int = key(POSITIVE, 500, doc="Steps between two checkpoints.")
+    weight_decay: float = key(NOT_NEGATIVE, default=0.02, doc="AdamW's weight decay.")
+    precision: str = key(choice(*PRECISIONS), default="auto", doc="Number format of training.")
+    checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
     towers: Towers = Towers()

@@ -52,35 +52,37 @@ PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accu
 class StreamTrain:
     """The training on each task of a stream of images."""
 
-    method: str = key(choice(*LEARNERS), "igsp", doc="Learner of the stream.")
-    steps: int = key(POSITIVE, 150, doc="Optimizer steps per task.")
-    batch_size: int = key(POSITIVE, 64, doc="Images per step.")
-    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate of experts.")
+    method: str = key(choice(*LEARNERS), default="igsp", doc="Learner of the stream.")
+    steps: int = key(POSITIVE, default=150, doc="Optimizer steps per task.")
+    batch_size: int = key(POSITIVE, default=64, doc="Images per step.")
+    lr: float = key(NOT_NEGATIVE, default=2e-3, doc="Peak learning rate of experts.")
     router_lr: float = key(
         NOT_NEGATIVE,
-        5e-2,
+        default=5e-2,
         doc="Peak learning rate of routers and scales, whose logits have further to go.",
     )
     warmup: int = key(
-        NOT_NEGATIVE, 10, doc="Steps over which the learning rates rise to their peaks."
+        NOT_NEGATIVE, default=10, doc="Steps over which the learning rates rise to their peaks."
     )
     weight_decay: float = key(
-        NOT_NEGATIVE, 0.01, doc="AdamW's weight decay; routers and scales have none."
+        NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
-    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
+    clip_norm: float = key(POSITIVE, default=1.0, doc="Norm to which gradients are clipped.")
     final_lr_share: float = key(
-        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at a task's last step."
+        UP_TO_ONE,
+        default=0.1,
+        doc="Share of the peak learning rates that is left at a task's last step.",
     )
     label_smoothing: float = key(
-        BELOW_ONE, 0.2, doc="Share of each label that is spread over all classes."
+        BELOW_ONE, default=0.2, doc="Share of each label that is spread over all classes."
     )
     checkpoint_every: int = key(
-        POSITIVE, 100, doc="Steps between two checkpoints; every task ends with one too."
+        POSITIVE, default=100, doc="Steps between two checkpoints; every task ends with one too."
     )
-    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
+    log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
     precision: str = key(
         choice(*PRECISIONS),
-        "float32",
+        default="float32",
         doc="Number format of training; accuracies are always measured in float32.",
     )
 
@@ -89,51 +91,57 @@ class StreamTrain:
 class RobotTrain:
     """The training on each task of a stream of robot tasks."""
 
-    method: str = key(choice(*ROBOT_LEARNERS), "igsp", doc="Learner of the stream.")
-    steps: int = key(POSITIVE, 400, doc="Optimizer steps per task.")
-    batch_size: int = key(POSITIVE, 32, doc="Frames per step.")
-    chunk: int = key(POSITIVE, 8, doc="Actions that are predicted at once.")
+    method: str = key(choice(*ROBOT_LEARNERS), default="igsp", doc="Learner of the stream.")
+    steps: int = key(POSITIVE, default=400, doc="Optimizer steps per task.")
+    batch_size: int = key(POSITIVE, default=32, doc="Frames per step.")
+    chunk: int = key(POSITIVE, default=8, doc="Actions that are predicted at once.")
     flow_samples: int = key(
-        POSITIVE, 8, doc="Flow times, each with its noise, that are drawn per image."
+        POSITIVE, default=8, doc="Flow times, each with its noise, that are drawn per image."
     )
-    lr: float = key(NOT_NEGATIVE, 2e-3, doc="Peak learning rate of low-rank experts.")
-    router_lr: float = key(NOT_NEGATIVE, 5e-2, doc="Peak learning rate of routers and scales.")
+    lr: float = key(NOT_NEGATIVE, default=2e-3, doc="Peak learning rate of low-rank experts.")
+    router_lr: float = key(
+        NOT_NEGATIVE, default=5e-2, doc="Peak learning rate of routers and scales."
+    )
     expert_lr: float = key(
-        NOT_NEGATIVE, 1e-3, doc="Peak learning rate of the action expert's own weights."
+        NOT_NEGATIVE, default=1e-3, doc="Peak learning rate of the action expert's own weights."
     )
     warmup: int = key(
-        NOT_NEGATIVE, 40, doc="Steps over which the learning rates rise to their peaks."
+        NOT_NEGATIVE, default=40, doc="Steps over which the learning rates rise to their peaks."
     )
     weight_decay: float = key(
-        NOT_NEGATIVE, 0.01, doc="AdamW's weight decay; routers and scales have none."
+        NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
-    clip_norm: float = key(POSITIVE, 1.0, doc="Norm to which gradients are clipped.")
+    clip_norm: float = key(POSITIVE, default=1.0, doc="Norm to which gradients are clipped.")
     normalization: str = key(
         choice(*NORMALIZATIONS),
-        "mean_std",
+        default="mean_std",
         doc="How each task's positions and actions are scaled: to mean 0 and standard deviation "
         "1, or by their 1 % and 99 % quantiles.",
     )
     final_lr_share: float = key(
-        UP_TO_ONE, 0.1, doc="Share of the peak learning rates that is left at a task's last step."
+        UP_TO_ONE,
+        default=0.1,
+        doc="Share of the peak learning rates that is left at a task's last step.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,
-        None,
+        default=None,
         later=True,
         doc="Parts of the backbone that do not learn, as in a recipe of a policy; a learner with "
         "experts puts none beside their maps. Null: all learns that the learner trains.",
     )
     validation_share: float = key(
-        SHARE, 0.05, doc="Share of each task's episodes that is kept for the validation loss."
+        SHARE,
+        default=0.05,
+        doc="Share of each task's episodes that is kept for the validation loss.",
     )
     checkpoint_every: int = key(
-        POSITIVE, 100, doc="Steps between two checkpoints; every task ends with one too."
+        POSITIVE, default=100, doc="Steps between two checkpoints; every task ends with one too."
     )
-    log_every: int = key(POSITIVE, 25, doc="Steps between two lines of metrics.jsonl.")
+    log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
     precision: str = key(
         choice(*PRECISIONS),
-        "auto",
+        default="auto",
         doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
         "float32.",
     )
@@ -143,16 +151,16 @@ class RobotTrain:
 class RobotDemos:
     """The demonstrations of each task of a stream."""
 
-    episodes: int = key(POSITIVE, 300, doc="Number of episodes that are recorded per task.")
+    episodes: int = key(POSITIVE, default=300, doc="Number of episodes that are recorded per task.")
     noise: float = key(
         NOT_NEGATIVE,
-        0.3,
+        default=0.3,
         doc="Standard deviation of the noise on executed actions; 1 is their full range.",
     )
-    seed: int = key(SEED, 0, doc="Seed of the recording; equal seeds give equal bytes.")
+    seed: int = key(SEED, default=0, doc="Seed of the recording; equal seeds give equal bytes.")
     paths: tuple[str, ...] | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Demonstrations to use instead of recording: one file or folder per task, in the "
         "order of `tasks`.",
     )
@@ -162,17 +170,19 @@ class RobotDemos:
 class RobotRollout:
     """How success is measured after each task of a stream."""
 
-    episodes: int = key(POSITIVE, 50, doc="Number of episodes per task.")
+    episodes: int = key(POSITIVE, default=50, doc="Number of episodes per task.")
     seed: int = key(
-        SEED, 0, later=True, doc="Seed of the episodes, none of which is a demonstration's."
+        SEED, default=0, later=True, doc="Seed of the episodes, none of which is a demonstration's."
     )
     colors: str = key(
-        choice(*COLOR_SETS), "seen", doc="Set of colours that the targets are drawn from."
+        choice(*COLOR_SETS), default="seen", doc="Set of colours that the targets are drawn from."
     )
-    replan: int = key(POSITIVE, 4, doc="Actions that are executed before the next prediction.")
+    replan: int = key(
+        POSITIVE, default=4, doc="Actions that are executed before the next prediction."
+    )
     split: str = key(
         choice(*SPLITS),
-        "evaluation",
+        default="evaluation",
         doc="Episodes and questions that figures are of; validation takes others, to choose "
         "settings on.",
     )
@@ -187,15 +197,15 @@ class Inference:
 
     rank: int = key(
         NOT_NEGATIVE,
-        16,
+        default=16,
         doc="Directions with a variance of their own; all others share one.",
     )
     shrinkage: float = key(
-        UP_TO_ONE, 0.03, doc="Share of each variance that is replaced by the mean of all."
+        UP_TO_ONE, default=0.03, doc="Share of each variance that is replaced by the mean of all."
     )
     quantile: float = key(
         BELOW_ONE,
-        0.05,
+        default=0.05,
         doc="Share of a task's own training images that count as belonging to no task.",
     )
 
@@ -205,7 +215,7 @@ class Sequential:
     """Options of the learner sequential, which trains all weights, task after task."""
 
     lr: float = key(
-        NOT_NEGATIVE, 3e-4, doc="Peak learning rate of all weights, instead of `train.lr`."
+        NOT_NEGATIVE, default=3e-4, doc="Peak learning rate of all weights, instead of `train.lr`."
     )
 
 
@@ -213,32 +223,32 @@ class Sequential:
 class SequentialLora:
     """Options of the learner sequential-lora, which trains one LoRA, task after task."""
 
-    rank: int = key(POSITIVE, 8, doc="Rank of the LoRA.")
+    rank: int = key(POSITIVE, default=8, doc="Rank of the LoRA.")
 
 
 @section
 class IsolatedLora:
     """Options of the learner isolated-lora, which trains one LoRA per task."""
 
-    rank: int = key(POSITIVE, 8, doc="Rank of each LoRA.")
+    rank: int = key(POSITIVE, default=8, doc="Rank of each LoRA.")
 
 
 @section
 class MoeAdapters:
     """Options of the learner moe-adapters."""
 
-    rank: int = key(POSITIVE, 4, doc="Rank of each expert.")
+    rank: int = key(POSITIVE, default=4, doc="Rank of each expert.")
     experts_per_task: int = key(
-        POSITIVE, 2, doc="Experts that the pool holds for each task of the stream."
+        POSITIVE, default=2, doc="Experts that the pool holds for each task of the stream."
     )
     top: int = key(
         POSITIVE,
-        2,
+        default=2,
         doc="Experts that an example uses, and that are frozen after a task.",
     )
     router_lr: float = key(
         NOT_NEGATIVE,
-        2e-3,
+        default=2e-3,
         doc="Peak learning rate of its linear routers and scales, instead of `train.router_lr`.",
     )
 
@@ -247,10 +257,10 @@ class MoeAdapters:
 class Prototype:
     """Options of the learner prototype."""
 
-    rank: int = key(POSITIVE, 8, doc="Rank of each expert.")
+    rank: int = key(POSITIVE, default=8, doc="Rank of each expert.")
     similarity: float = key(
         UP_TO_ONE,
-        0.9,
+        default=0.9,
         doc="Cosine of two tasks' mean features from which they share their expert.",
     )
 
@@ -259,41 +269,45 @@ class Prototype:
 class Igsp:
     """Options of the learner igsp."""
 
-    rank: int = key(POSITIVE, 4, doc="Rank of each expert.")
-    candidates: int = key(POSITIVE, 2, doc="New experts per task and map, before pruning.")
+    rank: int = key(POSITIVE, default=4, doc="Rank of each expert.")
+    candidates: int = key(POSITIVE, default=2, doc="New experts per task and map, before pruning.")
     history: float = key(
-        SHARE, 0.2, doc="Routing mass that the experts of earlier tasks begin with."
+        SHARE, default=0.2, doc="Routing mass that the experts of earlier tasks begin with."
     )
     reuse: float = key(
         NOT_NEGATIVE,
-        0.1,
+        default=0.1,
         doc="Weight of the share of new parameters that phase 1 asks for; 0 is an ablation.",
     )
     norm: float = key(
-        NOT_NEGATIVE, 0.01, doc="Weight of the new experts' squared norms in phase 1."
+        NOT_NEGATIVE, default=0.01, doc="Weight of the new experts' squared norms in phase 1."
     )
     kappa: float = key(
         SHARE,
-        0.5,
+        default=0.5,
         doc="Share of the uniform routing weight under which an expert may be pruned, if its "
         "`load` is small too.",
     )
     load: float = key(
         SHARE,
-        0.1,
+        default=0.1,
         doc="Share of the summed p ||f|| (routing weight times output norm) under which an expert "
         "may be pruned, if its weight is small too.",
     )
-    identify: float = key(SHARE, 0.5, doc="Share of a task's steps that phase 1 takes at most.")
+    identify: float = key(
+        SHARE, default=0.5, doc="Share of a task's steps that phase 1 takes at most."
+    )
     tolerance: float = key(
         NOT_NEGATIVE,
-        0.03,
+        default=0.03,
         doc="Total variation of the routing between two checks under which routers stand still.",
     )
     checks: int = key(
-        POSITIVE, 3, doc="Successive checks at which routers have to stand still to end phase 1."
+        POSITIVE,
+        default=3,
+        doc="Successive checks at which routers have to stand still to end phase 1.",
     )
-    check_every: int = key(POSITIVE, 10, doc="Steps between two checks.")
+    check_every: int = key(POSITIVE, default=10, doc="Steps between two checks.")
     prune: bool = key(default=True, doc="Whether experts are pruned; false is an ablation.")
     orthogonal: bool = key(
         default=False,
@@ -312,23 +326,23 @@ class StreamRecipe:
     )
     path: str | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Folder of a stream of image files: TASK/{train,test}/CLASS/IMAGE.",
     )
     order: tuple[str, ...] | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Tasks of the stream as they come; null takes all of them in the stream's own order.",
     )
     encoder: str = key(
         NOT_EMPTY,
-        "embedded-dual",
+        default="embedded-dual",
         doc="'embedded-dual', the folder of a checkpoint, or the folder or id of a CLIP model.",
     )
-    seed: int = key(SEED, 0, doc="Seed of the training.")
+    seed: int = key(SEED, default=0, doc="Seed of the training.")
     split: str = key(
         choice(*PARTS),
-        TEST,
+        default=TEST,
         doc="Part of each task's images that accuracies are of; validation is there to choose "
         "settings on.",
     )
@@ -350,11 +364,11 @@ class RobotStreamRecipe:
     tasks: tuple[str, ...] = key(TASK, doc="Tasks in the order in which they are learned.")
     backbone: str = key(
         NOT_EMPTY,
-        "embedded",
+        default="embedded",
         doc="'embedded', 'embedded-easy', the folder or file of a checkpoint, or the folder or id "
         "of a Hugging Face model.",
     )
-    seed: int = key(SEED, 0, doc="Seed of the training.")
+    seed: int = key(SEED, default=0, doc="Seed of the training.")
     demos: RobotDemos = RobotDemos()
     train: RobotTrain = RobotTrain()
     expert: Expert = Expert()

@@ -70,7 +70,7 @@ class PolicyVariant(Variant):
 
     against: str | None = key(
         NOT_EMPTY,
-        None,
+        default=None,
         doc="Variant that its success, return, drop and costs are compared with, e.g. a naive of "
         "the same learning rate and optimizer. Null: the variant named naive.",
     )
@@ -88,20 +88,22 @@ class Tuning:
     highest validation accuracy.
     """
 
-    task: str = key(TASK, "reach", doc="Task that the knobs are chosen on.")
+    task: str = key(TASK, default="reach", doc="Task that the knobs are chosen on.")
     seed: int = key(
-        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+        SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
-    questions: int = key(POSITIVE, 1400, doc="Number of questions on validation scenes.")
+    questions: int = key(POSITIVE, default=1400, doc="Number of questions on validation scenes.")
     episodes: int = key(
-        POSITIVE, 100, doc="Number of validation rollouts, with the colours of training."
+        POSITIVE, default=100, doc="Number of validation rollouts, with the colours of training."
     )
     within: float = key(
-        NOT_NEGATIVE, 3.0, doc="How far from the best success a value may be, in percentage points."
+        NOT_NEGATIVE,
+        default=3.0,
+        doc="How far from the best success a value may be, in percentage points.",
     )
     runs: int | None = key(
         POSITIVE,
-        None,
+        default=None,
         doc="Number of values that every tuned variant must be given, so that none has more trials "
         "than another. Null lets them differ.",
     )
@@ -123,7 +125,7 @@ class StudyRecipe:
     tuning: Tuning | None = None
     per_seed: tuple[str, ...] | None = key(
         choice(*PER_SEED),
-        None,
+        default=None,
         doc="What is drawn anew with every seed. What is not named is one and the same for all "
         "seeds: an interval says nothing of others then.",
     )
@@ -165,11 +167,11 @@ class StreamTuning:
 
     stream: str = key(NOT_EMPTY, doc="Stream that the knobs are chosen on.")
     seed: int = key(
-        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+        SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
     within: float = key(
         NOT_NEGATIVE,
-        0.5,
+        default=0.5,
         doc="How far from its best validation Last a value may be, in percentage points.",
     )
 
@@ -210,11 +212,11 @@ class RobotStreamTuning:
     """
 
     seed: int = key(
-        SEED, 1000, doc="Seed of the trainings; it is none of the seeds that are compared."
+        SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
     within: float = key(
         NOT_NEGATIVE,
-        3.0,
+        default=3.0,
         doc="How far from its best success a value may be, in percentage points.",
     )
 
@@ -235,7 +237,7 @@ class RobotStreamStudyRecipe:
     tuning: RobotStreamTuning | None = None
     per_seed: tuple[str, ...] | None = key(
         choice(*_NO_ANCHOR),
-        None,
+        default=None,
         doc="What is drawn anew with every seed. What is not named is one and the same for all "
         "seeds: an interval says nothing of others then.",
     )

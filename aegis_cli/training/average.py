@@ -9,7 +9,7 @@ validation loss is taken of; the training state has both.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -91,7 +91,7 @@ class Average:
         self._step = step
 
     @contextlib.contextmanager
-    def in_place(self) -> Iterator[None]:
+    def in_place(self) -> Generator[None]:
         """Let the parameters have the average's values inside the block, and their own after it."""
         self._exchange()
         try:

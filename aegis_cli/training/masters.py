@@ -10,7 +10,7 @@ is mixed-precision training with master weights (Micikevicius et al. 2018, arXiv
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -68,7 +68,7 @@ class Masters:
         return sum(p.numel() * BF16.itemsize for p in self._parameters)
 
     @contextlib.contextmanager
-    def rounded(self) -> Iterator[None]:
+    def rounded(self) -> Generator[None]:
         """Let passes inside the block see the weights rounded.
 
         Afterwards the parameters are float32 again, with the values that they had, and so are their

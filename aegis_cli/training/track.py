@@ -9,7 +9,7 @@ variables.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -70,7 +70,7 @@ def check(recipe: Recipe) -> None:
 
 
 @contextmanager
-def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Iterator[Log]:
+def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Generator[Log]:
     """Trackers of a run, opened and in the end closed; without any, nothing is logged.
 
     Args:
@@ -137,7 +137,7 @@ def _figures(line: Mapping[str, float]) -> dict[str, float]:
 
 
 @contextmanager
-def _tensorboard(recipe: Recipe, out: Path, done: int, job: str = "") -> Iterator[Tracker]:
+def _tensorboard(recipe: Recipe, out: Path, done: int, job: str = "") -> Generator[Tracker]:
     """Event files in the run's folder: tensorboard --logdir runs."""
     from torch.utils.tensorboard import SummaryWriter
 
@@ -183,7 +183,7 @@ def _moving(name: str, video: Path) -> Any:
 
 
 @contextmanager
-def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Iterator[Tracker]:
+def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Generator[Tracker]:
     """Trackio's own local database: trackio show --project aegis."""
     import trackio
 
@@ -195,7 +195,7 @@ def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Iterator[Tr
 
 
 @contextmanager
-def _wandb(recipe: Recipe, out: Path, done: int, job: str = "training") -> Iterator[Tracker]:
+def _wandb(recipe: Recipe, out: Path, done: int, job: str = "training") -> Generator[Tracker]:
     """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them.
 
     A run that is finished offline cannot be opened again: what is measured later is a run of the

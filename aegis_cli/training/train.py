@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -241,7 +241,7 @@ def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inp
 
 
 @contextmanager
-def _reading_state(out: Path) -> Iterator[None]:
+def _reading_state(out: Path) -> Generator[None]:
     """Say how a run can go on whose last training state would have to be written again.
 
     Raises:
@@ -426,7 +426,7 @@ def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
 
 
 @contextmanager
-def batches_of(run: TrainingRun, steps: Sequence[int]) -> Iterator[Iterator[RobotBatch]]:
+def batches_of(run: TrainingRun, steps: Sequence[int]) -> Generator[Iterator[RobotBatch]]:
     """This process's frames of each of these steps, fetched ahead.
 
     For a GPU several threads prepare them, as a model's own processor can take longer for a batch
@@ -487,7 +487,7 @@ def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) ->
 
 
 @contextmanager
-def _good_steps_saved(run: TrainingRun) -> Iterator[None]:
+def _good_steps_saved(run: TrainingRun) -> Generator[None]:
     """Write a checkpoint of the good steps where a later one turns out not to be finite.
 
     Raises:

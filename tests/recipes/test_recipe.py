@@ -510,8 +510,8 @@ def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> Non
 
     @dataclasses.dataclass(frozen=True)
     class Section:
-        moved: int = key(POSITIVE, 5, first=3)
-        stayed: int = key(POSITIVE, 1)
+        moved: int = key(POSITIVE, default=5, first=3)
+        stayed: int = key(POSITIVE, default=1)
         plain: bool = False
 
     assert changed(Section()) == {"moved": 5} and changed(Section(moved=3)) == {}
@@ -523,8 +523,8 @@ def test_a_key_that_came_later_is_no_part_of_a_record_until_it_is_used():
 
     @dataclasses.dataclass(frozen=True)
     class Section:
-        old: int = key(POSITIVE, 1)
-        late: int = key(POSITIVE, 2, later=True)
+        old: int = key(POSITIVE, default=1)
+        late: int = key(POSITIVE, default=2, later=True)
 
     assert recorded(Section()) == {"old": 1}
     assert recorded(Section(old=3, late=4)) == {"old": 3, "late": 4}

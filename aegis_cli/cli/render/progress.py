@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TextIO
 
@@ -27,7 +27,7 @@ Clock = Callable[[], float]
 
 
 @contextmanager
-def progress(clock: Clock = time.monotonic) -> Iterator[OnEvent]:
+def progress(clock: Clock = time.monotonic) -> Generator[OnEvent]:
     """A listener that shows each stage's share, rate, remaining time and metrics on stderr."""
     console = Terminal(stderr=True, highlight=False)
     if not sys.stderr.isatty() or console.is_dumb_terminal:

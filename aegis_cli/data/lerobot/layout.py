@@ -23,7 +23,7 @@ import json
 import math
 import re
 import string
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -376,7 +376,7 @@ def check_episodes(where: Path, info: Info, episodes: Mapping[int, EpisodeIndex]
 
 
 @contextlib.contextmanager
-def damaged(path: Path) -> Iterator[None]:
+def damaged(path: Path) -> Generator[None]:
     """Turn exceptions of wrong types, missing keys or wrong values into an error about a file."""
     try:
         yield
@@ -389,7 +389,7 @@ def damaged(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def reading_parquet(path: Path) -> Iterator[None]:
+def reading_parquet(path: Path) -> Generator[None]:
     """Turn a parquet file that is missing or damaged into the one error a user sees."""
     from pyarrow import ArrowException
 

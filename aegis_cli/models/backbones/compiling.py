@@ -7,7 +7,7 @@ compiled for one of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from typing import Any
 
@@ -57,7 +57,7 @@ class CompiledForward:
         self._cache = cache_argument(layer)
 
     @contextmanager
-    def telling(self, tell: Callable[[KeyValue], None]) -> Iterator[None]:
+    def telling(self, tell: Callable[[KeyValue], None]) -> Generator[None]:
         """Tell the keys and values of each pass inside the block."""
         self._tell = tell
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,7 +37,7 @@ _UNLOADABLE = (
 
 
 @contextlib.contextmanager
-def loading(folder: Path, what: str) -> Iterator[None]:
+def loading(folder: Path, what: str) -> Generator[None]:
     """What transformers finds wrong with a folder, as the one error a user sees."""
     try:
         yield
@@ -77,7 +77,7 @@ def complete(kind: Any, folder: Path, config: Any) -> Any:
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def quiet() -> Generator[None]:
     """Without transformers' warnings and bars: what matters of them is an error here."""
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -440,7 +440,7 @@ def _layer_types(text: Any, rotary: nn.Module) -> Sequence[str] | None:
 
 
 @contextmanager
-def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Iterator[None]:
+def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Generator[None]:
     """Inside the block, a head that is given [B, T, D] sees [1, n, D] of it."""
 
     def chosen(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -454,7 +454,7 @@ def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Iterator[None]:
 
 
 @contextmanager
-def _greedy(model: transformers.PreTrainedModel) -> Iterator[None]:
+def _greedy(model: transformers.PreTrainedModel) -> Generator[None]:
     """Inside the block, a model generates the likeliest token after each, until one that ends it.
 
     Its own settings may sample, and may penalise the words that a question has, such as

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,7 +44,7 @@ class Processors:
         return self  # copies of a model may share it: no call depends on those before
 
     @contextmanager
-    def one(self) -> Iterator[Any]:
+    def one(self) -> Generator[Any]:
         """A copy that nobody else calls meanwhile; as many are made as are in use at once."""
         try:
             processor = self._idle.pop()

@@ -9,7 +9,7 @@ computes a second time comes later and meets no hook.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,7 +66,7 @@ def attention(layer: nn.Module) -> nn.Module:
 
 
 @contextlib.contextmanager
-def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
+def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
     """Record what happens in `layers`, and which positions their rotary embedding is asked for."""
     seen = Seen()
 
@@ -104,7 +104,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Iterator[Seen]:
 
 
 @contextlib.contextmanager
-def unrotated(layers: nn.ModuleList) -> Iterator[dict[int, Tensor]]:
+def unrotated(layers: nn.ModuleList) -> Generator[dict[int, Tensor]]:
     """The keys that each attention of a pass would have without its rotary embedding, by layer."""
     seen = Seen()
     plain: dict[int, Tensor] = {}
