@@ -840,6 +840,58 @@ def compare(
     stages.COMPARE.run(paths, wide=wide, as_json=as_json)
 
 
+@app.command(short_help="Compare two models' scores on standard benchmarks.")
+def scores(
+    before: Annotated[
+        Path,
+        Argument(
+            metavar="BEFORE",
+            help="Folder that lmms-eval or lm-evaluation-harness wrote with --log_samples.",
+        ),
+    ],
+    after: Annotated[
+        Path, Argument(metavar="AFTER", help="The same of the fine-tuned model, on the same tasks.")
+    ],
+    max_drop: Annotated[
+        float | None,
+        Option(
+            help="Exit 1 if any score drops by more percentage points than this.",
+            callback=not_negative,
+        ),
+    ] = None,
+    gate: Annotated[
+        Gate,
+        Option(
+            help="What --max-drop limits: the drop as measured, or the upper end of its 95 % "
+            "interval, so that too few questions cannot pass."
+        ),
+    ] = Gate.mean,
+    wide: Wide = False,
+    as_json: Json = False,
+) -> None:
+    """Compare what two models scored on standard benchmarks, question by question.
+
+    lmms-eval asks its benchmarks of any run or backbone as the model aegis:
+    lmms-eval --model aegis --model_args pretrained=runs/x --tasks textvqa_val,pope --log_samples
+    --output_path scores/x. Both models are asked the same questions, so that the drop is one of
+    pairs.
+
+    \b
+    Example: aegis scores scores/before scores/x --max-drop 1 --gate upper
+    """
+    report = stages.SCORES.run(before, after, max_drop, gate.value, wide=wide, as_json=as_json)
+    failed = None
+    if report.passed is False:
+        lost = [s for s in report.scores if not s.passed]
+        names = ", ".join(f"{s.task} ({s.metric})" for s in lost)
+        limit = f"more than --max-drop {max_drop:g} points"
+        if gate is Gate.upper:
+            limit += ", by the upper end of the drop's interval"
+        failed = f"{names} dropped {limit}"
+    _say_gate(failed)
+    _end_at_gate(failed)
+
+
 @app.command(short_help="Write a run, job or study as one HTML page.")
 def report(
     path: Annotated[

@@ -47,7 +47,7 @@ def decoded(data: bytes) -> np.ndarray:
                     Exception
                 ):  # damaged metadata: viewers show the picture as it lies
                     ImageOps.exif_transpose(image, in_place=True)
-                return _rgb(image)
+                return rgb(image)
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise ValueError(str(error) or type(error).__name__) from error
 
@@ -61,7 +61,12 @@ def _raster() -> list[str]:
     return [name for name in RASTER if name in Image.OPEN]
 
 
-def _rgb(image: Image) -> np.ndarray:
+def rgb(image: Image) -> np.ndarray:
+    """Pixels [H, W, 3] uint8 of an image that Pillow has read; what is transparent lies on white.
+
+    Raises:
+        ValueError: grey of no known range.
+    """
     from PIL import Image as pillow
 
     if image.mode.startswith("I;16"):  # where Pillow's own conversion makes all above 255 white

@@ -233,10 +233,14 @@ def warn_of_few_questions(
     max_drop: float | None,
     stage: str,
     on_event: OnEvent,
+    fix: str = "Ask more (--questions, probe.questions of a recipe)",
 ) -> None:
     """Warn where the questions tell the drop less finely than its gate asks, and chance decides.
 
     A drop that is far past the gate is settled by few. None of 0 points can be told by any number.
+
+    Args:
+        fix: how more are asked.
     """
     if not max_drop or drop_interval is None:
         return
@@ -246,8 +250,8 @@ def warn_of_few_questions(
         return
     text = (
         f"{questions:,} questions tell the drop to ±{apart:.2f} points, too coarsely for a "
-        f"gate at {max_drop:g}: whether it passes is up to chance, or to how few they are. Ask "
-        "more (--questions, probe.questions of a recipe), or allow a larger drop"
+        f"gate at {max_drop:g}: whether it passes is up to chance, or to how few they are. "
+        f"{fix}, or allow a larger drop"
     )
     on_event(Warned(stage, text))
 

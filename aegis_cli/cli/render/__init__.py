@@ -31,6 +31,7 @@ from aegis_cli.cli.render.tables import (
     pretrain,
     probe,
     recipe_list,
+    scores,
     serving,
 )
 
@@ -62,6 +63,7 @@ __all__ = [
     "recipe_list",
     "routing_plot",
     "save_table",
+    "scores",
     "serving",
     "show",
     "stream",

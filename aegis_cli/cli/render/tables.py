@@ -77,6 +77,23 @@ def _drifts(layers: Sequence[Any]) -> Table:
     return plain_table(("Layer", "W2²", "Before"), rows)
 
 
+def scores(report: Any) -> RenderableType:
+    """A line per score of a benchmark."""
+    shown = {
+        "Task": lambda s: s.task,
+        "Metric": lambda s: s.metric,
+        "Questions": lambda s: f"{s.questions:,}",
+        "Before %": lambda s: percent(s.before, 2),
+        "After %": lambda s: percent(s.after, 2),
+        "Drop (points)": lambda s: fixed(s.drop_points, 2),
+        "95 % interval": lambda s: " to ".join(fixed(end, 2) for end in s.drop_interval),
+    }
+    if report.max_drop is not None:
+        shown["Gate"] = lambda s: "passed" if s.passed else "failed"
+    rows = [[show(score) for show in shown.values()] for score in report.scores]
+    return plain_table(list(shown), rows, left=2)
+
+
 def doctor(report: Any) -> RenderableType:
     """A line per check, and below what to do about those that are not well."""
     rows = [(check.name, check.state, check.found) for check in report.checks]

@@ -140,17 +140,31 @@ def score(graded: Sequence[Graded]) -> Score:
 def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval:
     """95 % interval of the accuracy lost, from the differences of the same questions.
 
-    The drop is the share of questions that were lost less the share that was won. Each has Wilson's
-    interval, and the ends of both are put together by squares (MOVER: Zou & Donner 2008, Statistics
-    in Medicine 27(10), 1693-1702), with the correlation of two shares of the same questions. So no
-    change at all is no certainty. Questions about one image share its difficulty, so they count
-    as fewer: as many as would tell as much if they were independent.
+    Questions about one image share its difficulty, so they count as fewer: as many as would tell as
+    much if they were independent.
     """
     # Differences of pairs: how hard a question is cancels, which two accuracies apart would not.
     pairs = zip(before, after, strict=True)
-    change = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
-    count = len(change) / _design_effect(change, [g.image for g in after])
-    lost, won = float((change > 0).mean()), float((change < 0).mean())
+    lost = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
+    return mean_loss_interval(lost, [g.image for g in after])
+
+
+def mean_loss_interval(losses: np.ndarray, cluster_of: Sequence[int]) -> Interval:
+    """95 % interval of a mean of losses, each in [-1, 1].
+
+    The mean is what was lost less what was won. Each has Wilson's interval, and the ends of both
+    are put together by squares (MOVER: Zou & Donner 2008, Statistics in Medicine 27(10),
+    1693-1702), with the correlation of two shares of the same questions. So no change at all is no
+    certainty. Losses of less than 1 vary less than the share that Wilson's interval takes their
+    mean for, so that it is rather too wide for them.
+
+    Args:
+        losses: [N].
+        cluster_of: N numbers; losses in one cluster are not independent.
+    """
+    count = len(losses) / _design_effect(losses, cluster_of)
+    lost = float(losses.clip(min=0).mean())
+    won = float((-losses).clip(min=0).mean())
     least_lost, most_lost = wilson_interval(lost * count, count)
     least_won, most_won = wilson_interval(won * count, count)
     # A question that was lost cannot have been won: of two shares, one is small where the other is

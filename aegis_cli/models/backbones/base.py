@@ -155,11 +155,14 @@ class Backbone(nn.Module, ABC):
         """One forward pass over image and prompt tokens."""
 
     @abstractmethod
-    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+    def answer(
+        self, images: Images, questions: Sequence[str], most: int | None = None
+    ) -> list[str]:
         """Answers by greedy autoregressive decoding.
 
         Args:
-            images: one per question, [B, H, W, 3] uint8.
+            images: one per question, or several where the backbone `reads_several`.
+            most: tokens of an answer at most; None: as many as a short answer has.
         """
 
     def prepare_answers(

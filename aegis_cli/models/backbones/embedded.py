@@ -219,12 +219,14 @@ class EmbeddedVLM(Backbone):
         return Batch(self.pixels(images), ids, mask)
 
     @torch.no_grad()
-    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+    def answer(
+        self, images: Tensor, questions: Sequence[str], most: int | None = None
+    ) -> list[str]:
         image = self._shared_image_pass(images)
         rows = [self.tokenizer.prompt(text) for text in questions]
         prompt_length = torch.tensor([[len(row)] for row in rows], device=self.device)
         answers: list[list[int]] = [[] for _ in rows]
-        for _ in range(MAX_ANSWER):
+        for _ in range(MAX_ANSWER if most is None else min(most, MAX_ANSWER)):
             ids, mask = self._pad([row + said for row, said in zip(rows, answers, strict=True)])
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, image)
             last = hidden[-1].squeeze(1)[torch.arange(len(rows)), mask.sum(-1) - 1]  # [B, D]

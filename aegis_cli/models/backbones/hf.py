@@ -250,8 +250,11 @@ class HFBackbone(Backbone):
         batch = self._prompter.process(images, prompts, "right")
         return self._prompter.padded(batch, self._multiple)
 
-    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
-        return self._generated(self._to_answer(images, questions), [MAX_ANSWER] * len(questions))
+    def answer(
+        self, images: Images, questions: Sequence[str], most: int | None = None
+    ) -> list[str]:
+        tokens = MAX_ANSWER if most is None else most
+        return self._generated(self._to_answer(images, questions), [tokens] * len(questions))
 
     def _to_answer(self, images: Images, questions: Sequence[str]) -> Batch:
         # Padding on the left, so that what is generated follows each prompt directly.

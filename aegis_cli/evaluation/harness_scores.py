@@ -1,0 +1,339 @@
+"""`aegis scores`: what two models scored on the same benchmarks, question by question.
+
+lmms-eval and lm-evaluation-harness write a line of JSON for every question where they are given
+`--log_samples --output_path FOLDER`. Two such folders, of a model before and after fine-tuning,
+have the same questions. So their difference is one of pairs, which is known far more closely than
+two averages apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import textwrap
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.data.vqa.metrics import mean_loss_interval
+from aegis_cli.evaluation import probe, results
+
+# How the two harnesses name their files.
+_SAMPLES = (
+    re.compile(r"(?P<date>\d{8}_\d{6})_samples_(?P<task>.+)\.jsonl"),
+    re.compile(r"samples_(?P<task>.+)_(?P<date>\d{4}-\d\d-\d\dT[\d.:-]+)\.jsonl"),
+)
+_RESULTS = ("{date}_results.json", "results_{date}.json")
+# Keys of a line that are no metric.
+_NO_METRIC = frozenset(
+    "doc_id doc target arguments input input_media resps filtered_resps filter metrics "
+    "token_counts doc_hash prompt_hash target_hash".split()
+)
+# Where a metric is an object, its key that says how the question was answered.
+_NOTED = ("score", "is_correct", "correct")
+_WRITTEN = "what lmms-eval or lm-evaluation-harness writes with --log_samples --output_path FOLDER"
+
+
+@dataclass(frozen=True)
+class ScoreDrop:
+    """One metric of one benchmark.
+
+    Attributes:
+        task, metric: as the harness names them.
+        questions: that have the metric, in both models' files.
+        before, after: means over these questions, in [0, 1].
+        drop_points: before less after, percentage points; drop_interval: its 95 % interval.
+        passed: whether the gate lets the drop pass; None without a gate.
+    """
+
+    task: str
+    metric: str
+    questions: int
+    before: float
+    after: float
+    drop_points: float
+    drop_interval: tuple[float, float]
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class ScoresReport:
+    """What was lost on every benchmark that both models were asked.
+
+    Attributes:
+        before, after: where the scores were read.
+        scores: one for each metric of each task, in the tasks' alphabetical order.
+        max_drop: points; None without a gate. gate: what of a drop it limits.
+        passed: whether every score passes; None without a gate.
+    """
+
+    before: str
+    after: str
+    scores: list[ScoreDrop]
+    max_drop: float | None
+    gate: str
+    passed: bool | None
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass
+class _Log:
+    """One task's lines.
+
+    Attributes:
+        asked: by the question's number, what was asked, and the reference answer.
+        values: by metric and question, the number that the harness gave; None where it is none.
+        falling: metrics of which less is better.
+    """
+
+    path: Path
+    asked: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    values: dict[str, dict[str, float | None]] = field(default_factory=lambda: defaultdict(dict))
+    falling: frozenset[str] = frozenset()
+
+
+def run(
+    before: Path,
+    after: Path,
+    max_drop: float | None = None,
+    gate: str = results.MEAN,
+    on_event: OnEvent = ignore,
+) -> ScoresReport:
+    """Compare the scores of two models on the same questions.
+
+    Args:
+        before, after: folders that the harness wrote, or single files of samples. Of several
+            evaluations of a task in one folder the newest counts, and a warning says so.
+        max_drop: points that no score may drop by.
+        gate: what of a drop it limits: MEAN, the drop as measured, or UPPER, the upper end of its
+            interval.
+
+    Raises:
+        AegisError: no samples, no task or score in common, or questions that differ.
+    """
+    if before.exists() and after.exists() and before.samefile(after):
+        found = f"'{before}' before and after"
+        raise AegisError(found, "the scores of two models", "give the other one's folder")
+    first, second = _tasks(before, on_event), _tasks(after, on_event)
+    _warn_of_lone(first.keys() ^ second.keys(), before, after, on_event)
+    scores: list[ScoreDrop] = []
+    for task in sorted(first.keys() & second.keys()):
+        logs = _read(first[task]), _read(second[task])
+        for metric in _comparable(task, logs, on_event):
+            scores.append(_drop(task, metric, logs, max_drop, gate, on_event))
+    if not scores:
+        raise AegisError(
+            f"no score of one question in common between '{before}' and '{after}'",
+            f"{_WRITTEN}, of the same tasks",
+            "ask both models the same --tasks",
+        )
+    passed = None if max_drop is None else all(score.passed for score in scores)
+    return ScoresReport(str(before), str(after), scores, max_drop, gate, passed)
+
+
+def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
+    """Each task's newest file of samples."""
+    if not place.exists():
+        raise AegisError(f"no '{place}'", f"a folder with {_WRITTEN}", "check the path")
+    found: dict[str, list[tuple[str, Path]]] = {}
+    for path in [place] if place.is_file() else sorted(place.rglob("*.jsonl")):
+        if (named := _named(path)) is not None:
+            task, date = named
+            found.setdefault(task, []).append((date, path))
+    if not found:
+        fix = "evaluate again with --log_samples, and give the folder of --output_path"
+        raise AegisError(f"no file of samples in '{place}'", _WRITTEN, fix)
+    newest = {task: max(own) for task, own in found.items()}
+    for task, own in found.items():
+        if len({path.parent for _, path in own}) > 1:
+            folders = sorted({str(path.parent) for _, path in own})
+            raise AegisError(
+                f"scores of {task} in {len(folders)} folders below '{place}'",
+                "those of one model",
+                f"give one of them, such as '{folders[0]}'",
+            )
+        if len(own) > 1:
+            text = f"{len(own)} evaluations of {task} in '{place}': the newest is read"
+            on_event(Warned("scores", f"{text}, '{newest[task][1].name}'"))
+    return {task: path for task, (_, path) in newest.items()}
+
+
+def _named(path: Path) -> tuple[str, str] | None:
+    """The task and the date that a file of samples is named after."""
+    for shape in _SAMPLES:
+        if (match := shape.fullmatch(path.name)) is not None:
+            return match["task"], match["date"]
+    return None
+
+
+def _warn_of_lone(tasks: set[str], before: Path, after: Path, on_event: OnEvent) -> None:
+    if tasks:
+        names = ", ".join(sorted(tasks))
+        on_event(Warned("scores", f"not in both '{before}' and '{after}', and left out: {names}"))
+
+
+def _read(path: Path) -> _Log:
+    """A task's lines.
+
+    Raises:
+        AegisError: a line that is no question's, or one question twice.
+    """
+    log = _Log(path, falling=_falling(path))
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        for number, line in enumerate(file, start=1):
+            if line.strip():
+                _add(log, number, line)
+    return log
+
+
+def _add(log: _Log, number: int, line: bytes) -> None:
+    where = f"line {number} of '{log.path}'"
+    try:
+        row = files.parse_json(line)
+    except ValueError as error:
+        raise AegisError(f"{where}: not JSON ({error})", _WRITTEN, "evaluate again") from error
+    if not isinstance(row, dict) or "doc_id" not in row:
+        raise AegisError(f"{where}: no question's doc_id", _WRITTEN, "evaluate again")
+    question = str(row["doc_id"])
+    # lm-evaluation-harness has no text of the prompt, but its digest.
+    prompt = row.get("input", row.get("prompt_hash"))
+    log.asked[question] = (prompt, row.get("target"))
+    for name, value in _metrics(row):
+        if question in log.values[name]:
+            found = f"{where}: question {question} a second time"
+            raise AegisError(found, "one line for each question", "evaluate again, once")
+        log.values[name][question] = value
+
+
+def _metrics(row: Mapping[str, Any]) -> Iterator[tuple[str, float | None]]:
+    """The names of a line's metrics, with the filter that an answer went through, and values."""
+    names = row.get("metrics") or [key for key in row if key not in _NO_METRIC]
+    chosen = row.get("filter")
+    suffix = "" if chosen in (None, "none") else f", {chosen}"
+    for name in names:
+        yield f"{name}{suffix}", _number(row.get(name))
+
+
+def _number(value: Any) -> float | None:
+    """A metric's value for one question, or what a task that sums up by itself has noted of it."""
+    if isinstance(value, dict):
+        value = next((value[name] for name in _NOTED if name in value), None)
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def _falling(path: Path) -> frozenset[str]:
+    """The metrics of a task of which less is better, as the file of results beside it says."""
+    named = _named(path)
+    assert named is not None  # no other file is read
+    task, date = named
+    for shape in _RESULTS:
+        beside = path.with_name(shape.format(date=date))
+        if beside.is_file():
+            rising = (files.load_json(beside).get("higher_is_better") or {}).get(task) or {}
+            return frozenset(name for name, is_so in rising.items() if is_so is False)
+    return frozenset()
+
+
+def _comparable(task: str, logs: tuple[_Log, _Log], on_event: OnEvent) -> list[str]:
+    """The metrics that both files have and that are a share for every question.
+
+    Others cannot be averaged, or have no points that a gate could limit; a warning says why each of
+    them is left out. Several that are equal for every question are one, and go by the first's name.
+    """
+    before, after = logs
+    shares: list[str] = []
+    for metric in [name for name in before.values if name in after.values]:
+        why = _unfit(metric, logs)
+        if why is not None:
+            on_event(Warned("scores", f"{task}: {metric} is left out: {why}"))
+        elif not any(_are_one(metric, other, logs) for other in shares):
+            shares.append(metric)
+    return shares
+
+
+def _are_one(metric: str, other: str, logs: tuple[_Log, _Log]) -> bool:
+    """Whether two metrics are equal for every question, before and after."""
+    return all(log.values[metric] == log.values[other] for log in logs)
+
+
+def _unfit(metric: str, logs: tuple[_Log, _Log]) -> str | None:
+    """Why a metric is no share in [0, 1] of which more is better; None if it is one."""
+    values = [value for log in logs for value in log.values[metric].values()]
+    numbers = [value for value in values if value is not None]
+    if len(numbers) < len(values):
+        return "not one number a question"
+    if any(metric.split(",")[0] in log.falling for log in logs):
+        return "less of it is better"
+    if min(numbers) < 0 or max(numbers) > 1:
+        return f"from {min(numbers):g} to {max(numbers):g}, which are no shares"
+    return None
+
+
+def _drop(
+    task: str,
+    metric: str,
+    logs: tuple[_Log, _Log],
+    max_drop: float | None,
+    gate: str,
+    on_event: OnEvent,
+) -> ScoreDrop:
+    """What was lost of one metric."""
+    _check_same(task, metric, logs)
+    before, after = (log.values[metric] for log in logs)
+    values = np.array([[before[question], after[question]] for question in before])  # [N, 2]
+    losses = values[:, 0] - values[:, 1]
+    low, high = mean_loss_interval(losses, range(len(losses)))
+    drop, interval = 100 * float(losses.mean()), (100 * low, 100 * high)
+    passed = None
+    if max_drop is not None:
+        passed = results.within(results.limited(drop, interval, gate), max_drop)
+        ask = "Ask more of the task's questions, without a limit"
+        stage = f"scores of {task}"
+        probe.warn_of_few_questions(len(losses), interval, max_drop, stage, on_event, ask)
+    return ScoreDrop(
+        task=task,
+        metric=metric,
+        questions=len(losses),
+        before=float(values[:, 0].mean()),
+        after=float(values[:, 1].mean()),
+        drop_points=drop,
+        drop_interval=interval,
+        passed=passed,
+    )
+
+
+def _check_same(task: str, metric: str, logs: tuple[_Log, _Log]) -> None:
+    """Raise AegisError unless both models were asked the same questions in the same words."""
+    before, after = logs
+    counts = [len(log.values[metric]) for log in logs]
+    apart = before.values[metric].keys() ^ after.values[metric].keys()
+    if apart:
+        found = f"{task}: {counts[0]} and {counts[1]} questions, {len(apart)} of them in one file"
+        fix = "evaluate both with the same limit, or with none"
+        raise AegisError(found, "the same questions in both", fix)
+    for question in before.values[metric]:
+        then, now = before.asked[question], after.asked[question]
+        if then != now:
+            raise AegisError(
+                f"{task}: question {question} is {_short(then)} in '{before.path}' and "
+                f"{_short(now)} in '{after.path}'",
+                "the same questions and references, in the same words",
+                "evaluate both with the same --model, version of the harness and settings",
+            )
+
+
+def _short(asked: Sequence[Any]) -> str:
+    prompt, target = (textwrap.shorten(str(part), 60, placeholder=" ...") for part in asked)
+    return f"'{prompt}' (reference '{target}')"
