@@ -131,6 +131,9 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
+    if recipe.probe.gate != "mean":
+        found = f"probe.gate: {recipe.probe.gate} with a stream"
+        yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.gate")
     if not isinstance(recipe.probe.vqa, str):
         found = f"probe.vqa: {', '.join(recipe.probe.vqa)} with a stream"
         yield Problem(found, "one set of questions", f"set probe.vqa to {recipe.probe.vqa[0]}")

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from aegis_cli.common import artifacts
+from aegis_cli.data.vqa import easy, sets
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import PlayedResult, Result
+from aegis_cli.training.up_to_date import digest
 
 Value = str | int | float | None
 _DIGITS = 12  # of a digest, which tell two files apart
@@ -56,9 +58,18 @@ def _rollout(found: PlayedResult | None) -> str | None:
 
 
 def _questions(path: Path, vqa: str, probed: Result) -> str:
-    """Which questions a probe asked, and how, as its run's recipe or its settings say."""
+    """Which questions a probe asked, and how, as its run's recipe or its settings say.
+
+    A name does not tell two files apart: any folder may have its `questions.jsonl`, and one file
+    may have been changed. How many questions of each family there are and how often each family's
+    commonest answer is theirs follows from the questions alone, whichever model was asked.
+    """
     own = results.recipe_of(path).probe
     words = [f"{probed.figures.get('questions', 0):,} of {vqa}"]
+    families = probed.figures.get("families")
+    if vqa not in (sets.SCENES, easy.NAME) and families:
+        told = {name: [one["questions"], one["majority"]] for name, one in families.items()}
+        words.append(f"families of digest {digest(told)[:_DIGITS]}")
     if (seed := probed.settings.get("seed", own.seed)) != 0:
         words.append(f"seed {seed}")
     if (ask := probed.settings.get("ask", own.ask)) != "{}":

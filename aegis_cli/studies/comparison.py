@@ -20,6 +20,7 @@ from aegis_cli.recipes import Pairs, PolicyVariant, Variant
 from aegis_cli.recipes.study_cells import HALF, ISOLATED, NAIVE, ZERO_SHOT
 from aegis_cli.studies.figures import (
     Divergence,
+    Figures,
     Outcome,
     PolicyFigures,
     RobotStreamFigures,
@@ -106,6 +107,13 @@ def measured(found: Outcome) -> bool:
     return not isinstance(found, Divergence)
 
 
+def _no_units(figures: Figures) -> None:
+    """What the figures are means of is not kept, so that there is one interval: Student's t.
+
+    A figure that has it is known to be one at which seeds may come out alike by chance.
+    """
+
+
 # --- policies -------------------------------------------------------------------------------------
 
 
@@ -177,7 +185,17 @@ class PolicyResult:
     knob: str | None
     value: Any
     diverged: list[int]
-    accuracy: Annotated[Mean, Metric("VQA %", 1, percent=True, more_is_better=True)]
+    accuracy: Annotated[
+        Mean,
+        Metric(
+            "VQA %",
+            1,
+            percent=True,
+            units=_no_units,
+            more_is_better=True,
+            sure=_stands_still,
+        ),
+    ]
     drop_points: Annotated[
         Mean,
         Metric(
@@ -205,7 +223,9 @@ class PolicyResult:
         Mean,
         Metric("Success held-out %", 1, percent=True, units=_held_out_share, more_is_better=True),
     ]
-    wrong_target: Annotated[Mean, Metric("Wrong target %", 1, percent=True, more_is_better=False)]
+    wrong_target: Annotated[
+        Mean, Metric("Wrong target %", 1, percent=True, units=_no_units, more_is_better=False)
+    ]
     return_share: Annotated[
         Mean,
         Metric(
@@ -683,10 +703,6 @@ def _is_frozen(figures: RobotStreamFigures) -> bool:
     from aegis_cli.continual import learners  # loads torch, which tables do without
 
     return learners.get(figures.method).frozen
-
-
-def _no_units(figures: RobotStreamFigures) -> None:
-    """What the figures are means of is not kept, so that there is one interval: Student's t."""
 
 
 def _reached(header: str, of: Callable[[RobotStreamFigures], float] | None = None) -> Metric:

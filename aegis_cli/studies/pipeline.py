@@ -128,7 +128,8 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
 
     To keep it means to lose at most half of what naive loses; of several sets of questions, each
     counts by the one that it lost most of. Who acts best succeeds most often, or, where nothing can
-    be rolled out, has the least open-loop error.
+    be rolled out, has the least open-loop error. Where the questions do not even tell that naive
+    has lost anything, there is no verdict.
     """
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
@@ -144,6 +145,12 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."
+    low, high = max(sets, key=lambda asked: asked.drop_points).drop_interval
+    if low <= 0:
+        return (
+            f"naive lost {lost}, or none: its 95 % interval is {low:.1f} to {high:.1f}. So few "
+            "questions do not tell who kept VQA; raise probe.questions."
+        )
     kept = [
         row
         for row in rows

@@ -22,7 +22,7 @@ from typing import Any
 from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.recipes import AnyStudy, RobotStreamStudyRecipe, StudyRecipe
+from aegis_cli.recipes import AnyStudy, PolicyVariant, RobotStreamStudyRecipe, StudyRecipe
 from aegis_cli.studies.cells import CELLS, Cell, CellStore, StudyKind
 from aegis_cli.studies.comparison import Findings, Report
 from aegis_cli.studies.figures import Outcome
@@ -72,7 +72,8 @@ def run(
 def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
     """What a study's finished cells say, without anything being measured.
 
-    Variants that have not been tuned to the end are left out, unless all are.
+    Variants that have not been tuned to the end are left out, unless all are. Where one is missing
+    that the margin of all others is of, nothing is chosen, and what was tried is told alone.
 
     Args:
         cells: a study's `cells.json`, under any name.
@@ -107,13 +108,31 @@ def kind_of(study: AnyStudy) -> StudyKind:
 
 
 def _tuned_whole(kind: StudyKind, store: CellStore) -> list[str]:
-    """The variants whose values have all been measured, and those that have none to choose."""
-    tuned = _tuned(kind, trials(kind))
-    return [
+    """The variants whose values have all been measured, and those that have none to choose.
+
+    There are none where one is not whole by which all others are judged: without it, they would be
+    judged by another, and other values would be chosen.
+    """
+    variants, tuned = kind.recipe.variants, _tuned(kind, trials(kind))
+    whole = [
         name
-        for name in kind.recipe.variants
+        for name in variants
         if all(store.runner.key(cell) in store.cells for _, cell in tuned.get(name, ()))
     ]
+    return whole if set(_judges(kind)) <= set(whole) else []
+
+
+def _judges(kind: StudyKind) -> list[str]:
+    """The variants whose best value sets the margin for all: none where each sets its own."""
+    variants, reference = kind.recipe.variants, kind.rule.reference
+    if reference is None:
+        return []
+    own = [
+        name
+        for name, variant in variants.items()
+        if isinstance(variant, PolicyVariant) and variant.is_plain(reference)
+    ]
+    return own or list(variants)
 
 
 def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:

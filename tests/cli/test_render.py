@@ -25,7 +25,7 @@ from aegis_cli.cli.render.layout import fixed, marked, number, percent, plain_ta
 from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live, _warning
-from aegis_cli.cli.render.studies import study
+from aegis_cli.cli.render.studies import shown_as, study
 from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
@@ -40,6 +40,7 @@ from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy
 from aegis_cli.merging.merge import MergeReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
+from aegis_cli.studies.metrics import Column as Declared
 
 # --- progress -------------------------------------------------------------------------------------
 
@@ -657,3 +658,11 @@ def test_lines_end_with_what_can_be_seen_in_colour_too(
     assert "\x1b[1m" in printed
     seen = re.sub(r"\x1b\[[0-9;]*m", "", printed).splitlines()
     assert seen == [line.rstrip() for line in seen] and len(seen) > 3
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.06, "-0.1"), (-0.04, "0.0"), (0.0, "0.0"), (0.04, "0.0"), (0.06, "+0.1"), (None, "-")],
+)
+def test_a_difference_that_rounds_to_nothing_has_no_sign(value: float | None, text: str) -> None:
+    assert shown_as(Declared("Gain (points)", 1, signed=True))(value) == text

@@ -409,6 +409,24 @@ def test_the_farther_ends_of_both_intervals_are_shown(aegis, tmp_path: Path) -> 
     assert not {f"{place}/interval/0", f"{place}/crossed/1"} & paths
 
 
+def test_each_demand_of_the_bar_shows_the_interval_that_it_is_judged_by(
+    aegis, tmp_path: Path
+) -> None:
+    """A mean alone, beside a verdict on its interval's end, can seem to contradict it."""
+    written = found(("naive", "x"), 5).to_json()
+    files.save_json(tmp_path / "table.json", written)
+    page, document = reported(aegis, tmp_path)
+    check_figures(page, document)
+    paths = {path for path, _, _ in page.figures}
+    barred = next(path for path in paths if path.endswith("/bar/checks/0/value"))
+    place = barred.removesuffix("/0/value")
+    checks = written["tasks"][0]["results"][1]["bar"]["checks"]
+    assert any(check["interval"] for check in checks)
+    for number, check in enumerate(checks):
+        ends = {f"{place}/{number}/interval/{end}" for end in (0, 1)}
+        assert (ends <= paths) is (check["interval"] is not None)
+
+
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:
     point = PolicyPoint("x", "kfac", 0.1, 0.875, 0.9, 0.5, chosen=True)
     table = replace(found(("naive", "x")), tasks=[], tuning_task="reach", tuning=[point])

@@ -501,6 +501,11 @@ def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     assert setting.replace("=", ": ") in refusal(tmp_path, "name: x", setting, kind=kind).found
 
 
+def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
+    found = refusal(tmp_path, "name: x\ntasks: [reach]", "probe.gate=upper", kind=RobotStreamRecipe)
+    assert "probe.gate: upper with a stream" in found.found and found.fix == "delete probe.gate"
+
+
 def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> None:
     """A digest is not at today's defaults, but at those that an option came with.
 

@@ -195,6 +195,24 @@ def test_answers_to_other_questions_are_shown_without_a_mark(
     assert "80.0" in out and ("*80.0" in out) == (questions == 40)
 
 
+@pytest.mark.parametrize("majority", [0.3, 0.4])
+def test_two_files_of_one_name_are_two_sets_of_questions(
+    majority: float, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any folder may have its own.jsonl; the commonest answers' shares are the questions' own."""
+    monkeypatch.chdir(job)
+    for number, name in enumerate(("naive", "aegis")):
+        figures = probe("x", number)
+        figures["families"]["x"]["majority"] = majority if number else 0.3
+        results.keep(job / name, "probe-own", figures, {"vqa": "own.jsonl", "path": f"/{number}"})
+        (job / name / "probe.json").unlink()
+    same = majority == 0.3
+    found = compare.run([job])
+    assert found.same_questions is same and found.question_sets == ["own.jsonl"]
+    _, out, err = aegis("compare", "naive", "aegis")
+    assert ("*80.0" in out) is same and ("40 of own.jsonl, families of digest" in err) is not same
+
+
 def test_without_an_evaluation_there_is_no_column_of_it(
     aegis, job: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -310,6 +310,23 @@ def test_seeds_that_came_out_alike_do_not_tell_how_seeds_vary(
     assert result.drop_points.ends == pytest.approx((lost, lost))
 
 
+def test_a_share_at_which_all_seeds_came_out_alike_has_no_interval() -> None:
+    """That no episode of few ended in another target is no certainty that none would."""
+    base = dataclasses.replace(row(Recipe(name="x")), wrong_target=0.0, cross_entropy=0.2)
+    variants = {"naive": PolicyVariant("naive")}
+    alike = {"naive": dict.fromkeys(range(3), base)}
+    result = task_results("reach", alike, variants, {}, {}, frozenset()).results[0]
+    assert result.wrong_target.mean == 0 and result.wrong_target.interval is None
+    assert result.accuracy.runs == 3 and result.accuracy.interval is None
+    unlike = {"naive": {**alike["naive"], 2: dataclasses.replace(base, wrong_target=0.02)}}
+    result = task_results("reach", unlike, variants, {}, {}, frozenset()).results[0]
+    assert result.wrong_target.interval is not None and result.wrong_target.crossed is None
+    still = dataclasses.replace(base, cross_entropy=base.baseline_cross_entropy)
+    alike = {"naive": dict.fromkeys(range(3), still)}
+    result = task_results("reach", alike, variants, {}, {}, frozenset()).results[0]
+    assert result.accuracy.interval == pytest.approx((base.accuracy, base.accuracy))
+
+
 def test_the_baseline_is_a_mean_over_the_questions_that_seeds_were_asked() -> None:
     base = row(Recipe(name="x"))
     own = {

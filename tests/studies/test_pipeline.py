@@ -673,7 +673,13 @@ def figured(**of: tuple[float, float | None]) -> list[Any]:
     """Rows of methods with their drops in points and their success."""
     plain = study_samples.row(Recipe(name="x"))
     return [
-        replace(plain, method=name.replace("_", "-"), drop_points=drop, success_seen=success)
+        replace(
+            plain,
+            method=name.replace("_", "-"),
+            drop_points=drop,
+            drop_interval=(drop - 0.3, drop + 0.3),
+            success_seen=success,
+        )
         for name, (drop, success) in of.items()
     ]
 
@@ -716,8 +722,10 @@ def asked_twice(rows: list[Any], **others: float) -> list[Any]:
     """The same rows, which were also asked other questions and lost these points of them."""
     again = {name.replace("_", "-"): drop for name, drop in others.items()}
     return [
-        replace(row, others={"other": SimpleNamespace(drop_points=again[row.method])})
+        replace(row, others={"other": SimpleNamespace(drop_points=drop, drop_interval=ends)})
         for row in rows
+        for drop in [again[row.method]]
+        for ends in [(drop - 0.3, drop + 0.3)]
     ]
 
 
@@ -734,6 +742,16 @@ def test_the_verdict_is_on_the_questions_that_most_was_lost_of(
 ) -> None:
     rows = asked_twice(figured(naive=(0, 0.95), kfac=(0, 0.9)), **others)
     assert says in pipeline.verdict(rows)
+
+
+@pytest.mark.parametrize(("low", "tells"), [(-4.3, False), (0.0, False), (0.1, True)])
+def test_a_loss_that_may_be_none_says_nothing_of_who_kept_vqa(low: float, tells: bool) -> None:
+    rows = [
+        replace(row, drop_interval=(low, 15.8)) for row in figured(naive=(4.8, 0.9), kfac=(0, 0.9))
+    ]
+    said = pipeline.verdict(rows)
+    assert ("kfac lost 0.0 points" in said) is tells
+    assert (f"{low:.1f} to 15.8" in said and "probe.questions" in said) is not tells
 
 
 def test_the_verdict_on_questions_that_the_vlm_could_not_answer_is_no_verdict_on_methods() -> None:

@@ -41,6 +41,26 @@ def test_some_cells_have_the_tables_of_what_there_is(tmp_path: Path) -> None:
         study.told(resolved, some)
 
 
+@pytest.mark.parametrize(("missing", "judged"), [("lora", True), ("naive", False)])
+def test_no_value_is_chosen_by_another_margin_than_that_of_all_cells(
+    missing: str, judged: bool, tmp_path: Path
+) -> None:
+    """The margin is naive's: without one of its values, the best of all others would set it."""
+    resolved = study_cells.load(RECIPES / "compare.yaml")
+    shipped = RECIPES / "results" / "compare.cells.json"
+    entries = files.load_json(shipped)
+    kind = study.kind_of(resolved)
+    runner = kind.make_runner(tmp_path, lambda event: None)
+    del entries[runner.key(study.trials(kind)[missing][-1][1])]
+    files.save_json(tmp_path / "some.json", entries)
+    found = study.told(resolved, tmp_path / "some.json")
+    whole = {p.variant: p.value for p in study.told(resolved, shipped).tuning if p.chosen}
+    chosen = {p.variant: p.value for p in found.tuning if p.chosen}
+    expected = {name: value for name, value in whole.items() if name != missing}
+    assert chosen == (expected if judged else {})
+    assert bool(found.tasks) is judged and found.tuning and found.finished
+
+
 def test_cells_need_the_recipe_of_their_study(aegis: Any, tmp_path: Path) -> None:
     entries = (RECIPES / "results" / "ablations.cells.json").read_bytes()
     (tmp_path / "mine.cells.json").write_bytes(entries)

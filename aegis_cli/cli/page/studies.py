@@ -182,4 +182,6 @@ def _demands(results: At) -> Markup:
 
 
 def _checked(check: At) -> Sequence[Child]:
-    return [decimal(check["value"], 2), " ", verdict(check["passed"].value)]
+    """A demand's figure, its verdict, and below them the interval by whose end it is judged."""
+    judged = verdict(check["passed"].value)
+    return [decimal(check["value"], 2), " ", judged, between(check["interval"], decimal)]

@@ -176,14 +176,18 @@ def _figure(result: Any, field: str) -> str:
 
 
 def shown_as(column: Column) -> Callable[[float | None], str]:
-    """How a column shows a value: in its unit, with its digits and its sign."""
+    """How a column shows a value: in its unit, with its digits and its sign.
+
+    What rounds to 0 has none, for it may be a little less than 0.
+    """
 
     def show(value: float | None) -> str:
         value = None if value is None else column.shown(value)
         if column.decimals is None:
             return number(value, column.significant)
         text = fixed(value, column.decimals)
-        return f"+{text}" if column.signed and not text.startswith("-") else text
+        is_more = value is not None and value > 0 and float(text) > 0
+        return f"+{text}" if column.signed and is_more else text
 
     return show
 
