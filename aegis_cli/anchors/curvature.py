@@ -229,18 +229,26 @@ class CurvatureRecorder:
         """Raise AegisError unless every map took part."""
         self._sums.check(self.names)
 
-    def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
+    def spectra(
+        self,
+        energy: float,
+        release: bool = False,
+        stage: str = "spectra",
+        on_event: OnEvent = ignore,
+    ) -> dict[str, Spectrum]:
         """Both factors of each map that took part, by its plain name.
 
         Args:
             energy: share of each factor's trace up to which eigenvectors are kept.
             release: forget the sums on the way.
+            stage: what the progress is called.
 
         Raises:
             AegisError: no map took part.
         """
         self.forget()
-        found = self._sums.spectra(energy, _factors(self.unmeasured), release)
+        leave_out = _factors(self.unmeasured)
+        found = self._sums.spectra(energy, leave_out, release, stage, on_event)
         if not found:
             raise AegisError(
                 "no map that an answer reads",
@@ -365,7 +373,7 @@ def measure(
                 recorder.answer(part.scores, keep=False, uniform=uniform)
         recorder.add_up(ranks)
         recorder.check_complete()
-        spectra = recorder.spectra(energy, release=True)
+        spectra = recorder.spectra(energy, True, f"{stage} spectra", on_event)
         # They come in the backward pass's order.
         found |= {name: spectra[name] for name in recorder.names}
     return found

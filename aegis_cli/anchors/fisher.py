@@ -36,6 +36,7 @@ def measure(
     # In float64: the square of a gradient of 1e-25 is 0 in float32.
     total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
     rows = spread.rows(len(asked.questions), samples)
+    on_event(Progress("anchor fisher", 0, samples, "samples"))
     for done, row in enumerate(rows.tolist(), start=1):
         if (done - 1) % ranks.count == ranks.rank:
             likelihood = _log_likelihood(model, asked, row)

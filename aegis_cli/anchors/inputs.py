@@ -157,7 +157,13 @@ class InputRecorder:
         """Raise AegisError unless every module of the maps has read something."""
         self._sums.check(self._modules)
 
-    def spectra(self, energy: float, release: bool = False) -> dict[str, Spectrum]:
+    def spectra(
+        self,
+        energy: float,
+        release: bool = False,
+        stage: str = "spectra",
+        on_event: OnEvent = ignore,
+    ) -> dict[str, Spectrum]:
         """The spectrum of each map that read something, by its plain name.
 
         A tied head's spectrum is named after its table, `TABLE.scores`.
@@ -165,11 +171,12 @@ class InputRecorder:
         Args:
             energy: share of each map's input energy up to which eigenvectors are kept.
             release: forget the sums on the way.
+            stage: what the progress is called.
 
         Raises:
             AegisError: no map read anything.
         """
-        read = self._sums.spectra(energy, self.unmeasured, release)
+        read = self._sums.spectra(energy, self.unmeasured, release, stage, on_event)
         if not read:
             raise AegisError(
                 "no map that read anything",
@@ -337,7 +344,7 @@ def measure(
                 pass
         recorder.add_up(ranks)
         recorder.check_complete()
-        found |= recorder.spectra(energy, release=True)
+        found |= recorder.spectra(energy, True, f"{stage} spectra", on_event)
     return found
 
 

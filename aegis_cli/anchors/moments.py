@@ -94,6 +94,7 @@ def measure_passes(
     """
     recorder, done = MomentRecorder(), 0
     own = itertools.islice(batches, ranks.rank, None, ranks.count)
+    on_event(Progress("anchor", done, total, "samples"))
     with prefetch.for_device(lambda batch: model.process(*read(batch)), own, model.device) as ready:
         for inputs in ready:
             encoding = model.encode(inputs.to(model.device))

@@ -86,6 +86,7 @@ def run(
     """
     image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
     own = Share(ranks.rank, ranks.count).rows(len(asked.images))
+    on_event(Progress(stage, 0, own.stop - own.start, "images"))
     for first in range(own.start, own.stop, step):
         last = min(first + step, own.stop)
         rows = ((image_of >= first) & (image_of < last)).nonzero().squeeze(1)

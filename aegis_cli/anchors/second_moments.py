@@ -9,6 +9,7 @@ from torch import Tensor
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
@@ -92,7 +93,12 @@ class SecondMoments:
             )
 
     def spectra(
-        self, energy: float, leave_out: Collection[str] = (), release: bool = False
+        self,
+        energy: float,
+        leave_out: Collection[str] = (),
+        release: bool = False,
+        stage: str = "spectra",
+        on_event: OnEvent = ignore,
     ) -> dict[str, Spectrum]:
         """The spectrum of each mean moment, by its name.
 
@@ -104,6 +110,7 @@ class SecondMoments:
             leave_out: names of moments that do not count.
             release: forget each sum when its spectrum is found, so that not all are in memory at
                 the same time.
+            stage: what the progress is called; of a large model they take minutes.
 
         Raises:
             AegisError: a sum that is not finite.
@@ -114,7 +121,8 @@ class SecondMoments:
         shared: dict[tuple[Readers, ...], Spectrum] = {}
         found: dict[str, Spectrum] = {}
         with devices.single_threaded():  # the eigensolver waits for its own threads
-            for name, sums in sums_of.items():
+            for done, (name, sums) in enumerate(sums_of.items()):
+                on_event(Progress(stage, done, len(names), "spectra"))
                 if name in self._small:
                     _check_finite(name, [self._small[name]])
                     found[name] = _small(self._small[name].cpu() / self._counts[name], energy)
@@ -128,6 +136,8 @@ class SecondMoments:
                     for readers in sums:
                         if last_use[readers] == name:
                             del self._rows[readers]
+        if names:
+            on_event(Progress(stage, len(names), len(names), "spectra"))
         return found
 
 

@@ -517,6 +517,7 @@ def _predict(
     # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
     noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
     found = []
+    on_event(Progress("evaluate", 0, len(at), "frames"))
     for first in range(0, len(at), batch_size):
         part = slice(first, first + batch_size)
         batch = shown.batch(at[part], 1)

@@ -260,6 +260,7 @@ def _try(
 ) -> _Sweep:
     """Judge each of the strengths in turn."""
     points: list[MergePoint] = []
+    on_event(Progress("merge", 0, len(strengths), "strengths"))
     for number, strength in enumerate(strengths, 1):
         points.append(judge.point(strength, displacement.keep(strength)))
         shown = {"accuracy": points[-1].accuracy}

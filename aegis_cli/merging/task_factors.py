@@ -76,6 +76,7 @@ def _passes(demos: Demonstrations, frames: int, stage: str, on_event: OnEvent) -
     """
     chosen = demos.train[spread.rows(len(demos.train), frames)]
     done = 0
+    on_event(Progress(stage, done, len(chosen), "frames"))
     for instruction in demos.instruction_of[chosen].unique():
         for rows in chosen[demos.instruction_of[chosen] == instruction].split(FRAMES):
             yield rows

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from aegis_cli import methods
 from aegis_cli.common import devices, launch, memory
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
@@ -167,8 +167,8 @@ def _planned(
     disk = _disk(training, written)
     buffers = WrittenBuffers(training.policy.backbone)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
-    needs = _needs(training, parts, free, base, ranks)
     told = on_event if ranks.first else ignore
+    needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
     return _report(training, tokens, needs, free, disk, recipe.train.steps - _done(written))
 
@@ -254,7 +254,12 @@ class _Needs(NamedTuple):
 
 
 def _needs(
-    training: TrainingRun, parts: dict[str, int], free: int | None, base: int, ranks: Ranks
+    training: TrainingRun,
+    parts: dict[str, int],
+    free: int | None,
+    base: int,
+    ranks: Ranks,
+    on_event: OnEvent,
 ) -> _Needs:
     """What the processes need, by steps that they take if the estimate fits.
 
@@ -266,7 +271,7 @@ def _needs(
     fits = _fits(needed, free, device, ranks)
     step_s, measured = None, None
     if fits is not False:
-        step_s = _step_s(training, ranks)
+        step_s = _step_s(training, ranks, on_event)
         fits = False  # unless the steps show that it does
     if step_s is not None:
         needed = memory.peak(device) - base + parts["checkpoint"]
@@ -466,7 +471,7 @@ def _while_saving(training: TrainingRun) -> int:
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _step_s(training: TrainingRun, ranks: Ranks) -> float | None:
+def _step_s(training: TrainingRun, ranks: Ranks, on_event: OnEvent) -> float | None:
     """Seconds per step, as the training takes its first ones; nothing is written.
 
     None where a GPU has no memory left for them. With several processes that is an error, for the
@@ -476,14 +481,14 @@ def _step_s(training: TrainingRun, ranks: Ranks) -> float | None:
         Diverged: a step that the training would end at, too.
     """
     try:
-        return _timed(training)
+        return _timed(training, on_event)
     except torch.OutOfMemoryError:
         if ranks.several:
             raise
         return None
 
 
-def _timed(training: TrainingRun) -> float:
+def _timed(training: TrainingRun, on_event: OnEvent) -> float:
     settings, parts = training.recipe.train, training.parts
     # The first step pays for what is done once, and batches are fetched meanwhile: those that a
     # GPU finds ready say nothing of how long they took, and as many may come together.
@@ -494,12 +499,14 @@ def _timed(training: TrainingRun) -> float:
     first = steps[ahead : ahead + 1] or steps  # the first that counts
     window, started_s = train.Window(), 0.0
     training.policy.train()
+    on_event(Progress("dry run", 0, len(steps), "steps"))
     with train.batches_of(training, steps) as batches:
         for index in steps:
             if index == first[0]:
                 train.read_figures(training, window)  # a GPU has done by then what it was given
                 started_s = time.perf_counter()
             train.update(training, index, next(batches), window)
+            on_event(Progress("dry run", index + 1, len(steps), "steps"))
         train.read_figures(training, window)
     return (time.perf_counter() - started_s) / (len(steps) - first[0])
 

@@ -20,7 +20,7 @@ from samples.tiny import make_tiny
 from torch import nn
 
 from aegis_cli import recipes
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress
 from aegis_cli.models import backbones
 from aegis_cli.training import checkpoint, dry_run, train
 
@@ -183,6 +183,16 @@ def test_what_is_free_is_asked_before_the_dry_run_takes_some(
     monkeypatch.setattr(dry_run.memory, "free", lambda device: order.append("free") or free(device))
     dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out")
     assert order == ["free", "build"]
+
+
+def test_a_dry_run_tells_the_steps_that_it_takes(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    events: list[Event] = []
+    settings = small(tiny_folder)
+    dry_run.run(settings, "naive", demos_file, None, tmp_path / "out", on_event=events.append)
+    told = [e for e in events if isinstance(e, Progress) and e.stage == "dry run"]
+    assert [e.done for e in told] == list(range(told[0].total + 1))
 
 
 def test_hours_are_those_of_the_steps_that_are_left(

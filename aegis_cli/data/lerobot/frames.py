@@ -325,6 +325,7 @@ def _write(
             done, stage = 0, f"decode {layout.short(camera)}"
             workers = workers or worker_count(len(parts) // _PER_WORKER)
             decode = partial(_decode, aside, offset, shape[1:3])
+            on_event(Progress(stage, done, count, "frames"))
             with mapped(
                 decode, parts, workers, "a decoding process", "free some memory, then run it again"
             ) as counts:

@@ -215,6 +215,7 @@ def grade(
             each in nats, as a backbone's own `answers` tells.
     """
     graded: list[Graded] = []
+    on_event(Progress("probe", 0, len(questions.questions), "questions"))
     for said, likelihood in answers(_asked(questions, batch_size)):
         rows = slice(len(graded), len(graded) + len(said))
         surprise, numbers = (-likelihood).tolist(), questions.image_of[rows].tolist()

@@ -247,8 +247,9 @@ def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> Non
 def test_decoding_that_stops_leaves_no_file(tmp_path: Path, frame_cache: Path) -> None:
     folder = save(tmp_path / "d")
 
-    def stop(_: Progress) -> None:
-        raise KeyboardInterrupt
+    def stop(event: Event) -> None:
+        if isinstance(event, Progress) and event.done:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         demonstrations.load(folder, 0.3, 0, on_event=stop)
