@@ -167,7 +167,7 @@ class RobotStreamRun(StreamRun):
         """The loss of the task just learned, on held-out episodes."""
         number, settings = self.current.task, self.recipe.train
         self.activate(number)
-        noise = generator(self.recipe.seed, number * settings.steps, VALIDATION_NOISE)
+        noise = _seed(self.recipe.seed, number * settings.steps, VALIDATION_NOISE)
         policy = self.policies[number].eval()
         return train.validation_loss(policy, self.demos[number], settings, noise)
 
@@ -597,7 +597,11 @@ def generator(seed: int, index: int, purpose: int) -> torch.Generator:
 
     So a resumed run draws what the uninterrupted one drew.
     """
-    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + purpose)
+    return torch.Generator().manual_seed(_seed(seed, index, purpose))
+
+
+def _seed(seed: int, index: int, purpose: int) -> int:
+    return (seed * 1_000_003 + index) * 4 + purpose
 
 
 # --- what is measured -----------------------------------------------------------------------------

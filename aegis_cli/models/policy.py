@@ -105,15 +105,33 @@ class Policy(nn.Module):
         Returns:
             A scalar, in normalised units; of a share, what it contributes to the whole batch's.
         """
-        device = self.backbone.device
-        actions = self.targets(batch)[:, None]  # [B, 1, H, A]
-        of = of or WholeBatch(len(actions), int((~batch.is_pad).sum()))
-        shape = (of.frames, samples, *actions.shape[2:])  # (B, K, H, A)
+        of = of or WholeBatch(len(batch), int((~batch.is_pad).sum()))
+        shape = (of.frames, samples, *batch.actions.shape[1:])  # (B, K, H, A)
         # Both are drawn on the CPU, so that they are the same whatever the device, and for the
         # whole batch, so that they are the same whatever the shares.
         rows = of.share.rows(of.frames)
-        times = send(flow.draw_times(shape[:2], generator)[rows], device)
-        noise = send(flow.draw_noise(shape, generator)[rows], device)
+        times = flow.draw_times(shape[:2], generator)[rows]
+        noise = flow.draw_noise(shape, generator)[rows]
+        return self.flow_loss_at(batch, encoding, times, noise, of.shown, detach)
+
+    def flow_loss_at(
+        self,
+        batch: RobotBatch,
+        encoding: Encoding,
+        times: Tensor,
+        noise: Tensor,
+        shown: int | None = None,
+        detach: bool = False,
+    ) -> Tensor:
+        """What `flow_loss` finds at these flow times [B, K] and noises [B, K, H, A].
+
+        Args:
+            shown: steps of the chunks that are no padding, of the batch that this one is a share
+                of; None: of this one.
+        """
+        device = self.backbone.device
+        actions = self.targets(batch)[:, None]  # [B, 1, H, A]
+        times, noise = send(times, device), send(noise, device)
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
@@ -121,9 +139,9 @@ class Policy(nn.Module):
             # none of the loss's gradient reaches it.
             prefix = [KeyValue(key.detach(), value.detach()) for key, value in prefix]
         proprio = self.proprio_scale(send(batch.proprio, device))
-        suffix = self.backbone.suffix(encoding, shape[2])
+        suffix = self.backbone.suffix(encoding, noise.shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
-        return flow.masked_mse(velocity, target, send(batch.is_pad, device), of.shown)
+        return flow.masked_mse(velocity, target, send(batch.is_pad, device), shown)
 
     def act(
         self,

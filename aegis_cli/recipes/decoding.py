@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from aegis_cli.recipes.keys import Check, base_type, is_retired
+from aegis_cli.recipes.keys import LARGEST, Check, base_type, is_retired, is_too_large
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 
 if TYPE_CHECKING:
@@ -100,7 +100,10 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     phrase = _PHRASES.get(hint) or _PHRASES[base_type(hint)]
     check = field.metadata.get("check")
     limits = [] if check and check.choices and phrase == "text" else [phrase]
-    expected = f"{dotted}: " + ", ".join(limits + ([check.expected] if check else []))
+    limits += [check.expected] if check else []
+    if "whole" in phrase and any(map(is_too_large, raw if isinstance(raw, list) else [raw])):
+        limits.append(f"at most {LARGEST:,}")
+    expected = f"{dotted}: " + ", ".join(limits)
     listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
     fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check, phrase)
     return Problem(f"{dotted}: {_quote(raw)}", expected, fix)

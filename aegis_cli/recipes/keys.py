@@ -25,6 +25,7 @@ from typing import (
 
 from aegis_cli.recipes.strict_yaml import plain
 
+LARGEST = 10**12  # whole number that a key takes; from some size on, arrays and times overflow
 _SCALARS = (int, float, bool, str)
 T = TypeVar("T")
 
@@ -192,7 +193,14 @@ class _Value:
         items = value if isinstance(value, tuple) else (value,)
         if value is not None and self.check and not all(map(self.check.accepts, items)):
             raise ValueError(self.check.expected)
+        if any(map(is_too_large, items)):
+            raise ValueError(f"at most {LARGEST:,}")
         return plain(value)
+
+
+def is_too_large(value: Any) -> bool:
+    """Whether a whole number is larger than any key takes."""
+    return isinstance(value, int) and value > LARGEST
 
 
 def _as_text(value: Any) -> Any:

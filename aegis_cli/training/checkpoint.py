@@ -34,7 +34,7 @@ from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.methods.base import Method
-from aegis_cli.models import backbones, download, lerobot_folder
+from aegis_cli.models import backbones, download, lerobot_folder, structure
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -49,6 +49,7 @@ BACKBONE = "backbone"
 PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 _REUSED = "anchor_gradient."
 _AVERAGE = "average."
+_BUFFER = "buffer."  # of a running average that training passes write, as BatchNorm's
 
 
 class State(NamedTuple):
@@ -75,12 +76,23 @@ def state_of(
     tensors = optimizer_state.to_tensors(parameters, optimizers)
     tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
     tensors |= {_AVERAGE + name: mean for name, mean in (average or {}).items()}
+    tensors |= {_BUFFER + name: buffer for name, buffer in _running(policy).items()}
     return State(tensors, optimizer_state.stateless(parameters, optimizers))
 
 
 def policy_of(state: State) -> dict[str, Tensor]:
-    """The weights that others are to use, by the policy's parameter names: averages, where kept."""
-    return _named(optimizer_state.WEIGHT, state.tensors) | _named(_AVERAGE, state.tensors)
+    """What others are to use, by the policy's names: weights, or their averages, and buffers."""
+    weights = _named(optimizer_state.WEIGHT, state.tensors) | _named(_AVERAGE, state.tensors)
+    return weights | _named(_BUFFER, state.tensors)
+
+
+def _running(policy: Policy) -> dict[str, Tensor]:
+    """The buffers that training passes write, by the policy's names."""
+    return {
+        f"backbone.{name}.{leaf}": buffer
+        for name, module in structure.averaging(policy.backbone).items()
+        for leaf, buffer in module.named_buffers(recurse=False)
+    }
 
 
 def save(
@@ -533,9 +545,14 @@ def restore(
         bare = optimizer_state.said_stateless(saved.header.meta)
     reused = _reused(path, saved.tensors, policy.backbone)
     average.check(_named(_AVERAGE, saved.tensors), f"the average in '{path}'")
+    running, buffers = _running(policy), _named(_BUFFER, saved.tensors)
+    check_state(f"the running averages in '{path}'", buffers, running)
     parameters = dict(policy.named_parameters())
-    own = {n: t for n, t in saved.tensors.items() if not n.startswith((_REUSED, _AVERAGE))}
+    others = (_REUSED, _AVERAGE, _BUFFER)
+    own = {n: t for n, t in saved.tensors.items() if not n.startswith(others)}
     optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)
+    for name, buffer in running.items():
+        buffer.copy_(buffers[name])
     average.put_back(step, _named(_AVERAGE, saved.tensors))
     return step, saved.header.meta, reused
 

@@ -544,8 +544,7 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     steps, every = recipe.train.steps, recipe.train.checkpoint_every
     done = _done(written)
     # The last step has one too, whether or not its turn has come.
-    planned = [min(step, steps) for step in range(every, steps + every, every)]
-    return sum(step > done for step in planned)
+    return 0 if done >= steps else -(-steps // every) - done // every
 
 
 def _done(written: Sequence[Path]) -> int:

@@ -169,9 +169,12 @@ def gathered(tensors: Mapping[str, Tensor], ranks: Ranks) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """A whole policy with these weights, which have its parameters' names."""
+    """A whole policy with these weights, which have its names, and with the buffers among them."""
     for name, parameter in plain.named_parameters():
         parameter.copy_(weights[name])
+    for name, buffer in plain.named_buffers():
+        if name in weights:
+            buffer.copy_(weights[name])
     return plain
 
 

@@ -81,10 +81,10 @@ class BatchOrder:
         """
         first, found = 0, list[np.ndarray]()
         for number, (size, count) in enumerate(self._shares, start=1):
-            place = np.arange(epoch * count, (epoch + 1) * count)
-            for each in np.unique(place // size).tolist():
+            begin, end = epoch * count, (epoch + 1) * count
+            for each in range(begin // size, -(-end // size)):
                 # The number keeps this generator apart from an epoch's.
                 order = np.random.default_rng([self._seed, each, number]).permutation(size)
-                found.append(first + order[place[place // size == each] % size])
+                found.append(first + order[max(0, begin - each * size) : end - each * size])
             first += size
         return np.sort(np.concatenate(found))

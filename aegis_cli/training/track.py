@@ -104,7 +104,7 @@ def tell(recipe: Recipe, out: Path, name: str, report: Mapping[str, Any], step: 
         return
     found = _measured(name, report, step)
     for tracker in names:
-        with _TRACKERS[tracker](recipe, out, 0, "measuring") as opened:
+        with _TRACKERS[tracker](recipe, out, None, "measuring") as opened:
             opened.show(found)
 
 
@@ -137,12 +137,17 @@ def _figures(line: Mapping[str, float]) -> dict[str, float]:
 
 
 @contextmanager
-def _tensorboard(recipe: Recipe, out: Path, done: int, job: str = "") -> Generator[Tracker]:
-    """Event files in the run's folder: tensorboard --logdir runs."""
+def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> Generator[Tracker]:
+    """Event files in the run's folder: tensorboard --logdir runs.
+
+    Args:
+        done: steps behind the run; None for one that is measured, of which every step stays.
+    """
     from torch.utils.tensorboard import SummaryWriter
 
-    # What was logged after the checkpoint that a run goes on from is repeated.
-    writer = SummaryWriter(str(out / "tensorboard"), purge_step=done + 1 if done else None)
+    # What was logged after the checkpoint that a run goes on from is repeated, or from the first
+    # step on if a run was killed before it had one.
+    writer = SummaryWriter(str(out / "tensorboard"), purge_step=None if done is None else done + 1)
 
     def log(line: Mapping[str, float]) -> None:
         for name, value in _figures(line).items():
@@ -183,7 +188,7 @@ def _moving(name: str, video: Path) -> Any:
 
 
 @contextmanager
-def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Generator[Tracker]:
+def _trackio(recipe: Recipe, out: Path, done: int | None, job: str = "") -> Generator[Tracker]:
     """Trackio's own local database: trackio show --project aegis."""
     import trackio
 
@@ -195,7 +200,7 @@ def _trackio(recipe: Recipe, out: Path, done: int, job: str = "") -> Generator[T
 
 
 @contextmanager
-def _wandb(recipe: Recipe, out: Path, done: int, job: str = "training") -> Generator[Tracker]:
+def _wandb(recipe: Recipe, out: Path, done: int | None, job: str = "training") -> Generator[Tracker]:
     """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them.
 
     A run that is finished offline cannot be opened again: what is measured later is a run of the

@@ -12,6 +12,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -37,6 +38,7 @@ from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
+from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
@@ -545,16 +547,16 @@ def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEven
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:
     """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
-    return _seeded(run.recipe.seed, index, stream)
+    return torch.Generator().manual_seed(_seed(run.recipe.seed, index, stream))
 
 
-def validation_noise(seed: int) -> torch.Generator:
-    """The noise of every validation loss of a run, by its recipe's seed."""
-    return _seeded(seed, 0, _VALIDATION)
+def validation_noise(seed: int) -> int:
+    """What seeds the noise of every validation loss of a run, by its recipe's seed."""
+    return _seed(seed, 0, _VALIDATION)
 
 
-def _seeded(seed: int, index: int, stream: int) -> torch.Generator:
-    return torch.Generator().manual_seed((seed * 1_000_003 + index) * 4 + stream)
+def _seed(seed: int, index: int, stream: int) -> int:
+    return (seed * 1_000_003 + index) * 4 + stream
 
 
 def update(
@@ -684,45 +686,77 @@ def validation_loss(
     policy: Policy,
     demos: demonstrations.Demonstrations,
     settings: Train | RobotTrain,
-    generator: torch.Generator,
+    noise: int,
     ranks: Ranks = ALONE,
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
-    The frames are spread evenly. Several processes have a share of every batch each, and take it in
-    as many passes as a step's.
+    The frames are spread evenly. They pass in batches of the training's size, of which several
+    processes have a share each, in as many passes as a step's. None of this shows in the loss: the
+    draws are a frame's own, and it is the mean over all that the frames have.
+
+    Args:
+        noise: seeds the draws, as `validation_noise` does for a run.
     """
     held_out, backbone = len(demos.validation), policy.backbone
     frames = demos.validation[spread.rows(held_out, VALIDATION_FRAMES)]
+    _, shown = demos.size(frames, settings.chunk)
 
-    def prepare(part: Tensor) -> tuple[RobotBatch, Ranks, int]:
+    def prepare(part: Tensor) -> tuple[Tensor, RobotBatch, Ranks, int]:
         """This process's frames of a batch, who shares it, and in how many passes."""
         # Where there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
         passes = getattr(settings, "accumulate", 1)
         passes = passes if len(part) >= sharing.count * passes else 1
-        own = demos.batch(step.own_rows(part, sharing, passes), settings.chunk)
+        numbers = step.own_rows(part, sharing, passes)
+        own = demos.batch(numbers, settings.chunk)
         size = demos.size(part, settings.chunk)
-        return step.with_prepared(own, size, backbone, sharing, passes), sharing, passes
+        return numbers, step.with_prepared(own, size, backbone, sharing, passes), sharing, passes
 
     total = 0.0
     parts = frames.split(settings.batch_size)
-    with prefetch.for_device(prepare, parts, backbone.device) as prepared:
-        for part, (own, sharing, passes) in zip(parts, prepared, strict=True):
-            noise, losses = generator.get_state(), []
-            each = step.passes(own, sharing, passes, backbone.device)
-            for (batch, of), made in zip(each, own.prepared, strict=True):
-                # Each pass draws the part's noise, and takes its own frames' of it.
-                generator.set_state(noise)
+    with (
+        _evaluating(policy),
+        prefetch.for_device(prepare, parts, backbone.device) as prepared,
+    ):
+        for numbers, own, sharing, passes in prepared:
+            losses = []
+            each = [batch for batch, _ in step.passes(own, sharing, passes, backbone.device)]
+            shares = numbers.split(list(map(len, each)))
+            for batch, made, mine in zip(each, own.prepared, shares, strict=True):
+                drawn = _draws(mine, settings.flow_samples, batch, noise)
                 with devices.autocast(backbone.device, settings.precision):
                     encoding = backbone.encode(made.inputs.to(backbone.device))
-                    loss = policy.flow_loss(
-                        batch, encoding, settings.flow_samples, generator, of=of
-                    )
-                losses.append(loss)
-            # The last part may be smaller, and counts less.
-            total += len(part) * sharing.total(torch.stack(losses).sum()).item()
-    return total / len(frames)
+                    losses.append(policy.flow_loss_at(batch, encoding, *drawn, shown))
+            total += sharing.total(torch.stack(losses).sum()).item()
+    return total
+
+
+def _draws(frames: Tensor, samples: int, batch: RobotBatch, noise: int) -> tuple[Tensor, Tensor]:
+    """The flow times [B, K] and noises [B, K, H, A] of frames [B], each drawn by its number alone.
+
+    So they depend neither on how many frames pass at once nor on which others are held out.
+    """
+    shape = (samples, *batch.actions.shape[1:])  # (K, H, A)
+    times, noises = [], []
+    for frame in frames.tolist():
+        # A generator on the CPU takes 32 bits of its seed: those of neighbours are mixed first.
+        mixed = np.random.SeedSequence([noise, frame]).generate_state(1)
+        generator = torch.Generator().manual_seed(int(mixed[0]))
+        times.append(flow.draw_times(shape[:1], generator))
+        noises.append(flow.draw_noise(shape, generator))
+    return torch.stack(times), torch.stack(noises)
+
+
+@contextmanager
+def _evaluating(policy: Policy) -> Iterator[None]:
+    """Let no pass inside the block write to the policy, as BatchNorm's averages in training."""
+    was_training = policy.training
+    policy.eval()
+    try:
+        yield
+    finally:
+        policy.train(was_training)
 
 
 def _report(run: TrainingRun) -> TrainReport:

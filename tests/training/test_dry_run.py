@@ -22,6 +22,7 @@ from torch import nn
 from aegis_cli import recipes
 from aegis_cli.common.events import Event, Progress
 from aegis_cli.models import backbones
+from aegis_cli.recipes.keys import LARGEST
 from aegis_cli.training import checkpoint, dry_run, train
 
 ROOT = Path(__file__).parent.parent.parent
@@ -350,6 +351,18 @@ def test_a_dry_run_counts_the_checkpoints_to_come(
     assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 2
     train.run(settings, "naive", demos_file, None, run, resume=True)
     assert dry_run.run(settings, "naive", demos_file, None, run, resume=True).checkpoints == 0
+
+
+@pytest.mark.parametrize("steps", [5, 6, LARGEST])
+@pytest.mark.parametrize("done", [0, 2, 3, 5, 6])
+def test_the_checkpoints_to_come_are_those_of_the_steps_that_are_left(
+    steps: int, done: int, tiny_folder: Path
+) -> None:
+    settings = small(tiny_folder, steps=steps, checkpoint_every=2)
+    written = [Path(str(done))] if done else []
+    known = {5: {2, 4, 5}, 6: {2, 4, 6}}.get(steps)
+    expected = LARGEST // 2 - done // 2 if known is None else sum(at > done for at in known)
+    assert dry_run._to_come(settings, written) == expected
 
 
 def test_as_many_steps_are_done_as_the_checkpoint_of_most_steps_says(tmp_path: Path) -> None:

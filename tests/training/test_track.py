@@ -100,6 +100,21 @@ def test_tensorboards_files_hold_the_log(recipe: Recipe, start: Start, tmp_path:
         assert [value for _, value in found] == pytest.approx([value for _, value in expected])
 
 
+@pytest.mark.parametrize("cut", [1, 3])  # before the first checkpoint, and after it
+def test_tensorboard_shows_each_step_of_a_run_once_that_was_ended_and_begins_again(
+    recipe: Recipe, start: Start, tmp_path: Path, cut: int
+) -> None:
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    watched = tracked(recipe, "tensorboard")
+    with pytest.raises(RuntimeError):
+        start("naive", tmp_path, recipe=watched, on_event=stop_at(cut, RuntimeError("killed")))
+    start("naive", tmp_path, recipe=watched, resume=True)
+    track.tell(watched, tmp_path, "probe-scenes", {"accuracy": 0.5}, step=6)
+    events = accumulators.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("loss")] == [1, 2, 3, 4, 5, 6]
+    assert len(events.Scalars("probe-scenes/accuracy")) == 1
+
+
 def test_a_tracked_run_has_the_same_weights_and_goes_on_untracked(
     stand_in: Any, recipe: Recipe, start: Start, naive_run: Path, tmp_path: Path
 ) -> None:

@@ -27,6 +27,7 @@ from samples.training_runs import (
     stop_at,
 )
 from samples.vqa_files import write_jsonl
+from torch import nn
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
@@ -34,6 +35,7 @@ from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 from aegis_cli.data.record import run as record
 from aegis_cli.methods import METHODS
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Insulate, Lora, Probe, Recipe, Rollout
 from aegis_cli.training import checkpoint, folder, step, train
@@ -53,6 +55,35 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     torch.manual_seed(99)  # another process has another random state
     start(method, tmp_path, resume=True)
     assert_same_run(tmp_path, uninterrupted)
+
+
+def test_running_averages_of_a_resumed_run_go_on_from_where_they_were(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No known family has any, but a model of the hub may."""
+    load, save = train.assemble.backbones.load, checkpoint.save
+    found: dict[str, torch.Tensor] = {}
+
+    def with_averages(name: str) -> Backbone:
+        backbone = load(name)
+        backbone.stem.norm = nn.BatchNorm2d(3)
+        backbone.stem.register_forward_pre_hook(lambda stem, given: stem.norm(*given))
+        return backbone
+
+    def saved(folder: Path, step: int, policy: Policy, *rest: Any, **more: Any) -> Path:
+        norm = policy.backbone.stem.norm
+        assert norm.num_batches_tracked == step  # those of validation do not count
+        found[folder.name] = norm.running_mean.clone()  # in the end the last checkpoint's
+        return save(folder, step, policy, *rest, **more)
+
+    monkeypatch.setattr(train.assemble.backbones, "load", with_averages)
+    monkeypatch.setattr(checkpoint, "save", saved)
+    start("naive", tmp_path / "whole", anchor=None)
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(3, KeyboardInterrupt())
+        start("naive", tmp_path / "cut", anchor=None, on_event=stop)
+    start("naive", tmp_path / "cut", anchor=None, resume=True)
+    assert torch.equal(found["whole"], found["cut"])
 
 
 def test_a_run_interrupted_before_its_first_checkpoint_begins_again(
