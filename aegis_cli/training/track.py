@@ -200,7 +200,9 @@ def _trackio(recipe: Recipe, out: Path, done: int | None, job: str = "") -> Gene
 
 
 @contextmanager
-def _wandb(recipe: Recipe, out: Path, done: int | None, job: str = "training") -> Generator[Tracker]:
+def _wandb(
+    recipe: Recipe, out: Path, done: int | None, job: str = "training"
+) -> Generator[Tracker]:
     """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them.
 
     A run that is finished offline cannot be opened again: what is measured later is a run of the
