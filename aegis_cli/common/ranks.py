@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +18,9 @@ from torch import distributed as dist
 
 from aegis_cli.common import devices, interrupts, launch
 from aegis_cli.common.errors import PeerLost
+
+if TYPE_CHECKING:
+    from torch.distributed.tensor import DTensor
 
 T = TypeVar("T")
 _BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
@@ -136,6 +139,7 @@ def joined() -> Generator[Ranks]:
         dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
         patient = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        assert isinstance(patient, dist.ProcessGroup)  # an int where this process is outside it
         ranks = Ranks(dist.get_rank(), dist.get_world_size(), patient=patient)
         with among(ranks):
             yield ranks
@@ -163,7 +167,7 @@ def among(ranks: Ranks) -> Generator[None]:
         _met = before
 
 
-def is_sharded(x: Tensor) -> bool:
+def is_sharded(x: Tensor) -> TypeGuard[DTensor]:
     """Whether each process has only some rows of a tensor."""
     return hasattr(x, "to_local")  # as only a DTensor has, whose class takes long to import
 
@@ -230,5 +234,5 @@ class _Total(torch.autograd.Function):
         return found
 
     @staticmethod
-    def backward(_: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return gradient, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return gradients[0], None
