@@ -73,13 +73,15 @@ class HFBackbone(Backbone):
             files: the processor's files as they were found; `save` writes them beside the weights.
 
         Raises:
-            AegisError: processor and model do not fit together, or the layers are not where the
-                family says.
+            AegisError: processor and model do not fit together, the layers are not where the
+                family says, or the model does not answer with words.
         """
         super().__init__()
         text = model.config.get_text_config()
         self.vlm, self._family, self._files = without_dropout(model.eval()), family, dict(files)
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
+        if head is None:
+            raise model_folder.headless(model)
         # The table's own length counts, because a processor may know more words than the model.
         limits = (text.max_position_embeddings, len(table.weight))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)

@@ -260,6 +260,15 @@ def _unsuitable(found: str, why: str) -> AegisError:
     )
 
 
+def headless(model: nn.Module) -> AegisError:
+    """The error for a model that answers with other things than words."""
+    return AegisError(
+        f"a {type(model).__name__} without a head that scores words",
+        "a vision-language model that answers with words",
+        f"use a model of another family: {', '.join(FAMILIES)}",
+    )
+
+
 def foreign_rotation(layer: int) -> AegisError:
     """The error for a family whose keys the expert's own would not fit."""
     found = f"layer {layer} rotates its keys in a way of its own, or not at all"
