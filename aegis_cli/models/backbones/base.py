@@ -155,11 +155,11 @@ class Backbone(nn.Module, ABC):
         """One forward pass over image and prompt tokens."""
 
     @abstractmethod
-    def answer(self, images: Tensor, questions: Sequence[str]) -> list[str]:
+    def answer(self, images: Images, questions: Sequence[str]) -> list[str]:
         """Answers by greedy autoregressive decoding.
 
         Args:
-            images: one per question, [B, H, W, 3] uint8.
+            images: one per question, as `prepare` takes them.
         """
 
     def prepare_answers(
@@ -174,7 +174,7 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def answer_log_likelihood(
         self,
-        images: Tensor,
+        images: Images,
         questions: Sequence[str],
         answers: Sequence[str],
         prepared: Any = None,
@@ -197,7 +197,7 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def read_vqa(
         self,
-        images: Tensor,
+        images: Tensor | Sequence[Tensor],
         image_of: Tensor,
         questions: Sequence[str],
         answers: Sequence[str],
@@ -209,7 +209,7 @@ class Backbone(nn.Module, ABC):
         So a forward hook needs no mask.
 
         Args:
-            images: [N, H, W, 3] uint8.
+            images: [N, H, W, 3] uint8, or N of any sizes.
             image_of: [M] int64, the image of each question.
             questions, answers: M texts each.
             together: how many questions one pass may read, in models that pass the image again for
