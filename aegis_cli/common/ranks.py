@@ -7,7 +7,7 @@ process adds what its own frames contribute to the whole batch's mean, and contr
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
@@ -106,9 +106,14 @@ class Ranks:
 
         The others wait for it, however long it takes to find.
         """
-        if not self.several:
-            return value
-        box: list[Any] = [value]
+        return self._told([value]) if self.several else value
+
+    def by_first(self, find: Callable[[], T]) -> T:
+        """What the first process finds, as `agree` does with a value; only it is asked."""
+        return self.agree(find()) if self.first else self._told([None])
+
+    def _told(self, box: list[Any]) -> Any:
+        """What is in the first process's box."""
         device = _device() if self.patient is None else torch.device("cpu")
         dist.broadcast_object_list(box, src=0, group=self.patient, device=device)
         return box[0]
