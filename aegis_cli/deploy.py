@@ -190,7 +190,7 @@ class DeployedPolicy:
         instruction: str | None = None,
         positions: Positions | None = None,
         previous: np.ndarray | None = None,
-        delay: int = 0,
+        delay: int | np.integer = 0,
     ) -> np.ndarray:
         """The next actions [H, A] float32.
 
@@ -259,7 +259,7 @@ class DeployedPolicy:
             acted = self._policy.act(images, texts, proprio, self._generator, continued)
         return check_actions(acted[0].cpu()).numpy()
 
-    def _continued(self, previous: np.ndarray | None, delay: int) -> Continued | None:
+    def _continued(self, previous: np.ndarray | None, delay: int | np.integer) -> Continued | None:
         """What a chunk is to continue; None where nothing is left.
 
         Raises:

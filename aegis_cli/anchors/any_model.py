@@ -256,5 +256,5 @@ class Measurement(Removable):
         self._add_samples(len(seen.mask))
 
     def _add_samples(self, count: int | None) -> None:
-        known = self._samples is not None and count is not None
-        self._samples = self._samples + count if known else None
+        known = self._samples
+        self._samples = None if known is None or count is None else known + count

@@ -210,6 +210,7 @@ class CurvatureRecorder:
         # The gradients at the maps' outputs are all that counts. Asking for those at the entries
         # leaves out the parameters' own, half of the work and as much memory as the model.
         ends = [*self._graph.entries, *self._graph.lone]
+        # pyrefly: ignore[no-matching-overload]: torch takes both kinds of ends in one list
         torch.autograd.grad(total, ends, retain_graph=keep, allow_unused=True)
         for reading in self._open:  # an answer may not depend on all that read the same
             self._count_inputs(reading)
@@ -401,6 +402,7 @@ def _size(whole: int, module: nn.Module) -> int:
     width = inputs.dense_width(module)
     if width is None:
         return 0
+    assert isinstance(module, DENSE)
     of_inputs = moment_sums.size(width, not isinstance(module, nn.Linear), whole)
     return of_inputs + moment_sums.size(len(module.weight), whole=whole)
 

@@ -412,6 +412,7 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     """
     if isinstance(module, nn.Conv2d):
         padding = 0 if module.padding == "valid" else module.padding
+        assert not isinstance(padding, str)  # "same" is no map: `structure.site_kind`
         patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
         return patches.transpose(1, 2).flatten(0, 1)  # [B, d, n] -> [B*n, d]
     if isinstance(module, nn.Conv3d):

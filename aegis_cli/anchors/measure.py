@@ -106,7 +106,7 @@ def run(
                 on_event,
             )
         _warn_of_few(measured.samples, settings, on_event)
-        return ranks.agree(_written(measured, settings, Path(out)) if ranks.first else None)
+        return ranks.by_first(lambda: _written(measured, settings, Path(out)))
 
 
 def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:

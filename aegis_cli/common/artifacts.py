@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -240,9 +239,9 @@ def _digest(fields: Mapping[str, Any], tensors: Tensors) -> str:
     return whole.hexdigest()
 
 
-def _bytes(tensor: Tensor) -> np.ndarray:
+def _bytes(tensor: Tensor) -> memoryview:
     """A tensor's values as they lie in memory [bytes], one after the other."""
-    return tensor.cpu().reshape(-1).view(torch.uint8).numpy()
+    return tensor.cpu().reshape(-1).view(torch.uint8).numpy().data
 
 
 class _OnCpu(Mapping[str, Tensor]):

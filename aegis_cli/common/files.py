@@ -105,12 +105,12 @@ def aside(path: Path) -> Generator[tuple[Path, BinaryIO]]:
     """
     sweep(path)
     with contextlib.ExitStack() as stack:
-        file = None
-        while file is None:
+        while True:
             place = _place(path)
-            opened = stack.enter_context(open(place, "xb"))
+            file = stack.enter_context(open(place, "xb"))
             stack.callback(_remove, place)  # after the rename there is nothing to remove
-            file = opened if _is_locked(opened.fileno(), place) else None
+            if _is_locked(file.fileno(), place):
+                break
         yield place, file
 
 
@@ -119,14 +119,14 @@ def folder_aside(path: Path) -> Generator[Path]:
     """A new folder beside `path`, as `aside` makes a file."""
     sweep(path)
     with contextlib.ExitStack() as stack:
-        locked = False
-        while not locked:
+        while True:
             place = _place(path)
             place.mkdir()
             stack.callback(_remove, place)
             descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
             stack.callback(os.close, descriptor)
-            locked = _is_locked(descriptor, place)
+            if _is_locked(descriptor, place):
+                break
         yield place
 
 

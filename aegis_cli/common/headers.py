@@ -125,23 +125,21 @@ def parse_header(
         AegisError: the file is not one of Aegis's, not of the `expected` kind, of a later version,
             or damaged.
     """
-    if "aegis" not in (metadata or {}):
+    if metadata is None or "aegis" not in metadata:
         raise AegisError(
             f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
             f"a file of kind {repr(expected) if expected else 'known to Aegis'}",
             rewrite(expected),
         )
     try:
-        fields = parse_json(metadata["aegis"])
+        fields: dict[str, Any] = parse_json(metadata["aegis"])
         canonical(fields)  # a number that is not finite is a ValueError
         kind, number = str(fields["kind"]), int(fields["schema"])
         _check_kind(path, kind, expected)
         _check_schema(path, kind, number)
-        specs = fields["tensors"].items()
-        tensors = {
-            name: TensorSpec(**{**spec, "shape": tuple(spec["shape"])}) for name, spec in specs
-        }
-        header = Header(**{**fields, "tensors": tensors})
+        tensors = {name: _spec(said) for name, said in fields["tensors"].items()}
+        whole: dict[str, Any] = {**fields, "tensors": tensors}
+        header = Header(**whole)
         _check_types(header)
         return header
     except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -150,6 +148,11 @@ def parse_header(
             "the header as Aegis wrote it",
             rewrite(expected),
         ) from error
+
+
+def _spec(said: Mapping[str, Any]) -> TensorSpec:
+    fields: dict[str, Any] = {**said, "shape": tuple(said["shape"])}
+    return TensorSpec(**fields)
 
 
 def _check_types(header: Header) -> None:

@@ -154,11 +154,12 @@ def save_video(clips: Sequence[Clip], path: Path) -> None:
 def _pictures(clips: Sequence[Clip]) -> Iterator[Any]:
     columns = len(clips) if len(clips) <= 4 else math.ceil(len(clips) / 2)
     rings = [_ring(clip.ring) for clip in clips]
-    drawn: list[tuple[Moment, np.ndarray] | None] = [None] * len(clips)
+    first = [clip.moments[0] for clip in clips]
+    drawn = [(m, _framed(m, ring)) for m, ring in zip(first, rings, strict=True)]
     for t in range(max(len(clip.moments) for clip in clips) + _HOLD_FRAMES):
         for i, clip in enumerate(clips):
             moment = clip.moments[min(t, len(clip.moments) - 1)]
-            if drawn[i] is None or drawn[i][0] is not moment:
+            if drawn[i][0] is not moment:
                 drawn[i] = (moment, _framed(moment, rings[i]))
         cells = [(clip.caption, [tile]) for clip, (_, tile) in zip(clips, drawn, strict=True)]
         yield tiled(cells, columns, _CLIP_TILE, _CLIP_TEXT)

@@ -125,7 +125,7 @@ class WorkerPool:
             process.kill()
         # A worker may have died while it wrote a result. The executor's thread waits for the rest
         # of it as long as somebody could write it, and this process could.
-        self._executor._result_queue._writer.close()
+        self._executor._result_queue._writer.close()  # pyrefly: ignore[missing-attribute]: private
 
 
 def _unguarded_script() -> str | None:

@@ -7,10 +7,10 @@ process adds what its own frames contribute to the whole batch's mean, and contr
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +18,9 @@ from torch import distributed as dist
 
 from aegis_cli.common import devices, interrupts, launch
 from aegis_cli.common.errors import PeerLost
+
+if TYPE_CHECKING:
+    from torch.distributed.tensor import DTensor
 
 T = TypeVar("T")
 _BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
@@ -103,9 +106,14 @@ class Ranks:
 
         The others wait for it, however long it takes to find.
         """
-        if not self.several:
-            return value
-        box: list[Any] = [value]
+        return self._told([value]) if self.several else value
+
+    def by_first(self, find: Callable[[], T]) -> T:
+        """What the first process finds, as `agree` does with a value; only it is asked."""
+        return self.agree(find()) if self.first else self._told([None])
+
+    def _told(self, box: list[Any]) -> Any:
+        """What is in the first process's box."""
         device = _device() if self.patient is None else torch.device("cpu")
         dist.broadcast_object_list(box, src=0, group=self.patient, device=device)
         return box[0]
@@ -136,6 +144,7 @@ def joined() -> Generator[Ranks]:
         dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
         patient = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        assert isinstance(patient, dist.ProcessGroup)  # an int where this process is outside it
         ranks = Ranks(dist.get_rank(), dist.get_world_size(), patient=patient)
         with among(ranks):
             yield ranks
@@ -163,7 +172,7 @@ def among(ranks: Ranks) -> Generator[None]:
         _met = before
 
 
-def is_sharded(x: Tensor) -> bool:
+def is_sharded(x: Tensor) -> TypeGuard[DTensor]:
     """Whether each process has only some rows of a tensor."""
     return hasattr(x, "to_local")  # as only a DTensor has, whose class takes long to import
 
@@ -230,5 +239,5 @@ class _Total(torch.autograd.Function):
         return found
 
     @staticmethod
-    def backward(_: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return gradient, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return gradients[0], None

@@ -27,6 +27,7 @@ class _SquaredReLU(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # `positive` is not an input: a second derivative would miss its term
+    # pyrefly: ignore[bad-override]: torch's has any number of them, the decorator hides a name
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (positive,) = ctx.saved_tensors
         return gradient.mul(positive).mul_(2)

@@ -114,18 +114,18 @@ class Curvature:
         flat = flat.to(self.c.dtype)
         inputs, outputs = self.inputs.to(flat.dtype), self.outputs.to(flat.dtype)
         floor, above = self._shares(strength, self.c, factor)
-        rest = self.c_rest
-        resolved = not isinstance(rest, Tensor) and rest == 0
-        if not resolved:
+        rest, of_rest = self.c_rest, None
+        if isinstance(rest, Tensor) or rest != 0:
             # Every input direction gets the share of the unresolved ones; along the stored ones the
             # difference to their own share is added below.
             if not isinstance(rest, Tensor):
                 rest = self.c.new_full((1,), rest)
-            floor_rest, above_rest = self._shares(strength, rest, factor)
+            of_rest = floor_rest, above_rest = self._shares(strength, rest, factor)
             floor, above = floor - floor_rest, above - above_rest
         read = flat @ inputs  # [o, k]
         found = (read * floor + outputs @ (self._stored(outputs, read) * above)) @ inputs.mT
-        if not resolved:
+        if of_rest is not None:
+            floor_rest, above_rest = of_rest
             found += flat * floor_rest
             found += outputs @ (self._stored(outputs, flat) * above_rest)
         found_weight = found[..., :width].reshape(weight.shape)

@@ -207,7 +207,8 @@ class Sketch(MomentSum):
 
     def _root(self, count: int, shift: float) -> Tensor:
         """The Cholesky root of O^T (Y + shift O), [l, l]."""
-        core = sum(part.T @ seen for part, seen in self._shifted(count, shift))
+        zero = self._trace.new_zeros(())
+        core = sum((part.T @ seen for part, seen in self._shifted(count, shift)), zero)
         return torch.linalg.cholesky((core + core.T) / 2)
 
     def _halves(self, root: Tensor, count: int, shift: float) -> Iterator[Tensor]:

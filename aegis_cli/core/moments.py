@@ -154,22 +154,24 @@ def shared_moments(
     """
     if reads:
         rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
-        valid = torch.ones((), dtype=torch.bool, device=mask.device)
+        masks: Sequence[Tensor | None] = [None] * len(rows)
         here = rows[0].new_tensor(rows[0].shape[1])
     else:
-        rows = []
+        rows, valids = list[Tensor](), list[Tensor]()
         for layers in _together(hidden):
             x, valid = _all_rows(layers, mask)
             rows.append(x.masked_fill(~valid, 0))
-        here = valid.sum().to(rows[0].dtype)
+            valids.append(valid)
+        masks = valids
+        here = valids[-1].sum().to(rows[0].dtype)
     count = total(here)
     means = total(torch.cat([x.sum(1) for x in rows])) / count  # [L, D]
     squares = []
     # The centre's gradient is left out: over all tokens it is 0, but not over a share of them.
     centres = means.detach().split([len(x) for x in rows])
-    for x, centre in zip(rows, centres, strict=True):
+    for x, centre, valid in zip(rows, centres, masks, strict=True):
         deviations = x - centre.unsqueeze(1)
-        if not reads:
+        if valid is not None:
             deviations = deviations.masked_fill(~valid, 0)
         squares.append(deviations.square().sum(1))
     return list(zip(means, total(torch.cat(squares)) / count, strict=True))

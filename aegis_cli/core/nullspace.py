@@ -66,10 +66,12 @@ class Dense:
         rest = self.rest
         if isinstance(rest, Tensor):
             protected = protected + rest[..., None] * weight
-            shifted = None if bias is None else shifted + rest * bias
+            if bias is not None and shifted is not None:
+                shifted = shifted + rest * bias
         elif rest:
             protected = protected + rest * weight
-            shifted = None if bias is None else shifted + rest * bias
+            if bias is not None and shifted is not None:
+                shifted = shifted + rest * bias
         return protected, shifted
 
     def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
@@ -153,7 +155,7 @@ class Elementwise:
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
         of_weight, of_bias = self.changed(weight, bias, before)
         weight.sub_(of_weight)
-        if bias is not None:
+        if bias is not None and of_bias is not None:
             bias.sub_(of_bias)
 
 

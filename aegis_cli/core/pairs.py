@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from aegis_cli.core.numerics import widened
 
 Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
+
+
+def present(pair: Pair) -> Sequence[Tensor]:
+    """The weight, and the bias where there is one."""
+    weight, bias = pair
+    return (weight,) if bias is None else (weight, bias)
 
 
 def copied(pair: Pair) -> Pair:

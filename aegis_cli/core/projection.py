@@ -99,8 +99,8 @@ def _one(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
 def dot(x: Tensor, y: Tensor) -> Tensor:
     """<x, y> of two tensors of one shape, a float64 scalar."""
     total = torch.zeros((), dtype=torch.float64, device=x.device)
-    for u, v in _widened(x, y):
-        total = total + u.dot(v)
+    for u, v in zip(_blocks(x), _blocks(y), strict=True):
+        total = total + u.double().dot(v.double())
     return total
 
 

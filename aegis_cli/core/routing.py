@@ -25,12 +25,14 @@ this package. `top` selects the usual linear router instead, with one gate per s
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, ItemsView, Mapping, Sequence, ValuesView
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+M = TypeVar("M", bound=nn.Module)
 
 
 class Traced(NamedTuple):
@@ -108,7 +110,8 @@ class Router(nn.Module):
         if self.top is None or len(self.experts) == 1:
             return
         drawn = self.bias if self.constant else self.read
-        width = 1 if self.constant else self.read.shape[1]
+        assert drawn is not None
+        width = 1 if self.constant else drawn.shape[1]
         # A sum over `width` inputs has a spread of 1 then, whatever the width.
         drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 
@@ -122,12 +125,15 @@ class Router(nn.Module):
         if len(self.experts) == 1:
             return codes.new_ones(codes.shape[:-1])
         if self.top is None:
+            assert self.read is not None and self.bias is not None
             logits = (codes * self.read).sum(-1) + self.bias  # [..., T, E]
             return logits.float().softmax(-1).to(codes.dtype)
         mean = x.mean(-2, keepdim=True)  # [..., 1, d_in]
         if self.constant:
+            assert self.bias is not None
             logits = self.bias.expand(*mean.shape[:-1], -1).float()
         else:
+            assert self.read is not None
             logits = nn.functional.linear(mean, self.read).float()  # [..., 1, E]
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
@@ -156,20 +162,35 @@ class Router(nn.Module):
             setattr(self, name, fresh)
 
 
+class _Modules(nn.ModuleDict, Generic[M]):
+    """Modules of one class by name."""
+
+    if TYPE_CHECKING:
+
+        def __getitem__(self, key: str) -> M: ...
+        def items(self) -> ItemsView[str, M]: ...
+        def values(self) -> ValuesView[M]: ...
+
+
 class RoutedLinear(nn.Module):
     """A frozen map, the experts beside it, and a router for each task that has some.
 
     Attributes:
+        experts: by number.
+        routers: by task.
         active: number of the task whose router is used. With None, or a task that has no router
             here, the map is bare.
         born: how many experts were ever created, which is the next one's number.
         trace: where passes are noted while `traced` is on.
     """
 
+    experts: _Modules[Expert]
+    routers: _Modules[Router]
+
     def __init__(self, base: nn.Linear) -> None:
         super().__init__()
         self.base = base.requires_grad_(False)
-        self.experts, self.routers = nn.ModuleDict(), nn.ModuleDict()
+        self.experts, self.routers = _Modules(), _Modules()
         self.active: int | None = None
         self.born = 0
         self.trace: list[Traced] | None = None
@@ -262,7 +283,7 @@ class RoutedLinear(nn.Module):
 
     def rebuild(self, structure: Mapping[str, Any]) -> None:
         """Recreate the modules of `structure`, frozen; their tensors are still to be loaded."""
-        self.experts, self.routers, self.born = nn.ModuleDict(), nn.ModuleDict(), structure["born"]
+        self.experts, self.routers, self.born = _Modules(), _Modules(), structure["born"]
         # JSON sorts its keys as text, 10 before 2; `numbers` promises the order of coming.
         for number in sorted(structure["experts"], key=int):
             said = structure["experts"][number]

@@ -426,7 +426,7 @@ def _load_folder(
     for name, own in zip(cameras, digests, strict=True):
         is_video = found.info.features[name].dtype != "image"
         if is_video and not cache and not camera_frames.are_kept(source, name, image_size, own):
-            parts = list(camera_frames.split(source, index, name))
+            parts = list(camera_frames.video_parts(source, index, name))
             frames.append(FramesOnDemand(parts, found.info.frames, image_size))
             videos.update(part.path for part in parts)
         else:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from aegis_cli.common import pictures
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
+
+if TYPE_CHECKING:
+    from aegis_cli.data.joined_frames import JoinedFrames
 
 
 class FittedFrames:
@@ -19,7 +24,7 @@ class FittedFrames:
     """
 
     def __init__(
-        self, frames: Tensor | FramesOnDemand | FittedFrames, size: tuple[int, int]
+        self, frames: Tensor | FramesOnDemand | FittedFrames | JoinedFrames, size: tuple[int, int]
     ) -> None:
         """Take the frames of one camera, of any size, and the (height, width) to show them in."""
         self.frames = frames

@@ -121,6 +121,7 @@ def best(
     with mapped(record, range(total), workers, "a recording process", _FIX) as results:
         for number, episode in enumerate(results):
             seen.attempts = number + 1
+            assert episode.total_reward is not None
             seen.returns.append(float(episode.total_reward))
             heapq.heappush(kept, (seen.returns[-1], -number, episode))
             if len(kept) > episodes:

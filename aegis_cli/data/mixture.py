@@ -99,7 +99,7 @@ def joined(
     first, *others = found
     if not others:
         return first
-    sizes = [tuple(frames.shape[1:3]) for frames in first.frames]
+    sizes = [(frames.shape[1], frames.shape[2]) for frames in first.frames]
     _warn_of_other_sizes(paths, found, on_event)
     shown = [first, *(other.fitted(sizes) for other in others)]
     counts = [len(own.episode_of) for own in shown]

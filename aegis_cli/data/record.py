@@ -163,6 +163,7 @@ def _report(
     preview: Path | None,
     cameras: Sequence[str] | None,
 ) -> DemosReport:
+    selection = Selection(None if cameras is None else tuple(cameras))
     return DemosReport(
         task=spec.name,
         episodes=episodes,
@@ -177,7 +178,7 @@ def _report(
         frames_per_s=seen.frames / seconds,
         workers=workers,
         out=str(out),
-        sha256=demonstrations.digest(Path(out), Selection(cameras and tuple(cameras))),
+        sha256=demonstrations.digest(Path(out), selection),
         preview=None if preview is None else str(preview),
     )
 

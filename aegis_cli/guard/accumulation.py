@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
-from aegis_cli.methods.backward import Groups
+from aegis_cli.methods.backward import Groups, Weights
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Accumulation:
     count: int
     anchor: dict[int, Tensor | None]
     w2: Tensor
-    weights: list[float]
+    weights: Weights
     marks: dict[int, tuple[Tensor | None, int]]
     idle: set[int] = field(default_factory=set)
     empty: bool = False
@@ -70,7 +70,7 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
     total.w2 = total.w2 + (w2 - total.w2) * share
 
 
-def mark(total: Accumulation, groups: Groups, weights: list[float]) -> None:
+def mark(total: Accumulation, groups: Groups, weights: Weights) -> None:
     """Remember the state of every `.grad`, which now holds the sum projected with these weights."""
     total.weights, total.marks, total.empty = weights, {}, cleared(groups)
     for group in groups:

@@ -242,7 +242,8 @@ class DualBackward:
             self._poisoned = accumulation.poison(total, groups)
             return
         check_row(gram, self._ledger.groups)
-        self._ledger.append(self._step, *(x / scale**2 for x in gram), total.w2)
+        tt, ta, aa = (x / scale**2 for x in gram)
+        self._ledger.append(self._step, tt, ta, aa, total.w2)
         self._row_is_open, self._skips = True, skips
         accumulation.mark(total, groups, weights)
         self._sum = total

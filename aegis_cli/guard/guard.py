@@ -135,7 +135,8 @@ class Guard(Removable):
         # Whoever names the kinds to protect has decided about the rest too.
         averaging = {} if dual or "protect" in options else structure.averaging(model)
         self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
-        self._hooks, self._seen = LayerHooks(found), None
+        self._hooks = LayerHooks(found)
+        self._seen: Pass | None = None
         self._dual: DualBackward | None = None
         if dual:
             self._dual = DualBackward(

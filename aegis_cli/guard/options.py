@@ -120,7 +120,7 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """
     problems: list[Problem] = []
     every = {} if methods.get(method).compares_layers else {"every": 1}
-    given = every | dict(options)
+    given: dict[str, Any] = every | dict(options)
     protect = {}
     if method == "kfac":
         protect["protect"] = _dense_kinds(given.pop("protect", _DENSE_KINDS))
@@ -214,6 +214,8 @@ def _measured_part(model: nn.Module, path: Path) -> str | None:
     try:
         wanted = artifacts.read_header(path).fingerprint
     except AegisError:  # whoever loads it says what is wrong with it
+        return None
+    if wanted is None:
         return None
     for name in structure.around_blocks(model):
         inside = structure.part_of(model, name)

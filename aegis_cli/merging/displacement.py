@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import torch
 
-from aegis_cli.core.pairs import Pair, minus
+from aegis_cli.core.pairs import Pair, minus, present
 from aegis_cli.core.projection import dot
 from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.site_weights import weights
@@ -90,10 +90,10 @@ class Displacement:
         for site, now, origin, tuned in parts:
             moved = minus(tuned, origin)
             left = self._keep(site, moved, strength)
-            for parameter, start, way, part in zip(now, origin, moved, left, strict=True):
-                if parameter is not None:
-                    parameter.copy_(start + part)
-                    along += float(dot(part, way))
-                    squared += float(dot(way, way))
+            four = map(present, (now, origin, moved, left))
+            for parameter, start, way, part in zip(*four, strict=True):
+                parameter.copy_(start + part)
+                along += float(dot(part, way))
+                squared += float(dot(way, way))
         # In bases that are not orthogonal, rounding can lead past either end.
         return min(max(along / squared, 0.0), 1.0) if squared else None

@@ -15,7 +15,7 @@ from aegis_cli.common.events import OnEvent
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.merging import TwoSided, basis, damped
-from aegis_cli.core.pairs import Pair, minus
+from aegis_cli.core.pairs import Pair, minus, present
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data.vqa import sets
 from aegis_cli.merging.displacement import Keep
@@ -58,8 +58,8 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
 
 
 def _moved(source: Source, site: str) -> bool:
-    pairs = zip(weights(source.backbone, site), weights(source.base, site), strict=True)
-    return any(now is not None and has_moved(source, now, before) for now, before in pairs)
+    both = (present(weights(model, site)) for model in (source.backbone, source.base))
+    return any(has_moved(source, now, before) for now, before in zip(*both, strict=True))
 
 
 def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:

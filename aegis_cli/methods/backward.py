@@ -173,11 +173,13 @@ def recompile_for_two_backward_passes() -> None:
 
     A graph compiled for one backward pass overwrites the buffers that the second needs.
     """
-    # They are looked up, not imported: without them nothing is compiled, and they load slowly.
-    config, dynamo = (
-        sys.modules.get(name) for name in ("torch._functorch.config", "torch._dynamo")
-    )
-    if config is not None and dynamo is not None and config.donated_buffer:
+    # Only where both are loaded: without them nothing is compiled, and they load slowly.
+    if not {"torch._functorch.config", "torch._dynamo"} <= sys.modules.keys():
+        return
+    import torch._dynamo as dynamo
+    import torch._functorch.config as config
+
+    if config.donated_buffer:
         config.donated_buffer = False
         dynamo.reset()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from torch import Tensor, nn
 
@@ -14,13 +14,15 @@ from aegis_cli.core.projection import Combine
 from aegis_cli.data.batch import RobotBatch, Share
 
 Options = Mapping[str, Any]
+M = TypeVar("M", bound=nn.Module)
 
 
 @dataclass(frozen=True)
-class MethodContext:
+class MethodContext(Generic[M]):
     """What a method is started with: model, options, anchor and data.
 
-    Every tensor is on the device where training runs.
+    Every tensor is on the device where training runs. A method that the guard has takes any module
+    M; others may ask for a `Backbone`.
 
     Attributes:
         backbone: adapted, its weights still the pre-trained ones.
@@ -41,7 +43,7 @@ class MethodContext:
         owners: the processes each of which has some rows of every weight; one where each has all.
     """
 
-    backbone: nn.Module
+    backbone: M
     groups: Mapping[str, Sequence[nn.Parameter]]
     sites: Mapping[str, str]
     options: Options

@@ -24,7 +24,7 @@ from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
 from aegis_cli.models.backbones.base import Backbone
 
 
-def start(context: MethodContext) -> Parts:
+def start(context: MethodContext[Backbone]) -> Parts:
     """Copy what learns of the backbone, as it is now."""
     weight = context.options["weight"]
     if weight == 0:  # naive, and no copy to pay for

@@ -27,6 +27,7 @@ from torch import Tensor
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
+from aegis_cli.models.backbones.base import Backbone
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class _Written:
     answered: Any
 
 
-def start(context: MethodContext) -> Parts:
+def start(context: MethodContext[Backbone]) -> Parts:
     """Let the backbone learn actions as text, and questions if they have a weight.
 
     Raises:
@@ -72,7 +73,7 @@ def start(context: MethodContext) -> Parts:
 
 
 def _action_loss(
-    context: MethodContext, write: Callable[[RobotBatch], _Written]
+    context: MethodContext[Backbone], write: Callable[[RobotBatch], _Written]
 ) -> Callable[[Pass], Tensor]:
     """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
     backbone = context.backbone
@@ -92,7 +93,7 @@ def _action_loss(
     return loss
 
 
-def _writing(context: MethodContext) -> Callable[[RobotBatch], _Written]:
+def _writing(context: MethodContext[Backbone]) -> Callable[[RobotBatch], _Written]:
     """Robot frames -> their actions as text; on the CPU, so that reading numbers syncs no GPU."""
     backbone, targets = context.backbone, context.targets
     limit, horizon, prompt = (context.options[name] for name in ("limit", "horizon", "prompt"))
@@ -141,7 +142,7 @@ def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
     return texts
 
 
-def _numbers(context: MethodContext) -> Sequence[str]:
+def _numbers(context: MethodContext[Backbone]) -> Sequence[str]:
     """The text of each bin, as the backbone writes numbers."""
     known = context.backbone.numbers
     count = known if context.options["bins"] is None else context.options["bins"]
@@ -154,7 +155,7 @@ def _numbers(context: MethodContext) -> Sequence[str]:
     return context.backbone.number_texts(count)
 
 
-def _check_room(context: MethodContext, longest: str) -> None:
+def _check_room(context: MethodContext[Backbone], longest: str) -> None:
     """Raise AegisError for an instruction with which the longest text of actions does not fit."""
     for instruction in context.instructions:
         asked = context.options["prompt"].replace("{}", instruction)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError, few
+from aegis_cli.common.ranks import is_sharded
 from aegis_cli.methods.backward import Gram
 from aegis_cli.models import structure
 
@@ -114,7 +115,10 @@ def refuse_partly_sharded(model: nn.Module, count: int) -> None:
     """
     wrong = []
     for name, parameter in structure.learning(model).items():
-        placements = getattr(parameter, "placements", ())
+        if not is_sharded(parameter):
+            wrong.append(name)
+            continue
+        placements = parameter.placements
         rows = len(placements) == 1 and placements[0].is_shard(0)
         if not rows or parameter.device_mesh.size() != count:
             wrong.append(name)

@@ -25,9 +25,10 @@ from aegis_cli.common.ranks import rows_here
 from aegis_cli.core import projection
 from aegis_cli.core.numerics import ratio
 from aegis_cli.methods.base import Method, MethodContext, Parts, Update, train_all
+from aegis_cli.models.backbones.base import Backbone
 
 
-def start(context: MethodContext) -> Parts:
+def start(context: MethodContext[Backbone]) -> Parts:
     """Hold every parameter to the value it has now, with the strength of its group."""
     weight = context.options["weight"]
     if weight == 0:
@@ -45,12 +46,13 @@ def start(context: MethodContext) -> Parts:
     def constrain(update: Update) -> None:
         chosen = []
         for name, parameter in learning.items():
-            if parameter.grad is not None and strengths[id(parameter)] > 0:
-                chosen.append((parameter, update.before[name], reference[name]))
+            gradient = parameter.grad
+            if gradient is not None and strengths[id(parameter)] > 0:
+                chosen.append((parameter, gradient, update.before[name], reference[name]))
         if not chosen:
             return
-        products = owners.total(torch.stack([_products(*three) for three in chosen]))
-        for (parameter, _, origin), found in zip(chosen, products, strict=True):
+        products = owners.total(torch.stack([_products(*four) for four in chosen]))
+        for (parameter, _, _, origin), found in zip(chosen, products, strict=True):
             _project(parameter, origin, found, strengths[id(parameter)])
 
     return Parts(constrain=constrain)
@@ -72,12 +74,12 @@ def _depth(group: str) -> tuple[int, int]:
     return {"embeddings": 1, "final_norm": 3, "head": 4}.get(group, 0), 0
 
 
-def _products(parameter: nn.Parameter, before: Tensor, origin: Tensor) -> Tensor:
+def _products(parameter: nn.Parameter, gradient: Tensor, before: Tensor, origin: Tensor) -> Tensor:
     """<now, now>, <was, was> and <gradient, was> [3] of the displacements now and before."""
     here, start = rows_here(parameter), rows_here(origin)
     now, was = here - start, rows_here(before) - start
     # These are float64: the two distances differ by one step in thousands.
-    pairs = ((now, now), (was, was), (rows_here(parameter.grad), was))
+    pairs = ((now, now), (was, was), (rows_here(gradient), was))
     return torch.stack([projection.dot(x, y) for x, y in pairs])
 
 

@@ -154,11 +154,12 @@ def _before(site: str, now: Pair, update: Update) -> Pair:
 
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:
-    weight, bias = now
-    moved, shifted = nullspace.allowed(protection, minus((weight, bias), before))
-    torch.add(before[0], moved, out=weight.data)
+    (weight, bias), (old_weight, old_bias) = now, before
+    moved, shifted = nullspace.allowed(protection, minus(now, before))
+    torch.add(old_weight, moved, out=weight.data)
     if bias is not None:
-        torch.add(before[1], shifted, out=bias.data)
+        assert old_bias is not None and shifted is not None
+        torch.add(old_bias, shifted, out=bias.data)
 
 
 METHOD = Method(

@@ -120,10 +120,10 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     backbone = outline.build(sizes["backbone"], folder / BACKBONE, path, count)
     with reading_meta(path):
         check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
-        scales = [_unit(int(sizes[name])) for name in ("positions", "actions")]
+        positions, actions = (_unit(int(sizes[name])) for name in ("positions", "actions"))
         relative = relative_of(meta, int(sizes["actions"]), int(sizes["positions"]))
         stored = STORED_TYPES[meta.get("stored", FLOAT32)]
-    policy = Policy(backbone, ActionExpert(shape), *scales, relative)
+    policy = Policy(backbone, ActionExpert(shape), positions, actions, relative)
     backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)

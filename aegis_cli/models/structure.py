@@ -477,7 +477,7 @@ def digest(state: Mapping[str, Tensor]) -> str:
     for name, tensor in sorted(state.items()):
         values = whole(tensor.detach()).float().cpu().contiguous()
         found.update(f"{name} {tuple(tensor.shape)}".encode())
-        found.update(values.numpy())
+        found.update(values.numpy().data)
     return found.hexdigest()
 
 
@@ -584,4 +584,5 @@ def rms_normed(module: nn.Module, x: Tensor) -> Tensor:
     """
     wide = widened(x)
     epsilon = rms_epsilon(module, wide.dtype)
+    assert epsilon is not None
     return wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + epsilon)

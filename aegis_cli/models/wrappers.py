@@ -7,7 +7,8 @@ never by the names alone, since a model may call a part of its own `module`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol, TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -117,19 +118,39 @@ def adapters_are_idle(model: nn.Module) -> bool:
     return all(_is_idle(module) for module in adapted(model).values())
 
 
+class _Adapting(Protocol):
+    """A layer that can say what its adapters add to the weights.
+
+    Attributes:
+        active_adapters: their names.
+        adapter_layer_names: its attributes that hold weights by the adapters' names.
+    """
+
+    @property
+    def active_adapters(self) -> Sequence[str]: ...
+
+    @property
+    def adapter_layer_names(self) -> Sequence[str]: ...
+
+    def get_delta_weight(self, adapter: str, /) -> Tensor: ...
+
+
 def _is_idle(module: nn.Module) -> bool:
     if _held(module) == "original_module":
         return all(map(_equal_weights, _copies(module), _originals(module)))
-    changes = getattr(module, "get_delta_weight", None)
-    if changes is None:
+    if not _says(module):
         return False
     names = [name for name in module.active_adapters if name in _known_adapters(module)]
-    return not any(changes(name).any() for name in names)
+    return not any(module.get_delta_weight(name).any() for name in names)
 
 
-def _known_adapters(module: nn.Module) -> set[str]:
+def _says(module: nn.Module) -> TypeGuard[_Adapting]:
+    return hasattr(module, "get_delta_weight")
+
+
+def _known_adapters(layer: _Adapting) -> set[str]:
     """The adapters that a layer has weights of; others may be active elsewhere in the model."""
-    parts = [getattr(module, name) for name in module.adapter_layer_names]
+    parts = [getattr(layer, name) for name in layer.adapter_layer_names]
     return {key for part in parts for key in part}
 
 

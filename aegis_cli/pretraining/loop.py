@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -32,8 +32,10 @@ class Pretraining(Protocol):
     `parameters` are all that learn, also those that are no part of the finished model.
     """
 
-    recipe: PretrainRecipe | DualRecipe
     optimizers: list[torch.optim.Optimizer]
+
+    @property
+    def recipe(self) -> PretrainRecipe | DualRecipe: ...
 
     @property
     def model(self) -> nn.Module: ...
@@ -175,7 +177,7 @@ def _save(run: Pretraining, path: Path, steps: int) -> None:
     )
 
 
-def save(model: EmbeddedModel, out: Path, provenance: dict[str, object]) -> Path:
+def save(model: EmbeddedModel, out: Path, provenance: Mapping[str, object]) -> Path:
     """Write the finished model in bfloat16, which its weights have been rounded to."""
     target = out / "model.safetensors"
     embedded_file.save(model, target, torch.bfloat16, provenance)

@@ -196,6 +196,7 @@ def easy_training() -> Rendered:
         AegisError: the package with the questions is missing.
     """
     source = sets.read(easy.NAME)
+    assert isinstance(source, sets.Listed)
     asked = source.choose("train", len(source.entries), seed=0).sized(IMAGE_SIZE)
     questions_of: dict[int, list[Question]] = {}
     for image, question in zip(asked.image_of.tolist(), asked.questions, strict=True):
@@ -206,6 +207,7 @@ def easy_training() -> Rendered:
         rows += [image] * parts
         questions += [of_image[part::parts] for part in range(parts)]
     images = asked.images[np.array(rows)]
+    assert isinstance(images, np.ndarray)  # they have been brought to one size
     cells = np.full((len(rows), GRID * GRID), UNKNOWN_CELL, np.uint8)
     return Rendered(images, cells, questions)
 

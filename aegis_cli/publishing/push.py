@@ -205,12 +205,12 @@ def _send(
         changes = [*added, *(CommitOperationDelete(path) for path in removed)]
         message = f"A policy of Aegis {__version__}"
         commit = api.create_commit(repo, changes, commit_message=message)
-    return str(commit.commit_url), removed
+    return commit.commit_url, removed
 
 
 def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> tuple[str, ...]:
     """The files that an earlier push, in either layout, has left and that this one lacks."""
-    siblings = api.repo_info(repo).siblings or []
+    siblings = api.model_info(repo).siblings or []
     there = {file.rfilename for file in siblings}
     left = set[str]()
     if {lerobot_folder.CONFIG, lerobot_folder.MODEL} <= there:

@@ -21,7 +21,7 @@ from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import TEST, RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, dump, override, parse, refuse
 
-R = TypeVar("R", Recipe, PretrainRecipe, DualRecipe, StreamRecipe, RobotStreamRecipe)
+R = TypeVar("R", bound=Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe)
 _READS: dict[str | None, str] = {
     "run": "a recipe for `aegis run`, of one run or of a study",
     "train": "a recipe for `aegis train`, of one run or of a stream",

@@ -22,7 +22,9 @@ _KINDS = "biuf"  # truth values, integers and floats; no objects, which would ha
 
 def encode(value: Any) -> bytes:
     """A message of nested mappings, lists, texts, numbers and arrays."""
-    return msgpack.packb(value, default=_marked)
+    packed = msgpack.packb(value, default=_marked)
+    assert packed is not None  # as it would be of a packer that gathers messages
+    return packed
 
 
 def decode(data: bytes) -> Any:

@@ -118,7 +118,7 @@ class PlanarTask(ABC):
             self.physics.set_control(self.servo(velocity))
             self.physics.step()
         self._steps += 1
-        self._count_rest(np.linalg.norm(self.tip() - before))
+        self._count_rest(float(np.linalg.norm(self.tip() - before)))
         success = self._chosen(0)
         wrong = self._held >= HOLD_STEPS and not success
         done = success or wrong or self._steps >= self.spec.max_steps

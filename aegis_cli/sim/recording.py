@@ -54,7 +54,9 @@ def record(
     """Run one episode of `env` to its end; the target's colour is one of `colors`."""
     seen = env.reset(rng, colors)
     frames, more, proprio, actions, rewards = [], [], [], [], []
-    for push in bursts(rng, noise, len(env.spec.action_names)):
+    pushes = bursts(rng, noise, len(env.spec.action_names))
+    while True:
+        push = next(pushes)
         label = env.expert_action()
         frames.append(seen.image)
         more.append(seen.more)
@@ -65,6 +67,7 @@ def record(
             rewards.append(step.reward)
         if step.done:
             break
+        assert step.observation is not None
         seen = step.observation
     return RecordedEpisode(
         np.stack(frames),

@@ -36,7 +36,7 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
     step.
     """
     root = ElementTree.fromstring(xml)
-    world = root.find("worldbody")
+    world = _child(root, "worldbody")
     for child in list(world):
         if child.tag == "light" or child.get("name", "").startswith(("wall_", "target")):
             world.remove(child)
@@ -45,11 +45,12 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
     for geom in root.iterfind(f".//geom[@name='{tip}']"):
         geom.set("size", str(tip_radius_m))
         geom.set("pos", f"0 0 {_TIP_Z}")
-    for motor in root.find("actuator"):
+    for motor in _child(root, "actuator"):
         motor.tag = "velocity"
         motor.set("kv", str(servo_gain))
-    root.find("default").remove(root.find("default/motor"))
-    root.find("option").set("integrator", "implicitfast")
+    default = _child(root, "default")
+    default.remove(_child(default, "motor"))
+    _child(root, "option").set("integrator", "implicitfast")
     for i in range(SLOTS):
         body = ElementTree.SubElement(world, "body", name=f"disc{i}", mocap="true")
         ElementTree.SubElement(
@@ -59,6 +60,13 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
     ElementTree.SubElement(visual, "quality", offsamples="0")
     ElementTree.SubElement(visual, "global", fovy=str(_FOVY_DEG))
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _child(parent: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """The first of its children of that tag, which every domain has."""
+    found = parent.find(tag)
+    assert found is not None
+    return found
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ class TrainingRun:
         another; `dataset`, their id or those of several, and `base_model`, that of the model that
         the backbone began as, if they come from the hub.
         """
-        found = {
+        found: dict[str, Any] = {
             "method": self.method.name,
             "task": self.demos.task,
             "replan": self.recipe.rollout.replan,
@@ -218,7 +218,7 @@ class TrainingRun:
             wide=self.recipe.train.weights == BF16_MASTER,
             averaged=averaged,
         )
-        if self.temporary not in (None, saved):
+        if self.temporary is not None and self.temporary != saved:
             shutil.rmtree(self.temporary, ignore_errors=True)
             self.temporary = None
         kept = self.recipe.train.keep_checkpoints

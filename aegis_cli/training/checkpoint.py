@@ -159,7 +159,7 @@ def write_policy(
     policy: Policy,
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
-    seed: int,
+    seed: int | None,
     card: str = "",
 ) -> None:
     """Write into an existing folder what a policy's user needs: its plain backbone, its expert."""
@@ -190,7 +190,7 @@ def _save_expert(
     fingerprint: str,
     meta: Mapping[str, Any],
     inputs: Mapping[str, str],
-    seed: int,
+    seed: int | None,
 ) -> None:
     scales = {"proprio": policy.proprio_scale, "action": policy.action_scale}
     tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
@@ -373,9 +373,9 @@ def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
         return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
-    expert, meta, scales = _load_expert(path / EXPERT, backbone)
+    expert, meta, proprio, action = _load_expert(path / EXPERT, backbone)
     relative = relative_of(meta, expert.shape.actions, expert.shape.proprio)
-    return Policy(backbone, expert, *scales, relative).eval(), _executed_now(path, meta)
+    return Policy(backbone, expert, proprio, action, relative).eval(), _executed_now(path, meta)
 
 
 def _executed_now(path: Path, meta: Mapping[str, Any]) -> dict[str, Any]:
@@ -412,7 +412,7 @@ def _expert_file(folder: str | Path) -> Path:
 
 def _load_expert(
     file: Path, backbone: Backbone | None = None
-) -> tuple[ActionExpert, dict[str, Any], list[Normalizer]]:
+) -> tuple[ActionExpert, dict[str, Any], Normalizer, Normalizer]:
     """The expert in a checkpoint's file, the meta, and the scales of proprioception and actions.
 
     Args:
@@ -441,7 +441,7 @@ def _load_expert(
         kind, rest = name.split(".", 1)
         parts.setdefault(kind, {})[rest] = tensor
     expert.load_state_dict(parts["expert"])
-    return expert, meta, [Normalizer(**parts[kind]) for kind in ("proprio", "action")]
+    return expert, meta, Normalizer(**parts["proprio"]), Normalizer(**parts["action"])
 
 
 def _check_user_meta(meta: Mapping[str, Any]) -> None:

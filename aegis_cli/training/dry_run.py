@@ -307,20 +307,20 @@ def shortage(report: DryRunReport) -> str | None:
     """What does not fit, on one line, and what to do about it; None where everything does."""
     missing = []
     if report.memory_fits is False:
+        free_mb = report.memory_free_mb
+        assert free_mb is not None  # else nobody knows whether it fits
         # Activations alone shrink with the batch.
         shared = 1 if report.memory_together_mb is None else report.processes
         rest = report.memory_needed_mb - shared * report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"
         if report.processes > 1:
             smaller += ", or --set train.parallel=fsdp"
-        if rest < report.memory_free_mb:
+        if rest < free_mb:
             smaller = "lower train.batch_size"
         needs = f"about {report.memory_needed_mb:,.0f} MB of memory, and"
-        if report.memory_needed_mb <= report.memory_free_mb:  # a step has shown that it is more
+        if report.memory_needed_mb <= free_mb:  # a step has shown that it is more
             needs = f"more memory than the estimate of {report.memory_needed_mb:,.0f} MB, and"
-        missing.append(
-            f"training needs {needs} {report.memory_free_mb:,.0f} MB are free: {smaller}"
-        )
+        missing.append(f"training needs {needs} {free_mb:,.0f} MB are free: {smaller}")
     if not report.disk_fits:
         missing.append(
             f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "

@@ -72,7 +72,7 @@ def owns(optimizer: Optimizer) -> bool:
     return any(is_marked(group) for group in optimizer.param_groups)
 
 
-def kept(parameter: nn.Parameter) -> dict[str, Tensor]:
+def kept(parameter: Tensor) -> dict[str, Tensor]:
     """What a checkpoint has of a parameter's state, as far as shapes and types go."""
     coded = parameter.numel() >= _SMALLEST
     like = torch.empty_like(parameter, dtype=torch.uint8 if coded else None, device="meta")
@@ -84,7 +84,7 @@ def kept(parameter: nn.Parameter) -> dict[str, Tensor]:
     return found
 
 
-def state_bytes(parameter: nn.Parameter) -> int:
+def state_bytes(parameter: Tensor) -> int:
     """Bytes of a parameter's state, its count aside."""
     return sum(tensor.nbytes for name, tensor in kept(parameter).items() if name != _COUNT)
 

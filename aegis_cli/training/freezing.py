@@ -229,4 +229,4 @@ def _largest(below: Iterable[str]) -> list[str]:
 def _near(name: str, groups: Sequence[str], below: Sequence[str]) -> str | None:
     """What may have been meant: the part whose name ends so, or one that is spelled alike."""
     ends = [known for known in below if known.endswith(f".{name}")]
-    return min(ends, key=len, default=None) or did_you_mean(name, groups + list(below))
+    return min(ends, key=len, default=None) or did_you_mean(name, [*groups, *below])

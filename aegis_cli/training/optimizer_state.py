@@ -19,7 +19,7 @@ _OPTIMIZER = "optimizer."
 STATELESS = "stateless"  # in a file's meta: parameters that learn and have no optimizer state
 # What each kind of optimizer keeps of a parameter: its step count, and tensors of its shape.
 _COUNT = "step"
-_KEPT = {
+_KEPT: dict[type[torch.optim.Optimizer], tuple[str, ...]] = {
     torch.optim.AdamW: (_COUNT, "exp_avg", "exp_avg_sq"),
     torch.optim.Muon: ("momentum_buffer",),
     torch.optim.SGD: ("momentum_buffer",),

@@ -160,6 +160,7 @@ def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> 
         if found.rows:
             writer.add_text(f"{found.name}/table", _markdown(found), found.step)
         if found.video is not None:
+            assert writer.file_writer is not None
             writer.file_writer.add_summary(_moving(f"{found.name}/video", found.video), found.step)
 
     try:
@@ -170,7 +171,7 @@ def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> 
 
 def _markdown(found: Measured) -> str:
     """The table as TensorBoard's text plugin draws it."""
-    shown = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in found.rows]
+    shown = [[f"{x:.4g}" if isinstance(x, float) else f"{x}" for x in row] for row in found.rows]
     lines = [found.header, ["---"] * len(found.header), *shown]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

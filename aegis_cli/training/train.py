@@ -370,7 +370,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
                 _save_interrupted(run, finished, window)
                 signaled.leave()
-    return run.ranks.agree(_report(run) if run.ranks.first else None)
+    return run.ranks.by_first(lambda: _report(run))
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ OPTIONS = """
 class Leash:
     \"\"\"Options of the method leash.\"\"\"
 
-    weight: float = key(NOT_NEGATIVE, 0.1, doc="Share of the gradient's norm that pulls.")
+    weight: float = key(NOT_NEGATIVE, default=0.1, doc="Share of the gradient's norm that pulls.")
 """
 RECIPE = """
 name: new

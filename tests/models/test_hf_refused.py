@@ -128,6 +128,15 @@ def test_a_repository_that_is_no_model(
     bad(*MEASURE, "someone/a-data-set", says=("no config.json", "Hugging Face model"))
 
 
+def test_a_model_without_a_head_that_scores_words(
+    model: Path, bad: Bad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some classes of models to be fine-tuned answer with other things than words."""
+    kind = transformers.PaliGemmaForConditionalGeneration
+    monkeypatch.setattr(kind, "get_output_embeddings", lambda self: None)
+    bad(*MEASURE, model, says=("PaliGemmaForConditionalGeneration without a head", "family"))
+
+
 def test_a_hub_id_without_transformers_is_a_missing_path(
     bad: Bad, monkeypatch: pytest.MonkeyPatch
 ) -> None:

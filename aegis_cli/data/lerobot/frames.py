@@ -210,7 +210,7 @@ def split(source: Source, index: Index, camera: str) -> Iterator[Part]:
         for file in source.data:
             yield from _image_parts(file, camera)
     else:
-        yield from _video_parts(source, index, camera)
+        yield from video_parts(source, index, camera)
 
 
 def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
@@ -240,7 +240,7 @@ def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
                 break
 
 
-def _video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart]:
+def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart]:
     """Episodes that follow each other, also in one file, are read in one go."""
     dataset = source.dataset
     tolerance = 0.5 / dataset.info.fps
@@ -304,7 +304,7 @@ def _check_within_clip(
 def _write(
     path: Path,
     parts: Sequence[Part],
-    shape: tuple[int, ...],
+    shape: tuple[int, int, int, int],
     workers: int | None,
     camera: str,
     on_event: OnEvent,
@@ -349,7 +349,7 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
     with open(file, "r+b") as out:
         out.seek(offset + part.first_frame * height * width * 3)
         for frame in part.decode():
-            out.write(np.ascontiguousarray(fitting.fit(frame, height, width)))
+            out.write(np.ascontiguousarray(fitting.fit(frame, height, width)).data)
             count += 1
     return count
 

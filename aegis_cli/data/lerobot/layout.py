@@ -304,7 +304,7 @@ def _filled(template: str, values: Mapping[str, str | int]) -> Path:
         ValueError: another format than that of a plain number, or a path that leads out.
     """
     for _, name, form, conversion in string.Formatter().parse(template):
-        if name is None:
+        if name is None or form is None:
             continue  # text alone
         value = values[name]
         if conversion or not (_NUMBER.fullmatch(form) if isinstance(value, int) else not form):

@@ -7,7 +7,7 @@ computed in float64 and about the mean, where LeRobot takes E[x^2] - E[x]^2 in t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -50,11 +50,11 @@ def _stacked(figures: Sequence[Mapping[str, float]]) -> Statistics:
 
 def merge(parts: Sequence[Statistics]) -> Statistics:
     """The figures of all parts together."""
-    count = sum(part["count"] for part in parts)
+    count = _sum(part["count"] for part in parts)
     shares = [part["count"] / count for part in parts]
-    mean = sum(share * part["mean"] for share, part in zip(shares, parts, strict=True))
+    mean = _sum(share * part["mean"] for share, part in zip(shares, parts, strict=True))
     # Chan, Golub & LeVeque (1979): the variances within the parts, and that of their means.
-    variance = sum(
+    variance = _sum(
         s * (p["std"] ** 2 + (p["mean"] - mean) ** 2) for s, p in zip(shares, parts, strict=True)
     )
     least = np.stack([part["min"] for part in parts]).min(0)
@@ -66,6 +66,11 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
         values = np.stack([part[name] for part in parts])
         merged[name] = values.min(0) if share <= 0.5 else values.max(0)
     return merged
+
+
+def _sum(figures: Iterable[np.ndarray]) -> np.ndarray:
+    first, *others = figures
+    return sum(others, 0 + first)
 
 
 def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:

@@ -143,7 +143,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
     for i in range(count):
         # One generator per picture: a picture does not depend on how many come before it.
         rng = np.random.default_rng([seed, SPLITS[split], i])
-        number = int(rng.choice(len(kinds), p=shares / shares.sum()))
+        number = rng.choice(len(kinds), p=shares / shares.sum())
         values = [int(rng.integers(len(words))) for words in kinds[number].attributes]
         facts[i, : 1 + len(values)] = number, *values
         images[i] = paint[number](*values, rng)

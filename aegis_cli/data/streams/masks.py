@@ -174,7 +174,9 @@ def glyph(
     ImageDraw.Draw(letter).text(
         (_CANVAS / 2, _CANVAS / 2), character, fill=255, font=font, anchor="mm"
     )
-    left, top, right, bottom = letter.getbbox()
+    box = letter.getbbox()
+    assert box is not None
+    left, top, right, bottom = box
     scale = (bottom - top) / (height_px * FINER)
     c, s = math.cos(angle_rad) * scale, math.sin(angle_rad) * scale
     # PIL asks where each pixel of the result comes from. So this is the way back: from turned to
@@ -189,7 +191,7 @@ def glyph(
 
 
 @cache
-def _font(size_px: int) -> ImageFont.FreeTypeFont:
+def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     from PIL import ImageFont
 
     return ImageFont.load_default(size=size_px)

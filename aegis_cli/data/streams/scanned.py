@@ -21,10 +21,12 @@ def digits() -> tuple[np.ndarray, np.ndarray]:
     """
     try:
         from sklearn.datasets import load_digits
+        from sklearn.utils import Bunch
     except ImportError:
         found = "no scikit-learn, which brings the stream's real digits"
         raise AegisError(found, "scikit-learn >= 1.4", "pip install 'aegis-vla[streams]'") from None
     found = load_digits()
+    assert isinstance(found, Bunch)
     pictures = np.stack([_enlarged(small) for small in found.images])
     return pictures, found.target.astype(np.int64)
 

@@ -145,7 +145,8 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     for number, row in enumerate(_each(rows.remove_columns("image") if keyed else rows, path)):
         where = f"row {number} of '{path}'"
         try:
-            file = folder.find(where, outside[number]) if outside[number] else None
+            apart = outside[number]
+            file = folder.find(where, apart) if apart else None
             own, kind = number if name is None else row[name], row.get("answer_type")
             family = kind if isinstance(kind, str) and kind else "all"
             question = make_question(where, row["question"], row[answers], own, family)

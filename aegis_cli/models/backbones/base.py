@@ -177,7 +177,7 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def answer_log_likelihood(
         self,
-        images: Tensor,
+        images: Images,
         questions: Sequence[str],
         answers: Sequence[str],
         prepared: Any = None,
@@ -200,7 +200,7 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def read_vqa(
         self,
-        images: Tensor,
+        images: Tensor | Sequence[Tensor],
         image_of: Tensor,
         questions: Sequence[str],
         answers: Sequence[str],
@@ -212,7 +212,7 @@ class Backbone(nn.Module, ABC):
         So a forward hook needs no mask.
 
         Args:
-            images: [N, H, W, 3] uint8.
+            images: [N, H, W, 3] uint8, or N of any sizes.
             image_of: [M] int64, the image of each question.
             questions, answers: M texts each.
             together: how many questions one pass may read, in models that pass the image again for

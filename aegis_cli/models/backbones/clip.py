@@ -29,6 +29,9 @@ class CLIPEncoder(DualEncoder):
     middle, as CLIP's own processor does, so that what is left of it is to scale and normalise.
     """
 
+    _mean: Tensor
+    _std: Tensor
+
     def __init__(
         self,
         model: transformers.CLIPModel,
@@ -44,9 +47,11 @@ class CLIPEncoder(DualEncoder):
         """
         super().__init__()
         self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
-        self.image_size = model.config.vision_config.image_size
-        self.width = model.config.projection_dim
-        self._longest = model.config.text_config.max_position_embeddings
+        side = model.vision_model.config.image_size
+        assert isinstance(side, int)
+        self.image_size = side
+        self.width = model.visual_projection.out_features
+        self._longest = model.text_model.config.max_position_embeddings
         for name, values in (("_mean", mean), ("_std", std)):
             per_channel = torch.tensor(values, dtype=torch.float32).view(3, 1, 1)
             # They belong to the processor's files, and would change the weights' fingerprint.
@@ -121,4 +126,5 @@ def load(folder: Path) -> CLIPEncoder:
         tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **SAFE)
         settings, _ = transformers.CLIPImageProcessor.get_image_processor_dict(folder, **SAFE)
         mean, std = settings["image_mean"], settings["image_std"]
+    assert tokenizer is not None
     return CLIPEncoder(model, tokenizer, mean, std, model_folder.processor_files(folder)).eval()

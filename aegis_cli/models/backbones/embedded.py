@@ -22,6 +22,7 @@ from aegis_cli.common.devices import send
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.activation import squared_relu
 from aegis_cli.core.attention import KeyValue, additive, block_attention
+from aegis_cli.data.batch import Images
 from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.base import AnswerScores, Backbone, Batch, Encoding
 from aegis_cli.models.backbones.tokenizer import Tokenizer
@@ -114,8 +115,8 @@ class EmbeddedVLM(Backbone):
     """A small VLM that ships with the package."""
 
     kind: ClassVar[str] = "backbone"
-    tied_heads: ClassVar[Mapping[str, str]] = {"words": "final_norm"}
-    numbers: ClassVar[int] = len(X_WORDS) * len(Y_WORDS)
+    tied_heads: Mapping[str, str] = {"words": "final_norm"}
+    numbers: int = len(X_WORDS) * len(Y_WORDS)
     _multiple = 1  # tokens; of it the lengths of prompts are multiples
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
@@ -128,14 +129,13 @@ class EmbeddedVLM(Backbone):
         self.stem = Stem(shape)
         self.words = nn.Embedding(len(vocabulary), shape.width)
         self.text_position = nn.Embedding(MAX_TEXT, shape.width)
-        self.layers = nn.ModuleList(
-            Layer(shape.width, shape.heads, shape.mlp_ratio) for _ in range(shape.depth)
-        )
+        layers = [Layer(shape.width, shape.heads, shape.mlp_ratio) for _ in range(shape.depth)]
+        self.layers = nn.ModuleList(layers)
         self.final_norm = nn.LayerNorm(shape.width)
         for table in (self.words, self.text_position):
             nn.init.normal_(table.weight, std=0.02)
         # Residual branches start small, so that depth does not inflate the stream.
-        for layer in self.layers:
+        for layer in layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * shape.depth) ** 0.5)
         self.float()
@@ -210,17 +210,18 @@ class EmbeddedVLM(Backbone):
 
     # --- questions -----------------------------------------------------------------------------
 
-    def pixels(self, images: Tensor) -> Tensor:
+    def pixels(self, images: Images) -> Tensor:
         """Images [B, H, W, 3] uint8 as [B, 3, H, W] float32 in [-1, 1]."""
+        assert isinstance(images, Tensor)  # all of the `image_size`
         return send(images, self.device).permute(0, 3, 1, 2).float() / 127.5 - 1
 
-    def process(self, images: Tensor, prompts: Sequence[str]) -> Batch:
+    def process(self, images: Images, prompts: Sequence[str]) -> Batch:
         ids, mask = self._pad([self.tokenizer.prompt(text) for text in prompts], self._multiple)
         return Batch(self.pixels(images), ids, mask)
 
     @torch.no_grad()
     def answer(
-        self, images: Tensor, questions: Sequence[str], most: int | None = None
+        self, images: Images, questions: Sequence[str], most: int | None = None
     ) -> list[str]:
         image = self._shared_image_pass(images)
         rows = [self.tokenizer.prompt(text) for text in questions]
@@ -237,7 +238,7 @@ class EmbeddedVLM(Backbone):
 
     def answer_log_likelihood(
         self,
-        images: Tensor,
+        images: Images,
         questions: Sequence[str],
         answers: Sequence[str],
         prepared: None = None,
@@ -256,7 +257,7 @@ class EmbeddedVLM(Backbone):
 
     def read_vqa(
         self,
-        images: Tensor,
+        images: Tensor | Sequence[Tensor],
         image_of: Tensor,
         questions: Sequence[str],
         answers: Sequence[str],
@@ -284,11 +285,12 @@ class EmbeddedVLM(Backbone):
         # In one part, since all go back through the same images.
         yield AnswerScores(torch.cat(found), torch.tensor(question))
 
-    def _shared_image_pass(self, images: Tensor) -> list[KeyValue]:
+    def _shared_image_pass(self, images: Images) -> list[KeyValue]:
         """Each row's image keys and values.
 
         A run of equal images, those of one image's questions, is passed once.
         """
+        assert isinstance(images, Tensor)
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
         row = send(begins.cumsum(0) - 1, self.device)
@@ -333,7 +335,8 @@ class EmbeddedVLM(Backbone):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {f"layers.{i}": list(layer.parameters()) for i, layer in enumerate(self.layers)}
         groups["stem"] = list(self.stem.parameters())
-        groups["embeddings"] = [self.words.weight, self.text_position.weight]
+        tables = (self.words, self.text_position)
+        groups["embeddings"] = [p for table in tables for p in table.parameters()]
         groups["final_norm"] = list(self.final_norm.parameters())
         return groups
 
@@ -345,7 +348,7 @@ class EmbeddedVLM(Backbone):
     def in_vision(self, name: str) -> bool:
         return name.startswith("stem.")
 
-    def save(self, folder: Path, provenance: dict[str, object] | None = None) -> None:
+    def save(self, folder: Path, provenance: Mapping[str, object] | None = None) -> None:
         path = Path(folder) / "model.safetensors"
         embedded_file.save(self, path, torch.float32, provenance)
 

@@ -63,11 +63,12 @@ class Tower(nn.Module):
 
     def __init__(self, width: int, depth: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(Layer(width, heads, mlp_ratio) for _ in range(depth))
+        layers = [Layer(width, heads, mlp_ratio) for _ in range(depth)]
+        self.layers = nn.ModuleList(layers)
         self.norm = nn.LayerNorm(width)
         self.project = nn.Linear(width, width, bias=False)
         # Residual branches start small, so that depth does not inflate the stream.
-        for layer in self.layers:
+        for layer in layers:
             for branch in (layer.out, layer.down):
                 nn.init.normal_(branch.weight, std=0.02 / (2 * depth) ** 0.5)
 

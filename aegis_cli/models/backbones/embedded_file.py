@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -37,7 +37,7 @@ class EmbeddedModel(Protocol):
 
     def state_dict(self) -> dict[str, Tensor]: ...
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> Any: ...
+    def load_state_dict(self, state: dict[str, Tensor], /) -> Any: ...
 
     def fingerprint(self) -> str: ...
 
@@ -51,7 +51,7 @@ def save(
     model: EmbeddedModel,
     path: Path,
     dtype: torch.dtype,
-    provenance: dict[str, object] | None = None,
+    provenance: Mapping[str, object] | None = None,
 ) -> None:
     """Write the model as one artifact; `dtype` bfloat16 halves it and rounds the weights."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ from aegis_cli.models.backbones.compiling import MULTIPLE, compile_layers
 from aegis_cli.models.backbones.families import FAMILIES, Family
 from aegis_cli.models.backbones.from_hub import SAFE, complete, loading, quiet, without_dropout
 from aegis_cli.models.backbones.prompting import Prompter
-from aegis_cli.models.backbones.recording import Seen, attention, recording, unrotated
+from aegis_cli.models.backbones.recording import Seen, recording, sliding_window, unrotated
 from aegis_cli.models.structure import of_type, outermost_lists, widest
 
 MAX_ANSWER = 32  # tokens that an answer is given at most, where its reference is not longer
@@ -73,15 +73,17 @@ class HFBackbone(Backbone):
             files: the processor's files as they were found; `save` writes them beside the weights.
 
         Raises:
-            AegisError: processor and model do not fit together, or the layers are not where the
-                family says.
+            AegisError: processor and model do not fit together, the layers are not where the
+                family says, or the model does not answer with words.
         """
         super().__init__()
         text = model.config.get_text_config()
         self.vlm, self._family, self._files = without_dropout(model.eval()), family, dict(files)
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
+        if head is None:
+            raise model_folder.headless(model)
         # The table's own length counts, because a processor may know more words than the model.
-        limits = (text.max_position_embeddings, len(table.weight))
+        limits = (text.max_position_embeddings, len(table.get_parameter("weight")))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.held = tuple(f"vlm.{name}" for name in family.held)
         self.idle = tuple(f"vlm.{part}" for part in family.idle(model.config))
@@ -188,7 +190,7 @@ class HFBackbone(Backbone):
         ahead = torch.arange(count, device=encoding.mask.device)
         rotations = self._rotations(encoding, ahead)
         rotation = rotations if self._layer_types is not None else rotations[0]
-        windows = [getattr(attention(layer), "sliding_window", None) for layer in self._layers]
+        windows = [sliding_window(layer) for layer in self._layers]
         if not any(windows):
             return Suffix(encoding.mask, rotation)
         visible = encoding.mask[:, None].expand(-1, count, -1)  # [B, S, T]
@@ -264,6 +266,7 @@ class HFBackbone(Backbone):
     def _generated(self, prompts: Batch, most: Sequence[int]) -> list[str]:
         """The answers that the model generates, each up to its own number of tokens."""
         batch = prompts.to(self.device)
+        assert isinstance(self.vlm, transformers.GenerationMixin)
         with _greedy(self.vlm):
             said = self.vlm.generate(**_arguments(batch), max_new_tokens=max(most))
         rows = said[:, batch.ids.shape[1] :].tolist()
@@ -298,7 +301,7 @@ class HFBackbone(Backbone):
 
     def answer_log_likelihood(
         self,
-        images: Tensor,
+        images: Images,
         questions: Sequence[str],
         answers: Sequence[str],
         prepared: _Answered | None = None,
@@ -349,7 +352,7 @@ class HFBackbone(Backbone):
 
     def read_vqa(
         self,
-        images: Tensor,
+        images: Tensor | Sequence[Tensor],
         image_of: Tensor,
         questions: Sequence[str],
         answers: Sequence[str],
@@ -530,8 +533,7 @@ def _assembled(
         _check_kind(folder, config)
         family = model_folder.family(folder, config.model_type, layers)
         model = make(config)
-    model_folder.check_path(model, family.layers)
-    model_folder.check_attention(model.get_submodule(family.layers))
+    model_folder.check_attention(model_folder.check_path(model, family.layers))
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     tokenizer = processor.tokenizer

@@ -154,13 +154,14 @@ def check_complete(folder: Path, report: Mapping[str, Any]) -> None:
         )
 
 
-def check_path(model: nn.Module, layers: str) -> None:
-    """Raise AegisError unless `layers` names a language model's list of modules.
+def check_path(model: nn.Module, layers: str) -> nn.ModuleList:
+    """The list of a language model's layers that `layers` names.
 
-    The rotary embedding has to stand beside it.
+    Raises:
+        AegisError: it names none, or no rotary embedding stands beside it.
     """
     modules = dict(model.named_modules())
-    lists = [name for name, module in modules.items() if isinstance(module, nn.ModuleList)]
+    lists = {name: module for name, module in modules.items() if isinstance(module, nn.ModuleList)}
     rotated = []
     for name in lists:
         parent = name.rpartition(".")[0]
@@ -176,6 +177,7 @@ def check_path(model: nn.Module, layers: str) -> None:
             f"one of {', '.join(rotated or lists)}",
             "name the language model's layers",
         )
+    return lists[layers]
 
 
 def check_files(folder: Path, kinds: Container[str]) -> None:
@@ -256,6 +258,15 @@ def _unsuitable(found: str, why: str) -> AegisError:
     return AegisError(
         f"{found}: {why}",
         "a vision-language model that attends to all tokens in each of its language layers",
+        f"use a model of another family: {', '.join(FAMILIES)}",
+    )
+
+
+def headless(model: nn.Module) -> AegisError:
+    """The error for a model that answers with other things than words."""
+    return AegisError(
+        f"a {type(model).__name__} without a head that scores words",
+        "a vision-language model that answers with words",
         f"use a model of another family: {', '.join(FAMILIES)}",
     )
 

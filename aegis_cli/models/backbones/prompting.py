@@ -106,7 +106,7 @@ class Prompter:
         if _PIXEL_MASK in tensors:  # as large as a picture, in eight bytes a pixel
             tensors[_PIXEL_MASK] = tensors[_PIXEL_MASK].bool()
         self._check_length(ids.shape[1], prompts[int(mask.sum(1).argmax())])
-        self._check_known(ids.max().item())
+        self._check_known(int(ids.max()))
         return Batch(pixels, ids, mask.bool(), tensors)
 
     def _first_refused(

@@ -65,6 +65,12 @@ def attention(layer: nn.Module) -> nn.Module:
     return found[0]
 
 
+def sliding_window(layer: nn.Module) -> int | None:
+    """How many tokens the layer's attention sees, if not all before."""
+    found = getattr(attention(layer), "sliding_window", None)
+    return found if isinstance(found, int) else None
+
+
 @contextlib.contextmanager
 def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
     """Record what happens in `layers`, and which positions their rotary embedding is asked for."""
