@@ -185,16 +185,22 @@ def save(model: EmbeddedModel, out: Path, provenance: Mapping[str, object]) -> P
 
 
 def _step(run: Pretraining, loss: Tensor, step: int) -> float:
-    if not torch.isfinite(loss):
-        raise AegisError(
-            f"loss {loss.item()} at step {step}",
-            "a finite loss",
-            "lower the learning rate: --set lr=1e-3",
-        )
+    _check_finite("loss", loss, step)
     for optimizer in run.optimizers:
         optimizer.zero_grad()
     loss.backward()
-    nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
+    norm = nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
+    _check_finite("gradient norm", norm, step)  # clipped by it, all weights would be NaN
     for optimizer in run.optimizers:
         optimizer.step()
     return loss.item()
+
+
+def _check_finite(name: str, value: Tensor, step: int) -> None:
+    """Raise AegisError for a figure of a step that is not finite."""
+    if not torch.isfinite(value):
+        raise AegisError(
+            f"{name} {value.item()} at step {step}",
+            f"a finite {name}",
+            "lower the learning rate: --set lr=1e-3",
+        )

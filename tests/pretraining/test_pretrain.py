@@ -7,10 +7,12 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts
@@ -25,7 +27,7 @@ from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, load_file
 from aegis_cli.models.backbones.tokenizer import SPECIAL
-from aegis_cli.pretraining import vlm
+from aegis_cli.pretraining import loop, vlm
 from aegis_cli.recipes import Model, PretrainRecipe
 
 RECIPE = PretrainRecipe(
@@ -170,6 +172,16 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(
         tmp_path / "state.safetensors", "training-state"
     )  # of the last good checkpoint
     assert saved.header.meta["step"] == 2 and not (tmp_path / "model.safetensors").exists()
+
+
+def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
+    model = nn.Linear(1, 1, bias=False)
+    nn.init.zeros_(model.weight)
+    optimizers = [torch.optim.AdamW(model.parameters())]
+    run = SimpleNamespace(model=model, optimizers=optimizers)
+    with pytest.raises(AegisError, match="gradient norm inf at step 3"):
+        loop._step(run, model.weight.sqrt().sum(), 3)
+    assert model.weight.item() == 0
 
 
 def test_through_the_command_line(aegis, finished, tmp_path: Path) -> None:
