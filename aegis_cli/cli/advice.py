@@ -44,7 +44,7 @@ def of_run(recipe: Recipe | AnyStudy) -> None:
     if isinstance(recipe, RobotStreamStudyRecipe):
         name, first = next(iter(recipe.variants.items()))
         asked = cell(recipe, name, recipe.tasks, recipe.seeds[0], first.values[0])
-        of_questions(asked.backbone, asked.probe.vqa)
+        of_questions(asked.backbone, asked.probe.only_set)
         return
     place, seed = recipe.tasks[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():
@@ -56,7 +56,7 @@ def of_run(recipe: Recipe | AnyStudy) -> None:
 
 
 def _asked(recipe: Recipe) -> Iterator[str | None]:
-    yield from (probe.vqa for probe in recipe.probe.of_each_set())
+    yield from recipe.probe.sets
     if recipe.anchor.source == "questions":
         yield recipe.anchor.vqa
     yield _trained_on(recipe)

@@ -441,11 +441,13 @@ def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Pa
         AegisError: neither the command nor the recipe names any.
     """
     named = recipe.demos.path
-    if not given and named is None:
-        fix = "record some with aegis demos, and give them as --demos"
-        expected = "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub"
-        raise AegisError(f"no --demos for '{file}', which names none as demos.path", expected, fix)
     if not given:
+        if named is None:
+            raise AegisError(
+                f"no --demos for '{file}', which names none as demos.path",
+                "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",
+                "record some with aegis demos, and give them as --demos",
+            )
         return _paths(named), recipe
     told = str(given[0]) if len(given) == 1 else tuple(map(str, given))
     if named is not None or len(given) > 1:
@@ -584,14 +586,14 @@ def merge(
         raise AegisError(found, "questions that are asked", "leave --vqa out, or give a sweep")
     asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size)
     if not asks_nothing:
-        advice.of_questions(target, asks.vqa)
+        advice.of_questions(target, asks.only_set)
     settings = MergeSettings(
         method=method,
         damping=damping,
         base=base,
         demos=tuple(demos) if demos else None,
         anchor=anchor,
-        vqa=asks.vqa,
+        vqa=asks.only_set,
         ask=asks.ask,
         skip_bad=asks.skip_bad,
         task_vqa=task_vqa,
@@ -743,11 +745,11 @@ def probe(
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
     gate = Gate(asks.gate) if gate is None else gate
-    advice.of_questions(target, asks.vqa)
+    advice.of_questions(target, asks.only_set)
     with stages.joined(device):
         report = stages.PROBE.run(
             target,
-            asks.vqa,
+            asks.only_set,
             asks.questions,
             baseline,
             anchor,
@@ -765,7 +767,7 @@ def probe(
         failed = None
         if report.passed is False:
             dropped = f"a drop of {report.drop_points:.2f} points"
-            if gate is Gate.upper:
+            if gate is Gate.upper_end:
                 dropped += f", which may be as large as {report.drop_interval[1]:.2f}"
             failed = f"{dropped}, more than {limit} {max_drop:g}"
         _say_gate(failed)
@@ -1245,7 +1247,7 @@ def run(
         failed = None
         if one_run and report.gate_failed:
             limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
-            if resolved.probe.gate == Gate.upper:
+            if resolved.probe.gate == Gate.upper_end:
                 limit += ", by the upper end of the drop's interval"
             failed = f"{', '.join(report.gate_failed)} dropped {limit}"
         _say_gate(failed)

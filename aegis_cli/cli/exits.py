@@ -131,7 +131,9 @@ def _close_output() -> None:
     At its end Python would complain of what it cannot write, and change the exit code.
     """
     for stream in (sys.__stdout__, sys.__stderr__):
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
+        if stream is None:
+            continue
+        with contextlib.suppress(OSError, ValueError):  # closed
             try:
                 stream.flush()
             except OSError:

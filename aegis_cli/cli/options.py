@@ -48,7 +48,7 @@ class RecipeAction(StrEnum):
 
 class Gate(StrEnum):
     mean = "mean"
-    upper = "upper"
+    upper_end = "upper"
 
 
 class Colors(StrEnum):

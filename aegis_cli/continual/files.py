@@ -19,7 +19,7 @@ from aegis_cli.continual.report import (
     StreamReport,
     report_from,
 )
-from aegis_cli.continual.state import StreamRun
+from aegis_cli.continual.state import AnyStreamRun
 from aegis_cli.core import routing
 from aegis_cli.models.structure import digest
 
@@ -33,7 +33,7 @@ def is_done(path: Path) -> bool:
     return (path / REPORT).is_file()
 
 
-def write(run: StreamRun, report: StreamReport) -> None:
+def write(run: AnyStreamRun, report: StreamReport) -> None:
     """Every file of a finished run; stream.json comes last and says that it is finished."""
     if run.learner.trains == "experts":
         write_tensors(run, report)
@@ -73,7 +73,7 @@ def read(path: Path) -> StreamReport:
         ) from error
 
 
-def attach(run: StreamRun) -> None:
+def attach(run: AnyStreamRun) -> None:
     """Put a finished run's experts, routers and Gaussians back beside the bare model.
 
     Raises:
@@ -100,7 +100,7 @@ def attach(run: StreamRun) -> None:
     run.gaussians = state.gaussians_from(routers.tensors)
 
 
-def write_tensors(run: StreamRun, report: StreamReport) -> None:
+def write_tensors(run: AnyStreamRun, report: StreamReport) -> None:
     """Experts, and routers with what they were measured to do."""
     parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
     experts = {name: t for name, t in parameters.items() if ".experts." in name}
@@ -125,7 +125,7 @@ def write_tensors(run: StreamRun, report: StreamReport) -> None:
     )
 
 
-def _figures(run: StreamRun, report: StreamReport) -> dict[str, Tensor]:
+def _figures(run: AnyStreamRun, report: StreamReport) -> dict[str, Tensor]:
     """The experts' numbers, mean weights and loads, per router.
 
     They are as measured when the router's task was last learned.

@@ -49,7 +49,7 @@ OWN_ENCODER = "trained encoder"  # that encoder among a report's inputs
 
 
 @dataclass(kw_only=True)
-class ImageStreamRun(StreamRun):
+class ImageStreamRun(StreamRun[StreamRecipe]):
     """A run through a stream of classification tasks.
 
     Attributes:

@@ -17,7 +17,7 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state
 from aegis_cli.continual.learners.base import Constraint, Flows, TaskContext
 from aegis_cli.continual.report import SiteRouting, TaskRecord, history_mass, record_from, untouched
-from aegis_cli.continual.state import Objective, StreamRun
+from aegis_cli.continual.state import AnyStreamRun, Objective
 from aegis_cli.core.identification import Flow, flow, read, total_variation
 from aegis_cli.core.routing import activate, traced
 from aegis_cli.training import folder
@@ -49,7 +49,7 @@ class TaskTraining:
 
 
 def learn(
-    run: StreamRun,
+    run: AnyStreamRun,
     prototypes: Sequence[Tensor],
     optimizer: torch.optim.Optimizer | None,
     on_event: OnEvent,
@@ -88,11 +88,11 @@ def learn(
             # after the last step the state waits for the evaluation, so that a run goes on either
             # before a task's end or after it, and nowhere in between
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
-                state.save(run, [training.optimizer])
+                state.save(run, training.optimizer)
             stage = f"task {current.task + 1} {training.objective.name}"
             on_event(Progress(stage, current.step, steps, "steps", {"loss": loss}))
             if signaled.number is not None and current.step < steps:
-                state.save(run, [training.optimizer])
+                state.save(run, training.optimizer)
                 signaled.leave()
     return _finish(run, training, loss)
 
@@ -101,7 +101,7 @@ def learn(
 
 
 def _prepare(
-    run: StreamRun, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
+    run: AnyStreamRun, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
 ) -> TaskTraining:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
     current, objective = run.current, run.objective(run.current.task)
@@ -128,7 +128,7 @@ def _prepare(
     return training
 
 
-def _learning_maps(run: StreamRun) -> dict[str, int]:
+def _learning_maps(run: AnyStreamRun) -> dict[str, int]:
     """How many parameters learn beside each map."""
     counts = {}
     for name, site in run.sites.items():
@@ -140,17 +140,18 @@ def _learning_maps(run: StreamRun) -> dict[str, int]:
 # --- a step ---------------------------------------------------------------------------------------
 
 
-def _step(run: StreamRun, training: TaskTraining, step: int, batch: Any) -> float:
+def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> float:
     """Take one step, and return the task's own loss before it.
 
     Raises:
         Diverged: the loss or the gradient is not finite; nothing has moved then.
     """
-    settings, current = run.recipe.train, run.current
+    settings, current, optimizer = run.recipe.train, run.current, training.optimizer
+    assert optimizer is not None
     factor = warmup_cosine(step, settings.steps, settings.warmup, settings.final_lr_share)
-    for group in training.optimizer.param_groups:
+    for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
-    training.optimizer.zero_grad()
+    optimizer.zero_grad()
     activate(run.sites, run.learner.router(current.task))
     identification = run.learner.identification if current.phase == 1 else None
     with devices.autocast(run.device, settings.precision):
@@ -161,20 +162,20 @@ def _step(run: StreamRun, training: TaskTraining, step: int, batch: Any) -> floa
                 loss = training.objective.loss(batch, step)
             total = loss + identification.penalty(training.context, traces)
     total.backward()
-    learning = [p for group in training.optimizer.param_groups for p in group["params"]]
+    learning = [p for group in optimizer.param_groups for p in group["params"]]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
     where = f"at step {step + 1} of task '{training.objective.name}'"
     check_finite(figures, where, training.slower, step)
     if training.constraint is not None:
         training.constraint.gradient()
-    training.optimizer.step()
+    optimizer.step()
     if training.constraint is not None:
         training.constraint.update()
     return figures["loss"]
 
 
-def _log(run: StreamRun, seconds: float) -> None:
+def _log(run: AnyStreamRun, seconds: float) -> None:
     """Write a line of metrics, of the steps since the last one."""
     current = run.current
     line = {
@@ -191,7 +192,7 @@ def _log(run: StreamRun, seconds: float) -> None:
 # --- the end of phase 1 ---------------------------------------------------------------------------
 
 
-def _watch(run: StreamRun, training: TaskTraining) -> None:
+def _watch(run: AnyStreamRun, training: TaskTraining) -> None:
     """End phase 1 when the routers stand still at a check, or its share of the steps is over."""
     current, options = run.current, run.options
     limit = max(1, round(options["identify"] * run.recipe.train.steps))
@@ -218,14 +219,16 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
     return sum(distances) / len(distances)
 
 
-def _settle(run: StreamRun, training: TaskTraining, flows: Flows) -> None:
+def _settle(run: AnyStreamRun, training: TaskTraining, flows: Flows) -> None:
     """Fix the structure and note which experts left.
 
     What still learns keeps its moments in the optimizer, as in a learner with one phase.
     """
     current = run.current
     before = {name: _used(run, name) for name in run.sites}
-    run.learner.identification.settle(training.context, flows)
+    identification = run.learner.identification
+    assert identification is not None
+    identification.settle(training.context, flows)
     for name, site in run.sites.items():
         gone = [n for n in before[name] if n not in _used(run, name)]
         current.dropped[name] = [n for n in gone if n in site.numbers]
@@ -236,13 +239,13 @@ def _settle(run: StreamRun, training: TaskTraining, flows: Flows) -> None:
     training.constraint = run.learner.constrain(training.context)
 
 
-def _used(run: StreamRun, site: str) -> tuple[int, ...]:
+def _used(run: AnyStreamRun, site: str) -> tuple[int, ...]:
     """Numbers of the experts that the task's router of a map uses."""
     router = run.sites[site].router(run.learner.router(run.current.task))
     return () if router is None else router.experts
 
 
-def measure(run: StreamRun, training: TaskTraining) -> Flows:
+def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
     """What flows where in each map that the task has a router in, on its calibration examples."""
     task = run.learner.router(run.current.task)
     activate(run.sites, task)
@@ -250,19 +253,19 @@ def measure(run: StreamRun, training: TaskTraining) -> Flows:
     with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
         loss = training.objective.calibration_loss()
     run.model.train()
-    routed = [name for name, site in run.sites.items() if site.router(task) is not None]
-    passes = read({name: traces[name] for name in routed}, loss)
-    flows = {}
-    for name, passed in passes.items():
-        site = run.sites[name]
-        flows[name] = flow(passed, site.of(site.router(task).experts))
-    return flows
+    used = {
+        name: site.of(router.experts)
+        for name, site in run.sites.items()
+        if (router := site.router(task)) is not None
+    }
+    passes = read({name: traces[name] for name in used}, loss)
+    return {name: flow(passed, used[name]) for name, passed in passes.items()}
 
 
 # --- after ----------------------------------------------------------------------------------------
 
 
-def _finish(run: StreamRun, training: TaskTraining, loss: float | None) -> TaskRecord:
+def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> TaskRecord:
     """Let the learner end the task, freeze everything, and say what was learned."""
     current, steps = run.current, run.recipe.train.steps
     flows = measure(run, training) if run.sites else {}
@@ -289,7 +292,7 @@ def _finish(run: StreamRun, training: TaskTraining, loss: float | None) -> TaskR
     )
 
 
-def _routing(run: StreamRun, name: str, found: Flow, trained: int) -> SiteRouting:
+def _routing(run: AnyStreamRun, name: str, found: Flow, trained: int) -> SiteRouting:
     """What one map's router does at the task's end, where `trained` parameters have learned."""
     site, used, current = run.sites[name], _used(run, name), run.current
     before = sum(s["added"] for r in current.records for s in r["sites"] if s["site"] == name)

@@ -64,7 +64,7 @@ Questions = sets.Scenes | sets.Listed
 
 
 @dataclass(kw_only=True)
-class RobotStreamRun(StreamRun):
+class RobotStreamRun(StreamRun[RobotStreamRecipe]):
     """A run through a stream of robot tasks.
 
     Attributes:
@@ -78,7 +78,6 @@ class RobotStreamRun(StreamRun):
     score_name = "success"
     partial_matrix = True
 
-    recipe: RobotStreamRecipe
     policies: tuple[Policy, ...]
     still: Still = Still()
     demos: tuple[Demonstrations, ...] = ()
@@ -149,14 +148,20 @@ class RobotStreamRun(StreamRun):
         self.question_files = source.sha256
         self.evaluator = RobotEvaluator(self, source, on_event)
 
+    @property
+    def measuring(self) -> RobotEvaluator:
+        """The evaluator of a run that does not only act."""
+        assert self.evaluator is not None
+        return self.evaluator
+
     def before_stream(self) -> None:
-        self.current.vqa.append(self.evaluator.vqa())
+        self.current.vqa.append(self.measuring.vqa())
 
     def after_task(self) -> dict[str, float]:
         current = self.current
         self.demos[current.task].check_files()
-        current.oracle.append(self.evaluator.row(current.task))
-        current.vqa.append(self.evaluator.vqa())
+        current.oracle.append(self.measuring.row(current.task))
+        current.vqa.append(self.measuring.vqa())
         loss = self._validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
         where = f"after task '{self.names[current.task]}'"
@@ -179,9 +184,9 @@ class RobotStreamRun(StreamRun):
         count = len(self.names)
         now = []
         for task in range(count):
-            now.append(self.evaluator.success(task))
+            now.append(self.measuring.success(task))
             on_event(Progress("probe", task + 1, count, "tasks"))
-        known = self.evaluator.vqa()
+        known = self.measuring.vqa()
         first = 0 if self.learner.frozen else count - 1
         rows = tuple(tuple(now[: t + 1]) for t in range(first, count))
         success = (*before.success[:first], *rows)
@@ -421,7 +426,7 @@ def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Question
         AegisError: it cannot be read.
     """
     asked = recipe.probe
-    return sets.read(asked.vqa, asked.skip_bad, on_event, asked.ask)
+    return sets.read(asked.only_set, asked.skip_bad, on_event, asked.ask)
 
 
 def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEvent) -> None:

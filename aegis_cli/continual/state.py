@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
 from pydantic import TypeAdapter, ValidationError
@@ -32,6 +32,7 @@ from aegis_cli.core.routing import Routed
 from aegis_cli.recipes import RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import optimizer_state
 
+S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)
 STATE = "state.safetensors"
 _GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
@@ -135,7 +136,7 @@ class Objective(Protocol):
 
 
 @dataclass(kw_only=True)
-class StreamRun(ABC):
+class StreamRun(ABC, Generic[S]):
     """A run of a learner through a stream, whatever the tasks are; built once.
 
     Attributes:
@@ -149,7 +150,7 @@ class StreamRun(ABC):
         partial_matrix: whether the matrix of the tasks so far is written after each of them.
     """
 
-    recipe: StreamRecipe | RobotStreamRecipe
+    recipe: S
     learner: Learner
     sites: Routed
     fingerprint: str
@@ -188,8 +189,8 @@ class StreamRun(ABC):
         """The maps that get experts with that task."""
         return self.sites
 
-    def task_begun(self) -> None:  # noqa: B027 (most have nothing more to do)
-        """Called after the learner has begun a task."""
+    def task_begun(self) -> None:
+        """Called after the learner has begun a task; most kinds have nothing more to do."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
         """What the learner has changed or added, by name."""
@@ -234,8 +235,8 @@ class StreamRun(ABC):
 
     # --- what is measured -------------------------------------------------------------------------
 
-    def before_stream(self) -> None:  # noqa: B027 (image streams measure nothing then)
-        """Measure what is to be known before the first task is learned."""
+    def before_stream(self) -> None:
+        """Measure what is to be known before the first task is learned; of images, nothing."""
 
     def before_task(self) -> Sequence[Tensor]:
         """Measure what is to be known before the current task is learned.
@@ -291,7 +292,12 @@ class StreamRun(ABC):
         """Write what the run has trained beside experts and routers, which are written already."""
 
 
-def optimizer(run: StreamRun, before: torch.optim.Optimizer | None = None) -> torch.optim.Optimizer:
+AnyStreamRun = StreamRun[StreamRecipe] | StreamRun[RobotStreamRecipe]
+
+
+def optimizer(
+    run: AnyStreamRun, before: torch.optim.Optimizer | None = None
+) -> torch.optim.Optimizer:
     """AdamW over what learns, at the rates of the run; no weight decay on routers and scales.
 
     Args:
@@ -315,11 +321,15 @@ def optimizer(run: StreamRun, before: torch.optim.Optimizer | None = None) -> to
     return made
 
 
-def save(run: StreamRun, optimizers: list[torch.optim.Optimizer]) -> None:
+def save(run: AnyStreamRun, current: torch.optim.Optimizer | None) -> None:
     """Write the run's state: experts, routers, scales, optimizer, phase and structure.
 
     Nothing random is in it: a step's draws follow from its number.
+
+    Args:
+        current: the optimizer of the task being learned, if one is.
     """
+    optimizers = [] if current is None else [current]
     parameters = optimizer_state.to_tensors(run.parameters(), optimizers)
     tensors = parameters | gaussian_tensors(run.gaussians)
     meta = {
@@ -339,7 +349,7 @@ def save(run: StreamRun, optimizers: list[torch.optim.Optimizer]) -> None:
     )
 
 
-def restore(run: StreamRun) -> torch.optim.Optimizer | None:
+def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     """Put the saved state back, and return the optimizer of the task being learned, if one is.
 
     Raises:

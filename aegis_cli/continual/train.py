@@ -29,8 +29,8 @@ from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
 from aegis_cli.continual import files, images, loop, state
 from aegis_cli.continual.report import StreamReport
-from aegis_cli.continual.state import StreamRun
-from aegis_cli.recipes import RobotStreamRecipe, StreamRecipe
+from aegis_cli.continual.state import AnyStreamRun
+from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import folder
 
 
@@ -100,7 +100,7 @@ def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -
     """
     if not isinstance(recipe, RobotStreamRecipe) or recipe.demos.paths is not None:
         return
-    learned = recipes.load_training(out / "recipe.yaml").demos
+    learned = recipes.load(out / "recipe.yaml", kind=RobotStreamRecipe).demos
     if dataclasses.replace(learned, paths=None) != recipe.demos:
         raise AegisError(
             f"other demonstrations than the finished stream in '{out}' learned from",
@@ -111,7 +111,7 @@ def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -
 
 def build(
     recipe: StreamRecipe | RobotStreamRecipe, out: Path, on_event: OnEvent = ignore
-) -> StreamRun:
+) -> AnyStreamRun:
     """Model, tasks and learner of a run that is to be trained.
 
     Raises:
@@ -120,7 +120,7 @@ def build(
     return _module(recipe).build(recipe, out, on_event)
 
 
-def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> StreamRun:
+def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> AnyStreamRun:
     """A finished run whose figures can be measured again.
 
     Args:
@@ -131,6 +131,7 @@ def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> Stream
             measured with is no longer the same.
     """
     recipe = recipes.load_training(path / "recipe.yaml")
+    assert not isinstance(recipe, Recipe)
     return _module(recipe).load(recipe, path, before, on_event)
 
 
@@ -143,7 +144,7 @@ def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:
     return robots
 
 
-def _learn(run: StreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+def _learn(run: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
     """Learn the tasks that are left, and measure after each.
 
     Args:
@@ -163,14 +164,14 @@ def _learn(run: StreamRun, optimizer: torch.optim.Optimizer | None, on_event: On
         run.current, optimizer = learned.next_task(), None
         if run.current.task < count:
             if run.learner.trains != "nothing":
-                state.save(run, [])
+                state.save(run, None)
             if run.partial_matrix:
                 files.write_matrix(run.out, run.report())
         shown = {run.score_name: learned.oracle[-1][learned.task]}
         on_event(Progress("stream", run.current.task, count, "tasks", shown))
 
 
-def _truncate_metrics(run: StreamRun) -> None:
+def _truncate_metrics(run: AnyStreamRun) -> None:
     """Forget what was logged after the state was written: a resumed run repeats those steps."""
     at = (run.current.task, run.current.step)
     lines = folder.read_metrics(run.out, "task", "step")

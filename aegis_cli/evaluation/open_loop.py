@@ -291,7 +291,7 @@ class _Source:
             AegisError: a folder of several cameras, and not those of the training.
         """
         own = ("only", "state", "action", "rename")
-        known = {name: meta[name] for name in own if name in meta}
+        known: dict[str, Any] = {name: meta[name] for name in own if name in meta}
         if self.recipe is not None:
             known = recipes.selected(self.recipe)
         known = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
@@ -311,9 +311,9 @@ class _Source:
             return self.recipe.demos.camera
         named = meta.get("cameras", ())
         by_name = {layout.short(camera): camera for camera in known}
-        found = tuple(by_name.get(layout.short(camera)) for camera in named)
-        if found and None not in found:
-            return found
+        short = [layout.short(camera) for camera in named]
+        if short and all(name in by_name for name in short):
+            return tuple(by_name[name] for name in short)
         if len(known) > 1:
             raise AegisError(
                 f"the cameras {', '.join(known)} in '{data}'",

@@ -108,6 +108,12 @@ class _PlayedEpisode:
     def done(self) -> bool:
         return self.last is not None and self.last.done
 
+    @property
+    def end(self) -> Step:
+        """The last step of an episode that has been played."""
+        assert self.last is not None
+        return self.last
+
 
 @dataclass(frozen=True)
 class _Pace:
@@ -308,10 +314,10 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
         return _returns(finished)
     found: dict[str, Any] = {**vars(_success(finished))}
     del found["episodes"]
-    found["outcomes"] = "".join(str(int(bool(e.last.success))) for e in finished)
+    found["outcomes"] = "".join(str(int(bool(e.end.success))) for e in finished)
     if sim.has_colors(task):
-        wrong = sum(bool(e.last.wrong_target) for e in finished) / len(finished)
-        distance = float(np.mean([e.env.distance() for e in finished]))
+        wrong = sum(bool(e.end.wrong_target) for e in finished) / len(finished)
+        distance = float(np.mean([_distance(e) for e in finished]))
         found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
     tasks = sim.members(task)
     if tasks != (task,):
@@ -321,6 +327,13 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
     found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
     found["instructions"] = _apart(finished, _instruction)
     return found
+
+
+def _distance(episode: _PlayedEpisode) -> float:
+    """Metres from the effector to the target, in a task with coloured ones."""
+    distance = episode.env.distance()
+    assert distance is not None
+    return distance
 
 
 def _apart(
@@ -341,7 +354,7 @@ def _instruction(episode: _PlayedEpisode) -> str:
 
 
 def _success(finished: Sequence[_PlayedEpisode]) -> PartSuccess:
-    successes = sum(bool(e.last.success) for e in finished)
+    successes = sum(bool(e.end.success) for e in finished)
     interval = wilson_interval(successes, len(finished))
     return PartSuccess(successes / len(finished), interval, len(finished))
 
@@ -476,6 +489,7 @@ def _moment(episode: _PlayedEpisode, step: Step) -> media.Moment:
     elif step.done:
         note += ": " + _ended(step)
     outcome = step.success if step.done else None
+    assert step.observation is not None
     return media.Moment(step.observation.image, note, outcome)
 
 
@@ -487,4 +501,5 @@ def _ended(step: Step) -> str:
 
 def _clip(episode: _PlayedEpisode) -> media.Clip:
     caption = episode.observation.instruction
+    assert episode.moments is not None
     return media.Clip(caption, episode.moments, episode.env.target_circle())

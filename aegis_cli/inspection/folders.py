@@ -146,10 +146,17 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     facts |= _data_facts(header, settings.demos)
     if base_model := header.meta.get("base_model"):
         facts["base_model"] = base_model
-    losses = {name: metrics.get(name) for name in ("loss", "validation_loss")}
+    loss, validation_loss = metrics.get("loss"), metrics.get("validation_loss")
     energies = figures.of_ledger(rows, until)
     if at is not None:
-        return InspectReport("checkpoint", str(at), facts, **losses, **energies)
+        return InspectReport(
+            "checkpoint",
+            str(at),
+            facts,
+            loss=loss,
+            validation_loss=validation_loss,
+            **energies,
+        )
     probed = tuple(_without_pictures(found) for found in results.probes(path))
     if before := results.steps_measured_before(path):
         facts["measured_before"] = before
@@ -157,7 +164,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         "run",
         str(path),
         facts,
-        **losses,
+        loss=loss,
+        validation_loss=validation_loss,
         **energies,
         probes=probed,
         rollouts=tuple(results.rollouts(path)),

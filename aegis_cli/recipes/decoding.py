@@ -58,6 +58,7 @@ def build(
         wrong = error.errors(include_url=False, include_context=False)
         found = [_problem(kind, raw, each["loc"], prefix, places) for each in wrong]
         problems += dict.fromkeys(found)  # each alternative of a union says what it minds
+        return None
     return None if problems else made
 
 

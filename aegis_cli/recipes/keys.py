@@ -8,6 +8,8 @@ is imported only where something is decoded, so that `aegis --help` stays quick.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 import re
 from collections.abc import Callable
 from types import UnionType
@@ -159,6 +161,7 @@ def base_type(hint: Any) -> Any:
 def section(kind: type[T]) -> type[T]:
     """Make a class a frozen dataclass that pydantic decodes strictly, each key by its check."""
     made = dataclasses.dataclass(frozen=True)(kind)
+    assert dataclasses.is_dataclass(made)
     hints = get_type_hints(made)
     for field in dataclasses.fields(made):
         if not dataclasses.is_dataclass(base_type(hints[field.name])):
@@ -216,7 +219,8 @@ def _strict(hint: Any) -> Any:
         return Annotated[hint, Strict()]
     origin, args = get_origin(hint), get_args(hint)
     if origin is tuple:
-        return tuple[_strict(args[0]), ...]
+        item = _strict(args[0])
+        return tuple[item, ...]
     if origin in (Union, UnionType):
-        return Union[tuple(_strict(arg) for arg in args)]  # noqa: UP007 - built from a list
+        return functools.reduce(operator.or_, map(_strict, args))
     return dict[str, Any] if origin is dict else hint

@@ -742,10 +742,20 @@ class Probe:
         "end of its 95 % interval, so that too few questions cannot pass.",
     )
 
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """The names of its question sets, in their order."""
+        return (self.vqa,) if isinstance(self.vqa, str) else self.vqa
+
+    @property
+    def only_set(self) -> str:
+        """The name of the one question set, as one of `of_each_set` and a stream's probe have."""
+        (name,) = self.sets
+        return name
+
     def of_each_set(self) -> tuple[Probe, ...]:
         """This probe of each of its question sets alone, in their order."""
-        names = (self.vqa,) if isinstance(self.vqa, str) else self.vqa
-        return tuple(dataclasses.replace(self, vqa=name) for name in names)
+        return tuple(dataclasses.replace(self, vqa=name) for name in self.sets)
 
     @property
     def asking(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,12 +102,9 @@ def _described(path: Path) -> Shipped:
 
     The line below the comment says its kind.
     """
-    comment = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            kind = line.removeprefix("kind:").strip()
-            break
-        comment.append(line.removeprefix("#").strip())
-    command, *about = comment
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
+    kind = lines[len(comment)].removeprefix("kind:").strip()
+    command, *about = (line.removeprefix("#").strip() for line in comment)
     first, dot, _ = " ".join(about).partition(". ")
     return Shipped(path.stem, kind, command, first + dot.strip())

@@ -260,9 +260,10 @@ def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
     """Where a study names demonstrations: for all cells, or for those of a variant."""
     shared, named = raw.get("shared"), raw.get("variants")
     settings = shared.get("demos") if isinstance(shared, dict) else None
-    for key in ("path", "paths") if isinstance(settings, dict) else ():
-        if settings.get(key) is not None:
-            yield f"shared: demos.{key}: {settings[key]}"
+    if isinstance(settings, dict):
+        for key in ("path", "paths"):
+            if settings.get(key) is not None:
+                yield f"shared: demos.{key}: {settings[key]}"
     for name, variant in named.items() if isinstance(named, dict) else ():
         for part in ("set", "tune"):
             own = variant.get(part) if isinstance(variant, dict) else None

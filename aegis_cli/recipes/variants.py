@@ -19,7 +19,7 @@ Places = Mapping[str, str | None]
 
 
 def merged(
-    shared: Mapping[str, Any],
+    shared: dict[str, Any],
     variant: Variant,
     value: Any = None,
     lines: Mapping[str, int | None] | None = None,
@@ -65,6 +65,7 @@ def read(
             own.append(
                 Problem(f"the variant '{name}'", f"a name of {FOLDER_NAME.expected}", "rename it")
             )
+        variant: V | None = None
         if isinstance(keys, dict):
             variant = build(kind, keys, own, f"{where}.")
         else:
@@ -75,14 +76,14 @@ def read(
                     f"indent them below '{name}:'",
                 )
             )
-        if not own:
+        if variant is not None:
             own += _problems(where, variant, places, _lines(keys))
             if anchors.get(name, variant.method) != variant.method:
                 expected = f"{anchors[name]}: the others are measured against it"
                 own.append(
                     Problem(f"{where}.method: {variant.method}", expected, "rename the variant")
                 )
-        if not own:
+        if variant is not None and not own:
             found[name] = variant
         line = line_of(raw, name)  # that of the variant, where no key of its own is to blame
         problems += [p if p.line else p._replace(line=line) for p in own]
@@ -151,7 +152,7 @@ def cell_problems(
     variants: Mapping[str, Variant],
     raw: Mapping[str, Any],
     places: Places,
-    given: Sequence[Mapping[str, Any]],
+    given: Sequence[dict[str, Any]],
     together: Callable[[Any], Iterable[Problem]],
 ) -> Iterator[Problem]:
     """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once.

@@ -137,7 +137,7 @@ def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: O
     left = []
     for path, report in found:
         steps, planned = report.facts.get("steps"), report.facts.get("planned_steps")
-        if None not in (steps, planned) and steps < planned:
+        if steps is not None and planned is not None and steps < planned:
             taken = f"{path}, {inspection.steps_taken(steps, planned)} steps"
             left.append(taken + _what_goes_on(path, report))
     if left:

@@ -163,6 +163,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         return _of_table(path)
     if recipes.is_stream_run(path):
         found = inspection.run(path)
+        assert isinstance(found, inspection.StreamInspection)
         repeat = _command("aegis", "train", path / "recipe.yaml", "--out", "NEW_FOLDER")
         return StreamDocument(found.kind, str(path), found.report, [repeat])
     if not (path / "recipe.yaml").is_file():
@@ -202,6 +203,7 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     """
     recipe = recipes.load(path / "recipe.yaml")
     found = inspection.run(path)
+    assert isinstance(found, inspection.InspectReport)
     train = _jobs_report(path)
     about = path / machine.NAME
     anchor = _anchor(path, recipe, found)

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from multiprocessing import Queue
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 
@@ -31,11 +31,12 @@ CLEARING = "clearing.json"  # which measured cell's run is being removed, while 
 _LISTEN_S = 0.2  # between looks at what the processes report
 _FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
 CellRecipe = Recipe | StreamRecipe | RobotStreamRecipe
+R = TypeVar("R", bound=CellRecipe)  # of all cells of one study
 Entry = TypeVar("Entry")
 
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(Generic[R]):
     """One training.
 
     Attributes:
@@ -44,17 +45,17 @@ class Cell:
     """
 
     label: str
-    recipe: CellRecipe
+    recipe: R
     validation: bool = False
 
 
-class CellRunner(Protocol):
+class CellRunner(Protocol[R]):
     """What trains and measures cells below one folder."""
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: Cell[R]) -> str:
         """Digest of all that shapes what the cell leads to."""
 
-    def measure(self, cell: Cell) -> Outcome:
+    def measure(self, cell: Cell[R]) -> Outcome:
         """Train and measure a cell."""
 
     def clear(self, label: str) -> None:
@@ -67,14 +68,13 @@ class CellRunner(Protocol):
         """Take nothing in the folder for finished."""
 
 
-MakeRunner = Callable[[Path, OnEvent], CellRunner]
+MakeRunner = Callable[[Path, OnEvent], CellRunner[R]]
 
 
-class StudyKind(Protocol):
+class StudyKind(Protocol[R]):
     """Policies on tasks, or learners on streams, of images or of robot tasks.
 
     Attributes:
-        recipe: the study, with `variants`, `seeds`, `tuning` and `keep_runs`.
         places: the tasks or streams that every variant is measured on.
         figures: the dataclass of what a cell leads to, unless it diverges.
         make_runner: called in each process; it travels there by name.
@@ -82,27 +82,33 @@ class StudyKind(Protocol):
         tunes_fixed: whether variants without a choice are measured with the tuned ones.
     """
 
-    recipe: AnyStudy
     places: Sequence[str]
     figures: type[Figures]
-    make_runner: MakeRunner
+    make_runner: MakeRunner[R]
     rule: Rule
     tunes_fixed: bool
 
-    def cell(self, variant: str, place: str, seed: int, value: Any) -> CellRecipe:
+    @property
+    def recipe(self) -> AnyStudy:
+        """The study, with `variants`, `seeds`, `tuning` and `keep_runs`."""
+
+    def only(self, variants: Collection[str]) -> StudyKind[R]:
+        """The same study of some of its variants."""
+
+    def cell(self, variant: str, place: str, seed: int, value: Any) -> R:
         """The recipe of a compared cell; `value` is what the variant's knob is set to.
 
         Raises:
             AegisError: keys or values that make no recipe.
         """
 
-    def trial(self, variant: str, value: Any) -> CellRecipe:
+    def trial(self, variant: str, value: Any) -> R:
         """The recipe by which a knob's value is judged, on the validation split."""
 
-    def check(self, trials: Sequence[Any]) -> None:
+    def check(self, trials: Sequence[R]) -> None:
         """Raise AegisError for a study that cannot be run, before any work."""
 
-    def prepare(self, runner: Any, cells: Sequence[Cell], together: bool) -> None:
+    def prepare(self, runner: Any, cells: Sequence[Cell[R]], together: bool) -> None:
         """Check and make what cells share, before they are measured.
 
         Args:
@@ -112,17 +118,17 @@ class StudyKind(Protocol):
     def point(self, variant: str, value: Any, found: Any) -> Point:
         """What a knob's value led to."""
 
-    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
+    def costs(self, store: CellStore[R], chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
         """What the compared variants cost over naive, measured if `store` does not know it.
 
         Where `store` delivers only what is known, nothing is measured.
         """
 
-    def report(self, findings: Findings, store: CellStore) -> Report:
+    def report(self, findings: Findings, store: CellStore[R]) -> Report:
         """The table of what is known."""
 
 
-class CellStore:
+class CellStore(Generic[R]):
     """A study's folder, its finished cells, and the runner that measures the others.
 
     Attributes:
@@ -133,7 +139,7 @@ class CellStore:
 
     def __init__(
         self,
-        kind: StudyKind,
+        kind: StudyKind[R],
         folder: Path,
         on_event: OnEvent,
         workers: int = 1,
@@ -170,17 +176,17 @@ class CellStore:
         (self.folder / CELLS).unlink(missing_ok=True)
         self.runner.begin_anew()
 
-    def count_known(self, cells: Sequence[Cell]) -> int:
+    def count_known(self, cells: Sequence[Cell[R]]) -> int:
         """How many of the cells `measured` would deliver without measuring them, the first ones."""
         return sum(self.runner.key(cell) in self.cells for cell in cells)
 
-    def measured(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Outcome]]:
+    def measured(self, cells: Sequence[Cell[R]]) -> Generator[tuple[Cell[R], Outcome]]:
         """What the cells led to: the known ones first, then the others as they are measured.
 
         Equal cells are measured once.
         """
         keys = {cell.label: self.runner.key(cell) for cell in cells}
-        todo: dict[str, Cell] = {}
+        todo: dict[str, Cell[R]] = {}
         for cell in cells:
             if keys[cell.label] in self.cells:
                 yield cell, self._deliver(keys[cell.label])
@@ -202,12 +208,12 @@ class CellStore:
                     if keys[cell.label] == key:
                         yield cell, self._deliver(key)
 
-    def tidy(self, cells: Iterable[Cell]) -> None:
+    def tidy(self, cells: Iterable[Cell[R]]) -> None:
         """Remove what is left of these cells' cleared runs; all of them are measured."""
         if not self.known_only and not self.kind.recipe.keep_runs:
             self.runner.tidy(cell.label for cell in cells)
 
-    def _measure(self, cells: list[Cell], together: bool) -> Iterator[tuple[Cell, Outcome]]:
+    def _measure(self, cells: list[Cell[R]], together: bool) -> Generator[tuple[Cell[R], Outcome]]:
         """What cells led to, as they finish, measured here or by several processes."""
         if not together:
             for cell in cells:
@@ -248,7 +254,8 @@ class CellStore:
         try:
             return decode(kind, self.cells[key])
         except Misfit as misfit:
-            names = sorted(f.name for f in dataclasses.fields(kind))  # type: ignore[arg-type]
+            assert dataclasses.is_dataclass(kind)
+            names = sorted(f.name for f in dataclasses.fields(kind))
             raise AegisError(
                 f"an entry of '{self.folder / CELLS}' that is no {kind.__name__} of this version: "
                 f"{misfit}",
@@ -290,12 +297,12 @@ def _noted(note: Path) -> tuple[str, str]:
 
 
 def _measure_together(
-    make: MakeRunner,
+    make: MakeRunner[R],
     folder: Path,
-    cells: Sequence[Cell],
+    cells: Sequence[Cell[R]],
     workers: int,
     on_event: OnEvent,
-) -> Iterator[tuple[Cell, Outcome]]:
+) -> Generator[tuple[Cell[R], Outcome]]:
     """Measure cells, `workers` at a time, each with its share of the cores.
 
     Raises:
@@ -322,14 +329,14 @@ def _finished(
             yield numbers[future], future.result()
 
 
-_runner: CellRunner  # of a process of its own
+_runner: CellRunner[Any]  # of a process of its own
 
 
-def _begin(make: MakeRunner, folder: Path, reports: Queue[Event], threads: int) -> None:
+def _begin(make: MakeRunner[R], folder: Path, reports: Queue[Event], threads: int) -> None:
     global _runner
     _runner = make(folder, reports.put)
     torch.set_num_threads(threads)
 
 
-def _measure_here(cell: Cell) -> Outcome:
+def _measure_here(cell: Cell[R]) -> Outcome:
     return _runner.measure(cell)

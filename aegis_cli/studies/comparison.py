@@ -383,20 +383,23 @@ def task_results(
             value=values.get(name),
             diverged=sorted(seed for seed, row in own.items() if not measured(row)),
             **measure(PolicyResult, samples[name], references),
-            step_time=cost and cost.step_time,
-            peak_memory=cost and cost.peak_memory,
+            step_time=None if cost is None else cost.step_time,
+            peak_memory=None if cost is None else cost.peak_memory,
             bar=None,
             against=variant.against,
         )
         if not variant.is_plain(NAIVE) and name not in ceilings:
             made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
         results.append(made)
+    asked = _each_probed(samples.values())
     return TaskResults(
         task=task,
+        baseline_accuracy=_mean([row.baseline_accuracy for row in asked]),
+        baseline_cross_entropy=_mean([row.baseline_cross_entropy for row in asked]),
+        majority_accuracy=_mean([row.majority_accuracy for row in asked]),
         results=results,
         compared=len(pairs),
         across_versions=sum(one.code != other.code for one, other in pairs),
-        **_before(samples.values()),
     )
 
 
@@ -406,17 +409,13 @@ def _pairs(sample: Sample, reference: Sample) -> list[tuple[PolicyFigures, Polic
     return [(sample.figures[setting], reference.figures[setting]) for setting in settings]
 
 
-def _before(samples: Iterable[Sample]) -> dict[str, float | None]:
-    """What the backbone knew before training, a mean over the sets of questions that were asked."""
-    # One cell of each set of questions, since seeds may have sets of their own.
+def _each_probed(samples: Iterable[Sample]) -> list[PolicyFigures]:
+    """One cell of each set of questions that was asked, since seeds may have sets of their own."""
     asked: dict[int, PolicyFigures] = {}
     for sample in samples:
         for row in sample.figures.values():
             asked.setdefault(row.probe_seed, row)
-    return {name: _mean([getattr(row, name) for row in asked.values()]) for name in _BEFORE}
-
-
-_BEFORE = ("baseline_accuracy", "baseline_cross_entropy", "majority_accuracy")
+    return list(asked.values())
 
 
 def _mean(values: Sequence[float]) -> float | None:
@@ -565,7 +564,7 @@ class StreamResult:
     @property
     def forgetting_points(self) -> float | None:
         """Forgetting with the task told, which is never under 0, in points."""
-        return self.told.forgetting and 100 * self.told.forgetting.mean
+        return None if self.told.forgetting is None else 100 * self.told.forgetting.mean
 
 
 # A learner is one to prefer to a LoRA per task if it is as accurate, smaller, and loses nothing:

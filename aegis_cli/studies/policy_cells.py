@@ -32,6 +32,7 @@ from aegis_cli.evaluation import (
     rollout,
     wrong_answers,
 )
+from aegis_cli.evaluation.probe import ProbeReport
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
@@ -47,9 +48,9 @@ from aegis_cli.recipes import (
 )
 from aegis_cli.recipes.study_cells import NAIVE
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
-from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.cells import Cell, CellStore, MakeRunner
 from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
-from aegis_cli.studies.figures import Divergence, Outcome, PolicyFigures, VqaFigures
+from aegis_cli.studies.figures import Divergence, Figures, Outcome, PolicyFigures, VqaFigures
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
 from aegis_cli.training import assemble, checkpoint, track, train
 from aegis_cli.training import folder as run_folder
@@ -62,14 +63,19 @@ POLICY = ("backbone/model.safetensors", "expert.safetensors")
 class PolicyStudy:
     """The kind of study whose cells are policies trained on a task."""
 
-    figures = PolicyFigures
+    figures: type[Figures] = PolicyFigures
     rule = POLICY_RULE
     tunes_fixed = True  # the frontier shows all variants, measured on the same validation split
 
     def __init__(self, recipe: StudyRecipe) -> None:
         self.recipe = recipe
-        self.make_runner = PolicyRunner
-        self.places = recipe.tasks
+        self.make_runner: MakeRunner[Recipe] = PolicyRunner
+        self.places: Sequence[str] = recipe.tasks
+
+    def only(self, variants: Collection[str]) -> PolicyStudy:
+        """The same study of some of its variants."""
+        kept = {name: self.recipe.variants[name] for name in variants}
+        return PolicyStudy(dataclasses.replace(self.recipe, variants=kept))
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
         """The recipe of one policy on one task."""
@@ -100,7 +106,7 @@ class PolicyStudy:
         if tuning is not None:
             _check_playable(trials)
 
-    def prepare(self, runner: PolicyRunner, cells: Sequence[Cell], together: bool) -> None:
+    def prepare(self, runner: PolicyRunner, cells: Sequence[Cell[Recipe]], together: bool) -> None:
         """Check questions and demonstrations; record and measure what processes would share.
 
         Raises:
@@ -134,7 +140,7 @@ class PolicyStudy:
         vqa = self.recipe.shared.get("probe", {}).get("vqa", Probe().vqa)
         return (None,) if isinstance(vqa, str) else tuple(vqa)
 
-    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Cost]:
+    def costs(self, store: CellStore[Recipe], chosen: Mapping[str, Any]) -> dict[str, Cost]:
         """Step time and memory over naive's, by variant; nothing where no variant is named naive.
 
         What is not known of this machine is measured, unless only finished cells are delivered.
@@ -166,7 +172,7 @@ class PolicyStudy:
         return self.cell(variant, study.tasks[0], study.seeds[0], chosen[variant])
 
     def _measure_costs(
-        self, store: CellStore, made: Mapping[str, Recipe], names: Collection[str]
+        self, store: CellStore[Recipe], made: Mapping[str, Recipe], names: Collection[str]
     ) -> Iterator[tuple[str, tuple[float, float]]]:
         """Ratios of step time and of peak memory for some variants.
 
@@ -181,7 +187,7 @@ class PolicyStudy:
             for name in group:
                 yield name, (found[name].step_time, found[name].peak_memory)
 
-    def report(self, findings: Findings, store: CellStore) -> StudyReport:
+    def report(self, findings: Findings, store: CellStore[Recipe]) -> StudyReport:
         """The table of what is known."""
         study = self.recipe
         ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
@@ -199,8 +205,8 @@ class PolicyStudy:
             cells=store.total,
             seeds=list(study.seeds),
             tasks=tables,
-            tuning_task=study.tuning and study.tuning.task,
-            within=study.tuning and study.tuning.within,
+            tuning_task=None if study.tuning is None else study.tuning.task,
+            within=None if study.tuning is None else study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
             costs_on=sorted({cost.machine for cost in findings.costs.values() if cost.machine}),
@@ -245,7 +251,7 @@ def _check_playable(trials: Sequence[Recipe]) -> None:
 
 
 def cell_key(
-    cell: Cell,
+    cell: Cell[Recipe],
     backbone_sha256: str,
     demos_sha256: str | None = None,
     vqa_state: Sequence[Mapping[str, Any]] = (),
@@ -379,9 +385,10 @@ class PolicyRunner:
 
     def source(self, settings: Anchor | Cotrain | Insulate | Probe) -> sets.Scenes | sets.Listed:
         """The question set of a recipe's section, read once."""
-        key = (settings.vqa, settings.skip_bad, settings.ask)
+        vqa = settings.only_set if isinstance(settings, Probe) else settings.vqa
+        key = (vqa, settings.skip_bad, settings.ask)
         if key not in self._sources:
-            self._sources[key] = sets.read(*key[:2], self.on_event, settings.ask)
+            self._sources[key] = sets.read(vqa, settings.skip_bad, self.on_event, settings.ask)
         return self._sources[key]
 
     def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:
@@ -430,13 +437,13 @@ class PolicyRunner:
 
     # --- a cell -------------------------------------------------------------------------------
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: Cell[Recipe]) -> str:
         """Digest of all that shapes what the cell leads to."""
         recipe = cell.recipe
         given = None if recipe.demos.path is None else self.demos(recipe).sha256
         return cell_key(cell, self.backbone_sha256(recipe), given, self.vqa_state(recipe))
 
-    def measure(self, cell: Cell) -> PolicyFigures | Divergence:
+    def measure(self, cell: Cell[Recipe]) -> PolicyFigures | Divergence:
         """The cell's figures. A training that diverges is a finding."""
         try:
             return self.figures(cell.label, cell.recipe, cell.validation)
@@ -466,7 +473,7 @@ class PolicyRunner:
         if recipe.merge.method is not None:
             trained |= self.merge(label, recipe)
         asked = {
-            str(settings.vqa): _vqa_figures(self.probe(label, recipe, settings, number, validation))
+            settings.only_set: _vqa_figures(self.probe(label, recipe, settings, number, validation))
             for number, settings in enumerate(recipe.probe.of_each_set(), start=1)
         }
         if recipe.anchor.source == "demos":
@@ -629,7 +636,7 @@ class PolicyRunner:
 
     def _probed(
         self, label: str, recipe: Recipe, settings: Probe, split: str, on_event: OnEvent
-    ) -> tuple[probe.ProbeReport, dict[str, Any]]:
+    ) -> tuple[ProbeReport, dict[str, Any]]:
         """The cell's answers compared with those of before, and what is kept of single images."""
         measured = self.anchor(recipe)
         asked = self.questions(recipe, settings, split)
@@ -666,7 +673,7 @@ class PolicyRunner:
         """The cell's success on seen or held-out colours; without colours, its only figure."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self._policy(label, recipe) / f"{name}-{colors}.json", recipe.rollout
-        key = {
+        key: dict[str, Any] = {
             "policy": _sha256(self._policy(label, recipe)),
             "episodes": settings.episodes,
             "replan": settings.replan,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from aegis_cli.recipes import (
     RobotStreamTuning,
     study_cells,
 )
-from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.cells import Cell, CellStore, MakeRunner
 from aegis_cli.studies.comparison import Findings, RobotStreamStudyReport, robot_stream_results
-from aegis_cli.studies.figures import Divergence, RobotStreamFigures
+from aegis_cli.studies.figures import Divergence, Figures, RobotStreamFigures
 from aegis_cli.studies.stream_runs import StreamRuns
 from aegis_cli.studies.tuning import ROBOT_STREAM_RULE, RobotStreamPoint
 from aegis_cli.training.up_to_date import StageRecords, digest
@@ -35,14 +35,19 @@ PLACE = "stream"  # the one place on which all variants are measured
 class RobotStreamStudy:
     """The kind of study whose cells are learners of one stream of robot tasks."""
 
-    figures = RobotStreamFigures
+    figures: type[Figures] = RobotStreamFigures
     rule = ROBOT_STREAM_RULE
     tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
-    places = (PLACE,)
+    places: Sequence[str] = (PLACE,)
 
     def __init__(self, recipe: RobotStreamStudyRecipe) -> None:
         self.recipe = recipe
-        self.make_runner = RobotStreamRunner
+        self.make_runner: MakeRunner[RobotStreamRecipe] = RobotStreamRunner
+
+    def only(self, variants: Collection[str]) -> RobotStreamStudy:
+        """The same study of some of its variants."""
+        kept = {name: self.recipe.variants[name] for name in variants}
+        return RobotStreamStudy(dataclasses.replace(self.recipe, variants=kept))
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> RobotStreamRecipe:
         """The recipe of one learner; there is one `place`."""
@@ -58,7 +63,9 @@ class RobotStreamStudy:
         for task in self.recipe.tasks:
             sim.check(task)
 
-    def prepare(self, runner: RobotStreamRunner, cells: Sequence[Cell], together: bool) -> None:
+    def prepare(
+        self, runner: RobotStreamRunner, cells: Sequence[Cell[RobotStreamRecipe]], together: bool
+    ) -> None:
         """Check the questions, and record what processes would share.
 
         Raises:
@@ -79,11 +86,15 @@ class RobotStreamStudy:
             return RobotStreamPoint(variant, method, value, None, None)
         return RobotStreamPoint(variant, method, value, found.last, found.vqa[-1])
 
-    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    def costs(
+        self, store: CellStore[RobotStreamRecipe], chosen: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """A learner's minutes are among its figures; nothing is timed apart."""
         return {}
 
-    def report(self, findings: Findings, store: CellStore) -> RobotStreamStudyReport:
+    def report(
+        self, findings: Findings, store: CellStore[RobotStreamRecipe]
+    ) -> RobotStreamStudyReport:
         """The table of what is known."""
         study = self.recipe
         return RobotStreamStudyReport(
@@ -95,13 +106,13 @@ class RobotStreamStudy:
             results=robot_stream_results(
                 findings.cells, study.variants, findings.chosen, study.tasks
             ),
-            within=study.tuning and study.tuning.within,
+            within=None if study.tuning is None else study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
         )
 
 
-class RobotStreamRunner(StreamRuns):
+class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
     """Learns the cells of a stream of robot tasks, which share demonstrations."""
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -116,7 +127,7 @@ class RobotStreamRunner(StreamRuns):
         super().begin_anew()
         self._records.begin_anew()
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: Cell[RobotStreamRecipe]) -> str:
         """Digest of all that shapes the figures.
 
         The run's label, and where the backbone and given demonstrations lie, are no part of it.
@@ -136,7 +147,7 @@ class RobotStreamRunner(StreamRuns):
         """
         if settings not in self._sources:
             self._sources[settings] = sets.read(
-                settings.vqa, settings.skip_bad, self.on_event, settings.ask
+                settings.only_set, settings.skip_bad, self.on_event, settings.ask
             )
         return self._sources[settings]
 
@@ -153,7 +164,7 @@ class RobotStreamRunner(StreamRuns):
             self._digests[path] = demonstrations.digest(demonstrations.at(path))
         return self._digests[path]
 
-    def learned(self, cell: Cell) -> RobotStreamRecipe:
+    def learned(self, cell: Cell[RobotStreamRecipe]) -> RobotStreamRecipe:
         """The recipe that is learned, on validation episodes if the cell is of the tuning."""
         recipe = cell.recipe
         split = "validation" if cell.validation else "evaluation"
@@ -182,7 +193,7 @@ class RobotStreamRunner(StreamRuns):
 
 
 def cell_key(
-    cell: Cell,
+    cell: Cell[RobotStreamRecipe],
     fingerprint: str,
     demos_sha256: Sequence[str],
     vqa_state: Mapping[str, Any],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,9 @@ from aegis_cli.recipes import (
     StreamTuning,
     study_cells,
 )
-from aegis_cli.studies.cells import Cell, CellStore
+from aegis_cli.studies.cells import Cell, CellStore, MakeRunner
 from aegis_cli.studies.comparison import Findings, StreamStudyReport, stream_results
-from aegis_cli.studies.figures import Divergence, StreamFigures
+from aegis_cli.studies.figures import Divergence, Figures, StreamFigures
 from aegis_cli.studies.stream_runs import StreamRuns
 from aegis_cli.studies.tuning import STREAM_RULE, StreamPoint
 from aegis_cli.training.up_to_date import digest
@@ -31,15 +31,20 @@ from aegis_cli.training.up_to_date import digest
 class StreamStudy:
     """The kind of study whose cells are learners of a stream."""
 
-    figures = StreamFigures
+    figures: type[Figures] = StreamFigures
     rule = STREAM_RULE
     tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
 
     def __init__(self, recipe: StreamStudyRecipe) -> None:
         self.recipe = recipe
-        self.make_runner = StreamRunner
+        self.make_runner: MakeRunner[StreamRecipe] = StreamRunner
         pairs = dataclasses.astuple(recipe.pairs) if recipe.pairs else ()
-        self.places: tuple[str, ...] = (*recipe.streams, *pairs)
+        self.places: Sequence[str] = (*recipe.streams, *pairs)
+
+    def only(self, variants: Collection[str]) -> StreamStudy:
+        """The same study of some of its variants."""
+        kept = {name: self.recipe.variants[name] for name in variants}
+        return StreamStudy(dataclasses.replace(self.recipe, variants=kept))
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> StreamRecipe:
         """The recipe of one learner on one stream."""
@@ -56,7 +61,7 @@ class StreamStudy:
     def prepare(
         self,
         runner: StreamRunner,
-        cells: Sequence[Cell],
+        cells: Sequence[Cell[StreamRecipe]],
         together: bool,
     ) -> None:
         """Load all streams and make their images, once: a missing one, or no pair, shows now.
@@ -84,11 +89,11 @@ class StreamStudy:
             return StreamPoint(variant, method, value, None, None)
         return StreamPoint(variant, method, value, found.last, found.parameters)
 
-    def costs(self, store: CellStore, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    def costs(self, store: CellStore[StreamRecipe], chosen: Mapping[str, Any]) -> dict[str, Any]:
         """A learner's minutes are among its figures; nothing is timed apart."""
         return {}
 
-    def report(self, findings: Findings, store: CellStore) -> StreamStudyReport:
+    def report(self, findings: Findings, store: CellStore[StreamRecipe]) -> StreamStudyReport:
         """The table of what is known."""
         study = self.recipe
         methods = {variant.method for variant in study.variants.values()}
@@ -105,14 +110,14 @@ class StreamStudy:
             results=stream_results(
                 findings.cells, study.variants, findings.chosen, study.pairs, unseeded, frozen
             ),
-            tuning_stream=study.tuning and study.tuning.stream,
-            within=study.tuning and study.tuning.within,
+            tuning_stream=None if study.tuning is None else study.tuning.stream,
+            within=None if study.tuning is None else study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
         )
 
 
-class StreamRunner(StreamRuns):
+class StreamRunner(StreamRuns[StreamRecipe]):
     """Learns the cells of streams of images."""
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -120,7 +125,7 @@ class StreamRunner(StreamRuns):
         self._fingerprints: dict[str, str] = {}
         self._image_sets: dict[tuple[Any, ...], str] = {}
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: Cell[StreamRecipe]) -> str:
         """Digest of all that shapes the figures.
 
         The run's label, and where encoder and images lie, are no part of it.
@@ -133,7 +138,7 @@ class StreamRunner(StreamRuns):
             self._image_sets[which] = images.image_set(recipe)
         return cell_key(cell, self._fingerprints[recipe.encoder], self._image_sets[which])
 
-    def learned(self, cell: Cell) -> StreamRecipe:
+    def learned(self, cell: Cell[StreamRecipe]) -> StreamRecipe:
         """The recipe that is learned, on validation parts if the cell is of the tuning."""
         return dataclasses.replace(cell.recipe, split=VALIDATION if cell.validation else TEST)
 
@@ -142,7 +147,7 @@ class StreamRunner(StreamRuns):
         return stream_figures(report)
 
 
-def cell_key(cell: Cell, fingerprint: str, image_set: str) -> str:
+def cell_key(cell: Cell[StreamRecipe], fingerprint: str, image_set: str) -> str:
     """Digest of a stream's settings.
 
     Options at their defaults are left out: one that is added later makes no finished cell stale.

@@ -7,7 +7,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import Diverged
@@ -18,10 +18,11 @@ from aegis_cli.studies.cells import Cell
 from aegis_cli.studies.figures import Divergence, RobotStreamFigures, StreamFigures
 from aegis_cli.training import folder as run_folder
 
+S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)  # of all streams of one study
 _BEGUN = ".begun"  # ends the name of the note beside a run that a study has started
 
 
-class StreamRuns(ABC):
+class StreamRuns(ABC, Generic[S]):
     """Learns cells; a label is a run's place below the folder: `primer-1/igsp/0`.
 
     Beside a run lies a note of what it was begun with.
@@ -31,11 +32,11 @@ class StreamRuns(ABC):
         self.folder, self.on_event = folder, on_event
 
     @abstractmethod
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: Cell[S]) -> str:
         """Digest of all that shapes the figures."""
 
     @abstractmethod
-    def learned(self, cell: Cell) -> StreamRecipe | RobotStreamRecipe:
+    def learned(self, cell: Cell[S]) -> S:
         """The recipe that is learned, on validation parts if the cell is of the tuning."""
 
     @abstractmethod
@@ -47,7 +48,7 @@ class StreamRuns(ABC):
         for note in self.folder.rglob(f"*{_BEGUN}"):
             files.write_text(note, "")
 
-    def measure(self, cell: Cell) -> StreamFigures | RobotStreamFigures | Divergence:
+    def measure(self, cell: Cell[S]) -> StreamFigures | RobotStreamFigures | Divergence:
         """Learn the stream. One that diverges is a finding."""
         out, key = self.folder / cell.label, self.key(cell)
         recipe = self.learned(cell)

@@ -23,7 +23,7 @@ from aegis_cli.common import files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.recipes import AnyStudy, PolicyVariant, RobotStreamStudyRecipe, StudyRecipe
-from aegis_cli.studies.cells import CELLS, Cell, CellStore, StudyKind
+from aegis_cli.studies.cells import CELLS, Cell, CellStore, R, StudyKind
 from aegis_cli.studies.comparison import Findings, Report
 from aegis_cli.studies.figures import Outcome
 from aegis_cli.studies.metrics import Setting
@@ -32,7 +32,7 @@ from aegis_cli.studies.robot_stream_cells import RobotStreamStudy
 from aegis_cli.studies.stream_cells import StreamStudy
 from aegis_cli.studies.tuning import choose
 
-Trials = Mapping[str, list[tuple[Any, Cell]]]  # variant -> its knob's values and their cells
+Trials = Mapping[str, list[tuple[Any, Cell[R]]]]  # variant -> its knob's values and their cells
 
 
 def run(
@@ -86,8 +86,7 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
         if names := _tuned_whole(kind, store):
-            variants = {name: study.variants[name] for name in names}
-            store.kind = kind = type(kind)(dataclasses.replace(study, variants=variants))
+            store.kind = kind = kind.only(names)
         report = _run(kind, trials(kind), store)
     if not report.finished:
         raise AegisError(
@@ -98,7 +97,7 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
     return dataclasses.replace(report, out=str(cells))
 
 
-def kind_of(study: AnyStudy) -> StudyKind:
+def kind_of(study: AnyStudy) -> StudyKind[Any]:
     """What a study's cells are, and how they are measured and told."""
     if isinstance(study, StudyRecipe):
         return PolicyStudy(study)
@@ -107,7 +106,7 @@ def kind_of(study: AnyStudy) -> StudyKind:
     return StreamStudy(study)
 
 
-def _tuned_whole(kind: StudyKind, store: CellStore) -> list[str]:
+def _tuned_whole(kind: StudyKind[R], store: CellStore[R]) -> list[str]:
     """The variants whose values have all been measured, and those that have none to choose.
 
     There are none where one is not whole by which all others are judged: without it, they would be
@@ -122,7 +121,7 @@ def _tuned_whole(kind: StudyKind, store: CellStore) -> list[str]:
     return whole if set(_judges(kind)) <= set(whole) else []
 
 
-def _judges(kind: StudyKind) -> list[str]:
+def _judges(kind: StudyKind[R]) -> list[str]:
     """The variants whose best value sets the margin for all: none where each sets its own."""
     variants, reference = kind.recipe.variants, kind.rule.reference
     if reference is None:
@@ -135,7 +134,7 @@ def _judges(kind: StudyKind) -> list[str]:
     return own or list(variants)
 
 
-def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
+def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
     study, tuned = kind.recipe, _tuned(kind, tried)
     store.total = sum(map(len, tuned.values()))
     store.total += len(study.seeds) * len(kind.places) * len(study.variants)
@@ -161,12 +160,12 @@ def _run(kind: StudyKind, tried: Trials, store: CellStore) -> Report:
     return _write(kind, store, dataclasses.replace(findings, costs=costs))
 
 
-def trials(kind: StudyKind) -> Trials:
+def trials(kind: StudyKind[R]) -> Trials[R]:
     """Every variant's values and their cells on the validation split.
 
     They are made at once, so that a bad one is refused before any work.
     """
-    made: dict[str, list[tuple[Any, Cell]]] = {}
+    made: dict[str, list[tuple[Any, Cell[R]]]] = {}
     for name, variant in kind.recipe.variants.items():
         made[name] = []
         for value, folder in zip(variant.values, _folders(variant.values), strict=True):
@@ -191,16 +190,17 @@ def _slug(value: Any) -> str:
     return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
 
 
-def _tuned(kind: StudyKind, tried: Trials) -> Trials:
+def _tuned(kind: StudyKind[R], tried: Trials[R]) -> Trials[R]:
     """The variants whose values are measured; none without tuning, where no variant has a knob."""
     if kind.recipe.tuning is None:
         return {}
     return {name: own for name, own in tried.items() if kind.tunes_fixed or len(own) > 1}
 
 
-def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
+def _tune(kind: StudyKind[R], store: CellStore[R], tuned: Trials[R]) -> Findings:
     """Measure the values, and choose the one that each variant is compared with."""
-    if not tuned:
+    tuning = kind.recipe.tuning
+    if tuning is None or not tuned:
         return Findings()
     found: dict[str, Any] = {}
     points: dict[str, list[Any]] = {}
@@ -215,7 +215,7 @@ def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
                 _write(kind, store, Findings(so_far))
     if len(found) < len(cells):
         return Findings([point for own in points.values() for point in own])
-    best = choose(kind.rule, points, kind.recipe.tuning.within)
+    best = choose(kind.rule, points, tuning.within)
     decided = [
         dataclasses.replace(point, chosen=number == best[name])
         for name, own in points.items()
@@ -224,7 +224,7 @@ def _tune(kind: StudyKind, store: CellStore, tuned: Trials) -> Findings:
     return Findings(decided, {name: own[best[name]].value for name, own in points.items()})
 
 
-def _points(kind: StudyKind, tuned: Trials, found: Mapping[str, Any]) -> dict[str, list[Any]]:
+def _points(kind: StudyKind[R], tuned: Trials[R], found: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What the finished values led to, in the recipe's order, whichever was finished first."""
     return {
         name: [
@@ -234,7 +234,7 @@ def _points(kind: StudyKind, tuned: Trials, found: Mapping[str, Any]) -> dict[st
     }
 
 
-def _compared(kind: StudyKind, chosen: Mapping[str, Any]) -> Iterator[Cell]:
+def _compared(kind: StudyKind[R], chosen: Mapping[str, Any]) -> Iterator[Cell[R]]:
     for seed in kind.recipe.seeds:
         for place in kind.places:
             for name in kind.recipe.variants:
@@ -243,7 +243,7 @@ def _compared(kind: StudyKind, chosen: Mapping[str, Any]) -> Iterator[Cell]:
 
 
 def _ordered(
-    kind: StudyKind, found: Mapping[str, Mapping[Setting, Outcome]]
+    kind: StudyKind[R], found: Mapping[str, Mapping[Setting, Outcome]]
 ) -> dict[str, dict[Setting, Outcome]]:
     """Variants and cells in the recipe's order, whichever was finished first."""
     settings = [(place, seed) for place in kind.places for seed in kind.recipe.seeds]
@@ -254,7 +254,7 @@ def _ordered(
     }
 
 
-def _write(kind: StudyKind, store: CellStore, findings: Findings) -> Report:
+def _write(kind: StudyKind[R], store: CellStore[R], findings: Findings) -> Report:
     """The report of what is known now."""
     report = kind.report(findings, store)
     files.save_json(store.folder / "table.json", report.to_json())

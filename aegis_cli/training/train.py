@@ -749,7 +749,7 @@ def _draws(frames: Tensor, samples: int, batch: RobotBatch, noise: int) -> tuple
 
 
 @contextmanager
-def _evaluating(policy: Policy) -> Iterator[None]:
+def _evaluating(policy: Policy) -> Generator[None]:
     """Let no pass inside the block write to the policy, as BatchNorm's averages in training."""
     was_training = policy.training
     policy.eval()

@@ -238,16 +238,24 @@ def _explain(drawn: Any, axis: Any, tuned: bool, compared: bool) -> None:
     """What the marks mean, and the way that is better."""
     from matplotlib.lines import Line2D
 
-    grey = {"color": "0.35", "linestyle": ""}
+    def grey(label: str, marker: str, size: float, face: str | None = None) -> Line2D:
+        return Line2D(
+            [],
+            [],
+            color="0.35",
+            linestyle="",
+            marker=marker,
+            markersize=size,
+            markerfacecolor=face,
+            label=label,
+        )
+
     marks = []
     if compared:
-        marks.append(
-            Line2D([], [], marker="*", markersize=12, label="mean over seeds, 95 % (probe)", **grey)
-        )
+        marks.append(grey("mean over seeds, 95 % (probe)", "*", 12))
     if tuned:
-        tried = {"marker": "o", "markersize": 5, **grey}
-        marks.append(Line2D([], [], markerfacecolor="white", label="tried (validation)", **tried))
-        marks.append(Line2D([], [], label="chosen (validation)", **tried))
+        marks.append(grey("tried (validation)", "o", 5, face="white"))
+        marks.append(grey("chosen (validation)", "o", 5))
     marks.append(Line2D([], [], color="0.3", linestyle="--", label="before fine-tuning"))
     drawn.legend(
         handles=marks, loc="outside lower center", ncols=len(marks), fontsize=9, frameon=False
@@ -292,9 +300,11 @@ def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, f
     for result in compared:
         success, lost = _compared_at(result)
         if result.drop_points.ends is not None:
-            spots += _between(*((success, end) for end in result.drop_points.ends))
+            low, high = result.drop_points.ends
+            spots += _between((success, low), (success, high))
         if _acts(result).ends is not None:
-            spots += _between(*((100 * end, lost) for end in _acts(result).ends))
+            low, high = _acts(result).ends
+            spots += _between((100 * low, lost), (100 * high, lost))
     for points in _curves(tried).values():
         ends = [_tried_at(p) for p in points]
         for first, second in zip(ends, ends[1:], strict=False):

@@ -70,7 +70,7 @@ def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
         # A merge whose sweep measured no validation loss has none.
         told = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
         left["merge"] = told
-    if None in (planned, steps) or steps >= planned:
+    if planned is None or steps is None or steps >= planned:
         return left
     return left | {"steps": _steps_taken(steps, planned)}
 

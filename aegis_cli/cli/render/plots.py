@@ -207,9 +207,10 @@ def _routing(report: Any, path: str) -> Any:
         layout="constrained",
     )
     panels = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    heats = []
     for task, (axes, record) in enumerate(zip(panels, report.records, strict=False)):
         routed = {site.site: site for site in record.sites}
-        heat = _task_routing(axes, task, [routed.get(name) for name in sites], count)
+        heats.append(_task_routing(axes, task, [routed.get(name) for name in sites], count))
         axes.set_title(f"{task + 1}. {literal(record.task)}", fontsize=9)
         axes.tick_params(length=0, labelsize=8)
         axes.spines[:].set_visible(False)
@@ -220,7 +221,7 @@ def _routing(report: Any, path: str) -> Any:
     panels[0].invert_yaxis()
     title = "Routing mass (%) after each task; a column holds the experts that one task brought"
     drawn.suptitle(f"{title}\n{literal(path)}", x=0.01, ha="left", fontsize=11)
-    drawn.colorbar(heat, ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
+    drawn.colorbar(heats[-1], ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
     _explain_routing(drawn)
     return drawn
 

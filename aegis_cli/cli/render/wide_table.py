@@ -10,6 +10,7 @@ from dataclasses import replace
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Column, Table
+from rich.text import TextType
 
 _BESIDE = 2  # columns of space that each column of the table takes beside its text
 
@@ -23,11 +24,16 @@ class WideTable(Table):
         left: columns that name a line, with which each part begins.
     """
 
-    def __init__(self, left: int, title: str | None = None) -> None:
+    def __init__(self, left: int, title: TextType | None = None) -> None:
         super().__init__(
-            box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, header_style="bold"
+            title=title,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            collapse_padding=True,
+            header_style="bold",
         )
-        self.left, self.title, self.title_justify = left, title, "left"
+        self.left = left
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         free = options.max_width - 1

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli.core.identification import Flow
-from aegis_cli.core.routing import Routed, RoutedLinear, Traced
+from aegis_cli.core.routing import Routed, RoutedLinear, Router, Traced
 
 Traces = Mapping[str, Sequence[Traced]]
 Flows = Mapping[str, Flow]  # per map; columns as in its router of the task
@@ -111,14 +111,16 @@ def route_task(
     context: TaskContext,
     top: int | None = None,
     constant: bool = False,
-) -> None:
-    """Give `task` a router over the experts `used`.
+) -> Router:
+    """Give `task` a router over the experts `used`, and return it.
 
     The router learns, and so does each of these experts that is not frozen.
     """
-    site.add_router(task, used, context.generator, top, constant).requires_grad_(True)
+    router = site.add_router(task, used, context.generator, top, constant)
+    router.requires_grad_(True)
     for expert in site.of(used):
         expert.requires_grad_(not expert.frozen)
+    return router
 
 
 def keep_experts(context: TaskContext, _: Flows) -> None:

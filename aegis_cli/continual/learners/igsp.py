@@ -57,8 +57,8 @@ def begin(context: TaskContext) -> None:
             site.add_expert(options["rank"], context.task, context.generator)
             for _ in range(options["candidates"])
         ]
-        route_task(site, context.task, (*history, *new), context)
-        start(site.routers[str(context.task)], len(history), len(new), options["history"])
+        router = route_task(site, context.task, (*history, *new), context)
+        start(router, len(history), len(new), options["history"])
 
 
 @torch.no_grad()
@@ -70,6 +70,7 @@ def start(router: Router, old: int, new: int, share: float) -> None:
     learn slowly: a step of an expert moves the output by (s p)^2.
     """
     if old:
+        assert router.bias is not None
         router.bias[:old] = math.log(share / (1 - share) * new / old)
     router.scale.fill_(new / (1 - share) if old else new)
 
@@ -98,7 +99,8 @@ def settle(context: TaskContext, flows: Flows) -> None:
     """Prune, and fix the routers but for their scales."""
     options = context.options
     for name, site in context.sites.items():
-        router = site.routers[str(context.task)]
+        router = site.router(context.task)
+        assert router is not None
         if options["prune"]:
             columns = needed(flows[name], options["kappa"], options["load"])
             site.restrict(context.task, [router.experts[i] for i in columns])
@@ -139,8 +141,10 @@ def _used(site: RoutedLinear, task: int) -> tuple[list[int], list[int]]:
 
     They stand in the router in this order.
     """
-    used = site.routers[str(task)].experts
-    new = [number for number in used if site.experts[str(number)].owner == task]
+    router = site.router(task)
+    assert router is not None
+    used = router.experts
+    new = [n for n, expert in zip(used, site.of(used), strict=True) if expert.owner == task]
     return [number for number in used if number not in new], new
 
 

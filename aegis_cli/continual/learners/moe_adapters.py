@@ -14,10 +14,12 @@ is claimed.
 from __future__ import annotations
 
 from aegis_cli.continual.learners.base import Flows, Learner, TaskContext, route_task
+from aegis_cli.models.backbones.dual import DualEncoder
 
 
 def begin(context: TaskContext) -> None:
     """The whole pool comes with the first task; an expert belongs to none until one freezes it."""
+    assert isinstance(context.model, DualEncoder)
     options = context.options
     pool = options["experts_per_task"] * context.tasks
     for name, site in context.sites.items():

@@ -22,9 +22,9 @@ def begin(context: TaskContext) -> None:
             own = site.add_expert(context.options["rank"], context.task, context.generator)
             route_task(site, context.task, [own], context)
             continue
-        route_task(site, context.task, known.experts, context)
+        router = route_task(site, context.task, known.experts, context)
         with torch.no_grad():
-            site.routers[str(context.task)].scale.copy_(known.scale)
+            router.scale.copy_(known.scale)
 
 
 def nearest(prototypes: Tensor, similarity: float) -> int | None:
