@@ -887,7 +887,7 @@ def scores(
         lost = [s for s in report.scores if not s.passed]
         names = ", ".join(f"{s.task} ({s.metric})" for s in lost)
         limit = f"more than --max-drop {max_drop:g} points"
-        if gate is Gate.upper:
+        if gate is Gate.upper_end:
             limit += ", by the upper end of the drop's interval"
         failed = f"{names} dropped {limit}"
     _say_gate(failed)

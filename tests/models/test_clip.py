@@ -327,7 +327,7 @@ def _without_a_weight(folder: Path) -> None:
         (_without_a_weight, "1 missing (visual_projection.weight)"),
         (lambda f: (f / "model.safetensors").unlink(), "does not load"),
         (lambda f: (f / "preprocessor_config.json").unlink(), "processor"),
-        (lambda f: (f / "tokenizer.json").unlink(), "processor"),
+        (lambda f: (f / "tokenizer.json").unlink(), "no tokenizer"),
     ],
 )
 def test_a_model_that_is_not_whole_is_one_error(

@@ -371,6 +371,18 @@ def test_a_file_that_is_missing_or_cut(
     bad(*MEASURE, "model", says=("model",))
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("tokenizer.json", "no tokenizer in"), ("processor_config.json", "no image processor in")],
+)
+def test_a_part_of_the_processor_that_is_missing_is_named(
+    name: str, said: str, bad: Bad, model: Path
+) -> None:
+    """Of no tokenizer transformers makes one without words, and images have no token then."""
+    (model / name).unlink()
+    bad(*MEASURE, "model", says=(said, "the model that this one was made from"))
+
+
 @pytest.mark.parametrize("alone", [False, True])
 def test_an_adapter_of_peft_is_refused_with_what_makes_a_model_of_it(
     alone: bool, bad: Bad, model: Path

@@ -122,6 +122,7 @@ def load(folder: Path) -> CLIPEncoder:
                 "give the folder of a CLIP model",
             )
         model = complete(transformers.CLIPModel, folder, config)
+    model_folder.check_processor(folder)
     with quiet(), loading(folder, "processor"):
         tokenizer = transformers.AutoTokenizer.from_pretrained(folder, **SAFE)
         settings, _ = transformers.CLIPImageProcessor.get_image_processor_dict(folder, **SAFE)

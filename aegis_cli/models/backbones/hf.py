@@ -534,6 +534,7 @@ def _assembled(
         family = model_folder.family(folder, config.model_type, layers)
         model = make(config)
     model_folder.check_attention(model_folder.check_path(model, family.layers))
+    model_folder.check_processor(folder)
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     tokenizer = processor.tokenizer

@@ -19,6 +19,14 @@ from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 _OWN = "aegis.json"  # in a saved folder of a family that is not known: where its layers are
 _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
+# The parts of a processor, and the files that may hold one.
+_PARTS = {
+    "tokenizer": (
+        *("tokenizer.json", "tokenizer.model", "vocab.json", "vocab.txt"),
+        *("spiece.model", "sentencepiece.bpe.model", "tekken.json"),
+    ),
+    "image processor": ("preprocessor_config.json", "processor_config.json"),
+}
 _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
 _STORED = {"BF16": "bfloat16", "F16": "float16"}  # safetensors' names
 GIVE = (
@@ -99,6 +107,21 @@ def processor_files(folder: Path) -> dict[str, bytes]:
         if path.suffix in _PROCESSOR_SUFFIXES and path.is_file() and not of_model:
             found[str(path.relative_to(folder))] = path.read_bytes()
     return found
+
+
+def check_processor(folder: Path) -> None:
+    """Raise AegisError unless a folder has a file of each part of a processor.
+
+    transformers would make a tokenizer without words of none.
+    """
+    own = {path.name for path in folder.iterdir()}
+    for part, names in _PARTS.items():
+        if not own.intersection(names):
+            raise AegisError(
+                f"no {part} in '{folder}'",
+                f"the processor's files beside the model's, such as {names[0]}",
+                "copy them from the repository of the model that this one was made from",
+            )
 
 
 def processor_class(folder: Path) -> str | None:
