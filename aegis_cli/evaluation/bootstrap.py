@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # tables of finished studies are shown without it
 
 RESAMPLES = 2000
 _AT_ONCE = 250  # resamples held in memory together
+FEW = 10  # images or episodes unlike the others, below which resamples tell too little
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,11 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     sqrt((S - 1) / S) (Hesterberg 2015, The American Statistician 69(4), section 3.1), so that
     deviations from the mean are divided by it.
 
-    Where all images or episodes of all seeds came out alike, no draw differs, and that says
-    nothing. Then the share of those that would have come out otherwise is at most Wilson's bound
-    for a share that was never seen.
+    Where fewer than ten images or episodes came out unlike the others, resamples know too few
+    outcomes, and where none did, none at all. Then the interval is made to hold that of two shares
+    as well, of those that came out higher and of those that came out lower
+    (`data.vqa.metrics.mean_loss_interval`). So one image that was lost is not told more sharply
+    than none.
 
     Args:
         seeds: S seeds.
@@ -79,9 +82,8 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     if count < 2:
         return None
     mean = float(np.mean([one.values.sum() / one.counts.sum() for one in seeds]))
-    if np.ptp(np.concatenate([one.values / one.counts for one in seeds])) == 0:
-        reach = 0.0 if all(one.sure for one in seeds) else _unseen(seeds) * seeds[0].reach
-        return mean - reach, mean + reach
+    if all(one.sure for one in seeds):
+        return mean, mean
     rng = np.random.default_rng(seed)
     found = []
     for first in range(0, RESAMPLES, _AT_ONCE):
@@ -90,18 +92,35 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
         found.append((drawn * _resampled_means(seeds, resamples, rng)).sum(1) / count)
     deviations = (np.concatenate(found) - mean) * math.sqrt(count / (count - 1))
     low, high = np.quantile(mean + deviations, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return float(low), float(high)
+    least, most = _of_few(seeds)
+    return min(float(low), mean - least), max(float(high), mean + most)
 
 
-def _unseen(seeds: Sequence[Units]) -> float:
-    """The largest share of images or episodes that may be unlike all that were seen.
+def _of_few(seeds: Sequence[Units]) -> tuple[float, float]:
+    """How far below and above the mean an interval of shares reaches; nothing where many differ.
 
-    An image's questions share its difficulty, so that they are one look and not several.
+    An image's questions share its difficulty, so that they are one look and not several; so do the
+    looks of several seeds at one image. Shares count in units of `reach`.
     """
-    from aegis_cli.data.vqa.metrics import wilson_interval  # loads torch
+    import numpy as np
 
-    asked = {unit for one in seeds for unit in _units(one)}
-    return wilson_interval(0, len(asked))[1]
+    from aegis_cli.data.vqa.metrics import mean_loss_interval  # loads torch
+
+    each = [one.values / one.counts for one in seeds]
+    outcomes, times = np.unique(np.concatenate(each), return_counts=True)
+    common = float(outcomes[times.argmax()])
+    if any(np.count_nonzero(means != common) >= FEW for means in each):
+        return 0.0, 0.0
+    looks: dict[Hashable, list[float]] = {}
+    for one, means in zip(seeds, each, strict=True):
+        for unit, mean in zip(_units(one), means.tolist(), strict=True):
+            looks.setdefault(unit, []).append(mean)
+    if sum(any(mean != common for mean in own) for own in looks.values()) >= FEW:
+        return 0.0, 0.0
+    apart = np.array([sum(own) / len(own) - common for own in looks.values()]) / seeds[0].reach
+    low, high = mean_loss_interval(apart.clip(-1, 1), range(len(apart)))
+    middle = float(apart.clip(-1, 1).mean())
+    return (middle - low) * seeds[0].reach, (high - middle) * seeds[0].reach
 
 
 def _units(one: Units) -> list[Hashable]:

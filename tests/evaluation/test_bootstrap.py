@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from aegis_cli.data.vqa.metrics import wilson_interval
-from aegis_cli.evaluation.bootstrap import Units, crossed_interval
+from aegis_cli.evaluation import bootstrap
+from aegis_cli.evaluation.bootstrap import FEW, Units, crossed_interval
 from aegis_cli.evaluation.estimates import estimate
 
 
@@ -75,6 +76,43 @@ def test_names_that_no_seeds_share_are_those_of_draws_of_their_own() -> None:
     plain = [replace(one, names=None) for one in apart]
     widths = [np.ptp(crossed_interval(seeds)) for seeds in (apart, plain)]
     assert widths[0] == pytest.approx(widths[1], rel=0.15)
+
+
+def rare(rng: np.random.Generator, share: float, images: int, seeds: int) -> list[Units]:
+    """Seeds that lose one of four questions about the same few images, each with this share."""
+    lost = (rng.random(images) < share).astype(float)
+    return [Units(100 * lost, np.full(images, 4.0)) for _ in range(seeds)]
+
+
+@pytest.mark.parametrize("lost", range(1, 10))
+def test_few_losses_are_told_no_more_sharply_than_none(lost: int) -> None:
+    none = [Units(np.zeros(500), np.full(500, 4.0)) for _ in range(3)]
+    few = [Units(np.where(np.arange(500) < lost, 100.0, 0.0), np.full(500, 4.0))] * 3
+    low, high = crossed_interval(few)
+    assert high > crossed_interval(none)[1]
+    mean = 100 * lost / (4 * 500)
+    assert low <= mean - (crossed_interval(none)[1]) / 4 and high >= mean
+
+
+@pytest.mark.parametrize("share", (0.001, 0.004, 0.008))
+def test_rare_losses_that_all_seeds_share_are_within_the_interval(share: float) -> None:
+    rng = np.random.default_rng(0)
+    truth, tries = 100 * share / 4, 200
+    found = [crossed_interval(rare(rng, share, 500, 3)) for _ in range(tries)]
+    assert sum(low <= truth <= high for low, high in found) / tries >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("lost", "as_few"), [(3, True), (FEW - 1, True), (FEW, False), (60, False)]
+)
+def test_of_many_losses_the_resamples_alone_tell(
+    lost: int, as_few: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.where(np.arange(500) < lost, 100.0, 0.0)
+    seeds = [Units(values, np.full(500, 4.0))] * 3
+    found = crossed_interval(seeds)
+    monkeypatch.setattr(bootstrap, "FEW", 0)
+    assert (crossed_interval(seeds) != found) is as_few
 
 
 def test_other_images_are_no_pair() -> None:
