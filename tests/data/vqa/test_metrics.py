@@ -134,7 +134,7 @@ def test_grade_asks_each_question_of_its_image_once() -> None:
     assert [g.correct for g in rows] == [True, False, True, True, False]  # half an answer is wrong
     assert [g.cross_entropy for g in rows] == [2, 3, 4, 5, 6]
     assert score(rows).cross_entropy == 4 and math.isclose(score(rows).accuracy, 0.6)
-    assert [(e.done, e.total) for e in events] == [(2, 5), (4, 5), (5, 5)]
+    assert [(e.done, e.total) for e in events] == [(0, 5), (2, 5), (4, 5), (5, 5)]
 
 
 # --- answers by people ---------------------------------------------------------------------------
