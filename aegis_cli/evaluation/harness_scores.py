@@ -9,8 +9,8 @@ two averages apart.
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
+import sys
 import textwrap
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -217,18 +217,20 @@ def _add(log: _Log, number: int, line: bytes) -> None:
 
 def _metrics(row: Mapping[str, Any]) -> Iterator[tuple[str, float | None]]:
     """The names of a line's metrics, with the filter that an answer went through, and values."""
-    names = row.get("metrics") or [key for key in row if key not in _NO_METRIC]
+    named = row.get("metrics")
+    names = named if isinstance(named, list) else [key for key in row if key not in _NO_METRIC]
     chosen = row.get("filter")
     suffix = "" if chosen in (None, "none") else f", {chosen}"
     for name in names:
-        yield f"{name}{suffix}", _number(row.get(name))
+        yield f"{name}{suffix}", _number(row.get(str(name)))
 
 
 def _number(value: Any) -> float | None:
     """A metric's value for one question, or what a task that sums up by itself has noted of it."""
     if isinstance(value, dict):
         value = next((value[name] for name in _NOTED if name in value), None)
-    if not isinstance(value, int | float) or not math.isfinite(value):
+    # A whole number may be too large for a float, and is no share then.
+    if not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         return None
     return float(value)
 
@@ -241,7 +243,10 @@ def _falling(path: Path) -> frozenset[str]:
     for shape in _RESULTS:
         beside = path.with_name(shape.format(date=date))
         if beside.is_file():
-            rising = (files.load_json(beside).get("higher_is_better") or {}).get(task) or {}
+            found = files.load_json(beside)
+            for key in ("higher_is_better", task):
+                found = found.get(key) if isinstance(found, dict) else None
+            rising = found if isinstance(found, dict) else {}
             return frozenset(name for name, is_so in rising.items() if is_so is False)
     return frozenset()
 

@@ -148,6 +148,7 @@ def test_what_a_task_notes_of_each_question_is_its_score(tmp_path: Path, key: st
     [
         ([{"answer": "A"}, {"answer": "B"}], "not one number a question"),
         ([float("nan"), 1.0], "not one number a question"),
+        ([10**400, 1.0], "not one number a question"),
         ([0.0, 7.0], "from 0 to 7, which are no shares"),
     ],
 )
@@ -169,6 +170,26 @@ def test_a_metric_of_which_less_is_better_is_left_out(tmp_path: Path) -> None:
     report = harness_scores.run(tmp_path / "a", tmp_path / "b", on_event=events.append)
     assert [score.metric for score in report.scores] == ["exact_match"]
     assert "wer is left out: less of it is better" in heard(events)
+
+
+@pytest.mark.parametrize("beside", ([1], {"higher_is_better": 3}, {"higher_is_better": {"t": []}}))
+def test_results_that_do_not_say_what_is_better_leave_the_scores(
+    tmp_path: Path, beside: Any
+) -> None:
+    for name in ("a", "b"):
+        path = lmms(tmp_path / name, "t", rows_of({"exact_match": [1.0]}))
+        path.with_name(f"{DATE}_results.json").write_text(json.dumps(beside))
+    assert len(harness_scores.run(tmp_path / "a", tmp_path / "b").scores) == 1
+
+
+@pytest.mark.parametrize("named", (5, [], [["exact_match"]]))
+def test_a_line_whose_list_of_metrics_is_damaged_is_no_defect(tmp_path: Path, named: Any) -> None:
+    for name in ("a", "b"):
+        lmms(tmp_path / name, "t", [{**rows_of({"exact_match": [1.0]})[0], "metrics": named}])
+    if named == 5:  # then the line's own keys tell
+        assert len(harness_scores.run(tmp_path / "a", tmp_path / "b").scores) == 1
+    else:
+        assert "no score of one question" in refused(tmp_path / "a", tmp_path / "b")
 
 
 def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, Path]) -> None:
