@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from samples.interrupted import at_each, stop
 from samples.robots import STEPS, Make
 from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
 from samples.training_runs import contents
@@ -20,7 +21,6 @@ from samples.vqa_files import write_jsonl
 from aegis_cli import inspection
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import Progress
 from aegis_cli.continual import files, loop, probe, robots, state, train
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.continual.robots import RobotEvaluator, RobotStreamRun
@@ -451,62 +451,54 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
 # --- interrupted ----------------------------------------------------------------------------------
 
 
-def stop(stage: str, at: int, event: Progress) -> None:
-    if event.stage == stage and event.done >= at:
-        raise KeyboardInterrupt
-
-
 ONE, TWO = "task 1 reach", "task 2 point"
+PLACES = {
+    # In phase 1 and 2 of either task, while the first is tried, and after each.
+    "igsp": (
+        (ONE, 1),
+        (ONE, 5),
+        ("rollout seen reach", 1),
+        ("stream", 1),
+        (TWO, 2),
+        (TWO, 5),
+        ("stream", 2),
+    ),
+    "sequential": ((ONE, 5), ("stream", 1)),
+    "isolated-lora": ((TWO, 5),),
+}
 
 
-@pytest.mark.parametrize(
-    ("method", "stage", "at"),
-    [
-        ("igsp", ONE, 1),
-        ("igsp", ONE, 5),
-        ("igsp", "rollout seen reach", 1),
-        ("igsp", "stream", 1),
-        ("igsp", TWO, 2),
-        ("igsp", TWO, 5),
-        ("igsp", "stream", 2),
-        ("sequential", ONE, 5),
-        ("sequential", "stream", 1),
-        ("isolated-lora", TWO, 5),
-    ],
-)
-def test_resumed_anywhere_it_ends_in_the_same_bytes(
-    method: str, stage: str, at: int, make: Make, done: Done, tmp_path: Path
+@pytest.mark.parametrize("method", PLACES)
+def test_interrupted_anywhere_and_resumed_it_ends_in_the_same_bytes(
+    method: str, make: Make, done: Done, tmp_path: Path
 ) -> None:
-    """The cuts are in phase 1 and 2 of either task, at its end, while it is tried, and after it."""
-    with pytest.raises(KeyboardInterrupt):
-        train.run(make(method), tmp_path / "run", on_event=partial(stop, stage, at))
-    if (stage, at) == ("stream", 1):  # a task that has been learned and tried is not done again
-        saved = artifacts.read_header(tmp_path / "run" / state.STATE).meta["place"]
-        assert (saved["task"], saved["step"], len(saved["records"]), len(saved["vqa"])) == (
-            1,
-            0,
-            1,
-            2,
-        )
-        so_far, whole = (
-            json.loads((o / "success_matrix.json").read_text())
-            for o in (tmp_path / "run", done(method)[1])
-        )
-        for name, count in (("tasks", 1), ("success", 1), ("vqa", 2)):
-            assert so_far[name] == whole[name][:count] and len(whole[name]) == count + 1
-        assert so_far["scores"]["last"] == whole["success"][0][0]
-        with pytest.raises(AegisError, match="not learned to its end"):
-            inspection.run(tmp_path / "run")
-    torch.manual_seed(99)
-    report = train.run(make(method), tmp_path / "run", resume=True)
+    begin = partial(train.run, make(method), tmp_path / "run")
+    for place in at_each(PLACES[method], begin):
+        if place == ("stream", 1):
+            assert_learned_and_tried(tmp_path / "run", done(method)[1])
+    report = begin(resume=True)
     wanted, out = done(method)
     assert contents(tmp_path / "run") == contents(out)
     assert dataclasses.replace(report, minutes=0, out="") == dataclasses.replace(
         wanted, minutes=0, out=""
     )
     assert not (tmp_path / "run" / state.STATE).exists()
-    again = train.run(make(method), tmp_path / "run", resume=True)
+    again = begin(resume=True)
     assert again.success == report.success and contents(tmp_path / "run") == contents(out)
+
+
+def assert_learned_and_tried(cut: Path, whole: Path) -> None:
+    """The first task of an interrupted stream, which is not done again."""
+    saved = artifacts.read_header(cut / state.STATE).meta["place"]
+    assert (saved["task"], saved["step"]) == (1, 0)
+    assert (len(saved["records"]), len(saved["vqa"])) == (1, 2)
+    matrix = "success_matrix.json"
+    so_far, all_of_it = (json.loads((folder / matrix).read_text()) for folder in (cut, whole))
+    for name, count in (("tasks", 1), ("success", 1), ("vqa", 2)):
+        assert so_far[name] == all_of_it[name][:count] and len(all_of_it[name]) == count + 1
+    assert so_far["scores"]["last"] == all_of_it["success"][0][0]
+    with pytest.raises(AegisError, match="not learned to its end"):
+        inspection.run(cut)
 
 
 def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:

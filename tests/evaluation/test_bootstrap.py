@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -78,28 +79,33 @@ def test_names_that_no_seeds_share_are_those_of_draws_of_their_own() -> None:
     assert widths[0] == pytest.approx(widths[1], rel=0.15)
 
 
-def rare(rng: np.random.Generator, share: float, images: int, seeds: int) -> list[Units]:
-    """Seeds that lose one of four questions about the same few images, each with this share."""
-    lost = (rng.random(images) < share).astype(float)
-    return [Units(100 * lost, np.full(images, 4.0)) for _ in range(seeds)]
+@cache
+def interval_of_shared_losses(lost: int) -> tuple[float, float]:
+    """Three seeds lose one of four questions about each of the same `lost` images of 500."""
+    values = np.where(np.arange(500) < lost, 100.0, 0.0)
+    found = crossed_interval([Units(values, np.full(500, 4.0))] * 3)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("lost", range(1, 10))
 def test_few_losses_are_told_no_more_sharply_than_none(lost: int) -> None:
-    none = [Units(np.zeros(500), np.full(500, 4.0)) for _ in range(3)]
-    few = [Units(np.where(np.arange(500) < lost, 100.0, 0.0), np.full(500, 4.0))] * 3
-    low, high = crossed_interval(few)
-    assert high > crossed_interval(none)[1]
+    low, high = interval_of_shared_losses(lost)
+    none = interval_of_shared_losses(0)[1]
+    assert high > none
     mean = 100 * lost / (4 * 500)
-    assert low <= mean - (crossed_interval(none)[1]) / 4 and high >= mean
+    assert low <= mean - none / 4 and high >= mean
 
 
 @pytest.mark.parametrize("share", (0.001, 0.004, 0.008))
 def test_rare_losses_that_all_seeds_share_are_within_the_interval(share: float) -> None:
-    rng = np.random.default_rng(0)
-    truth, tries = 100 * share / 4, 200
-    found = [crossed_interval(rare(rng, share, 500, 3)) for _ in range(tries)]
-    assert sum(low <= truth <= high for low, high in found) / tries >= 0.95
+    """Summed over how many of 500 images are lost, which is binomial."""
+    within = 0.0
+    for lost in range(20):
+        low, high = interval_of_shared_losses(lost)
+        if low <= 100 * share / 4 <= high:
+            within += math.comb(500, lost) * share**lost * (1 - share) ** (500 - lost)
+    assert within >= 0.95
 
 
 @pytest.mark.parametrize(
