@@ -236,7 +236,7 @@ class Enough(Exception):
     """Ends a training that was only to be resumed."""
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_leaves_a_run_that_goes_on(place: Path, number: signal.Signals) -> None:
     args = (*TRAIN, "--set", "train.steps=1000000", "--set", "train.checkpoint_every=3")
     err = interrupted(
@@ -292,28 +292,28 @@ def working(_: int, said: str) -> bool:
     return "demos: " in said or "render: " in said
 
 
-@pytest.mark.parametrize("moment", [starting, working])
+RECORDING = ("demos", "point", "--episodes", "9999", "--out", "d.safetensors")
+DRAWING = ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", "empty")
+
+
 @pytest.mark.parametrize(
-    "command",
+    ("command", "moment", "number"),
     [
-        ("demos", "point", "--episodes", "9999", "--out", "d.safetensors"),
-        ("pretrain", "vlm.yaml", "--set", "scenes=9999", "--out", "empty"),
+        (RECORDING, starting, signal.SIGINT),
+        (DRAWING, working, signal.SIGINT),
+        (RECORDING, working, signal.SIGTERM),
     ],
 )
-def test_ctrl_c_with_worker_processes(
-    command: tuple[str, ...], moment: Callable[[int, str], bool], place: Path
+def test_a_signal_ends_worker_processes_too(
+    command: tuple[str, ...],
+    moment: Callable[[int, str], bool],
+    number: signal.Signals,
+    place: Path,
 ) -> None:
     """None of them prints a traceback of its own, and no output is begun."""
     (place / "empty").mkdir()
     before = snapshot(place)
-    interrupted(place, command, moment)
-    assert snapshot(place) == before
-
-
-def test_sigterm_ends_worker_processes_too(place: Path) -> None:
-    before = snapshot(place)
-    command = ("demos", "point", "--episodes", "9999", "--out", "d.safetensors")
-    interrupted(place, command, working, signal.SIGTERM)
+    interrupted(place, command, moment, number)
     assert snapshot(place) == before
 
 
@@ -344,10 +344,16 @@ def output_of(*command: str, **environment: str) -> str:
     return done.stdout.decode(environment.get("PYTHONIOENCODING", "utf-8"))
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_an_output_without_our_characters_gets_plain_ones(trained: Path, encoding: str) -> None:
-    shown = output_of("inspect", str(trained), PYTHONIOENCODING=encoding)
+@pytest.mark.parametrize(("encoding", "columns"), [("ascii", 60), ("latin-1", 100)])
+def test_a_pipe_gets_the_characters_that_it_knows_in_lines_as_wide_as_columns_says(
+    trained: Path, encoding: str, columns: int
+) -> None:
+    """Without blanks at the lines' ends."""
+    shown = output_of("inspect", str(trained), PYTHONIOENCODING=encoding, COLUMNS=str(columns))
     assert "Energy" in shown and "─" not in shown
+    lines = shown.splitlines()
+    assert max(map(len, lines)) <= columns
+    assert [line for line in lines if line != line.rstrip()] == []
 
 
 def test_characters_that_an_encoding_has_not_got_are_written_plainly() -> None:
@@ -358,14 +364,5 @@ def test_characters_that_an_encoding_has_not_got_are_written_plainly() -> None:
     assert raw.getvalue().decode("ascii") == "W2^2 1.5 +-0.2, ?\n"
 
 
-@pytest.mark.parametrize("columns", ["60", "100"])
-def test_a_pipe_is_as_wide_as_columns_says_and_lines_have_no_blanks_at_their_ends(
-    columns: str, trained: Path
-) -> None:
-    lines = output_of("inspect", str(trained), COLUMNS=columns).splitlines()
-    assert max(map(len, lines)) <= int(columns)
-    assert [line for line in lines if line != line.rstrip()] == []
-
-
-def test_h_asks_for_help_as_help_does() -> None:
-    assert output_of("probe", "-h") == output_of("probe", "--help")
+def test_h_asks_for_help_as_help_does(aegis: Callable[..., tuple[int, str, str]]) -> None:
+    assert aegis("probe", "-h") == aegis("probe", "--help")

@@ -120,41 +120,30 @@ def test_a_library_without_a_driver_is_found_by_trying(monkeypatch: pytest.Monke
     assert "libegl-mesa0" in caught.value.fix and "ulimit -v" in caught.value.fix
 
 
-WITHOUT = (
-    "import ctypes.util, sys; ctypes.util.find_library = lambda name: None; from "
-    "aegis_cli.cli.app import app; app(sys.argv[1:])"
-)
-
-
 @pytest.mark.parametrize(
-    ("code", "args", "setting", "words"),
+    ("args", "setting", "words"),
     [
-        (WITHOUT, ("demos", "reach", "--out", "d"), "", "sudo apt-get install libegl1"),
-        (
-            WITHOUT,
-            ("run", str(ROOT / "recipes" / "quickstart.yaml")),
-            "",
-            "sudo apt-get install libegl1",
-        ),
-        (
-            "from aegis_cli.cli.app import main; main()",
-            ("anchor", "--out", "a"),
-            "elg",
-            "MUJOCO_GL=elg",
-        ),
+        (("demos", "reach", "--out", "d"), "", "sudo apt-get install libegl1"),
+        (("run", str(ROOT / "recipes" / "quickstart.yaml")), "", "sudo apt-get install libegl1"),
+        (("anchor", "--out", "a"), "elg", "MUJOCO_GL=elg"),
     ],
 )
 def test_the_command_says_so_before_any_work(
-    code: str, args: tuple[str, ...], setting: str, words: str, tmp_path: Path
+    args: tuple[str, ...],
+    setting: str,
+    words: str,
+    aegis: Callable[..., tuple[int, str, str]],
+    machine: Callable[..., None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    command = [sys.executable, "-c", code, *args]
-    environment = finding(ROOT) | {"MUJOCO_GL": setting}
-    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert (result.returncode, result.stdout) == (2, ""), result.stderr
-    assert words in result.stderr and "Traceback" not in result.stderr
-    assert not re.search(r"^\w+: \d", result.stderr, re.MULTILINE) and not list(
-        tmp_path.iterdir()
-    )  # no progress, no file
+    machine(setting=setting)
+    monkeypatch.chdir(tmp_path)
+    code, out, err = aegis(*args)
+    assert (code, out) == (2, ""), err
+    assert words in err and "Traceback" not in err
+    # No progress, and no file.
+    assert not re.search(r"^\w+: \d", err, re.MULTILINE) and not list(tmp_path.iterdir())
 
 
 def test_triton_comes_before_the_renderer(tmp_path: Path) -> None:

@@ -103,9 +103,9 @@ def moved(anchors: dict[str, Path]) -> str:
         return str(error)
 
 
-def _apart(made: Callable[[str | None], Tensor], place: str) -> float | str:
+def _apart(made: Callable[[str | None], Tensor], whole: Tensor, place: str) -> float | str:
     try:
-        return float((made(None) - made(place)).abs().max())
+        return float((whole - made(place)).abs().max())
     except Exception:
         return traceback.format_exc()[-2000:]
 
@@ -120,8 +120,9 @@ def main(folder: Path) -> None:
         }
         made["measure"] = lambda place: anchor(folder, place)
         made["masters"] = masters
+        on_one = {name: do(None) for name, do in made.items()}
         for place in PLACES:
-            found[place] = {name: _apart(do, place) for name, do in made.items()}
+            found[place] = {name: _apart(do, on_one[name], place) for name, do in made.items()}
         found["moved"] = {"said": moved(anchors)}
     print(json.dumps(found))
 
