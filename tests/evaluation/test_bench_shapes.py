@@ -80,6 +80,7 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     assert "peak not known" in shown(found) and "CPU seconds" in shown(found)
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_on_a_cpu_each_measurement_has_a_process_of_its_own() -> None:
     with bench_shapes._Processes() as processes:
         found = {processes.run(os.getpid), processes.run(os.getpid), os.getpid()}

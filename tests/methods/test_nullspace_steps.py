@@ -27,7 +27,7 @@ from aegis_cli.methods.base import Method, MethodContext, Parts, Update
 
 pytestmark = pytest.mark.usefixtures("fixed_draws")
 
-STEPS = 50
+STEPS = 20
 
 
 OPTIMIZERS: dict[str, tuple[Callable[[list[nn.Parameter]], torch.optim.Optimizer], float]] = {
