@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.vqa.entries import Entry, Read, Reader, make_question
+from aegis_cli.data.vqa.entries import Entry, Reader, make_question
 from aegis_cli.data.vqa.images import Picture
 
 NAME = "easy-vqa"
@@ -38,10 +38,15 @@ def reader() -> Reader:
         raise AegisError(f"{NAME} {found}", f"version {VERSION}", fix)
     folder = Path(easy_vqa.__file__).parent / "data"
     files = tuple(folder / split / "questions.json" for split in ("train", "test"))
-    return Reader(_read, files)
+    return Reader(lambda: iter(_entries()), files)
 
 
-def _read() -> Iterator[Read]:
+@cache  # reading them takes seconds, and a training is probed several times
+def _entries() -> tuple[Entry, ...]:
+    return tuple(_read())
+
+
+def _read() -> Iterator[Entry]:
     import easy_vqa
 
     sources = {
