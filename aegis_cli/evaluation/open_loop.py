@@ -7,7 +7,7 @@ that is not simulated it is the figure there is. It does not say how often the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
 
 TRACED = 3  # episodes that a plot shows
@@ -150,7 +151,7 @@ class OpenLoopReport:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     data: Path,
     episodes: Sequence[int] | None = None,
     frames: int = 1000,
@@ -164,7 +165,7 @@ def run(
     """Compare a run's predictions with demonstrations, frame by frame.
 
     Args:
-        run: the run of one policy, one of its checkpoints, an exported policy, or the id of a
+        run_path: the run of one policy, one of its checkpoints, an exported policy, or the id of a
             policy on the hub.
         data: demonstrations, a file or a LeRobot folder.
         episodes: numbers from 0; None: the run's validation episodes where it was trained on this
@@ -181,8 +182,8 @@ def run(
         AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
             be told from those that it was trained on.
     """
-    run, data = Path(run), Path(data)
-    source = _Source.find(run)
+    run_path, data = Path(run_path), Path(data)
+    source = _Source.find(run_path)
     policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
@@ -207,7 +208,7 @@ def run(
         asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
         asked |= {"rename": dict(rename)} if rename else {}
         name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
-        results.keep_if_possible(run, name, report.kept(), asked, on_event)
+        results.keep_if_possible(run_path, name, report.kept(), asked, on_event)
     return report
 
 
@@ -281,7 +282,7 @@ class _Source:
         places = frozenset(Path(place).resolve() for place in kept.demos) if kept else frozenset()
         return cls(name, chosen, recipe, mixture.digests(header.inputs), places)
 
-    def selection(self, meta: Mapping[str, Any], data: Path, rename: Renaming = ()) -> Selection:
+    def selection(self, meta: PolicyMeta, data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
 
         Args:
@@ -301,7 +302,7 @@ class _Source:
         return Selection(camera, **known)
 
     def _camera(
-        self, meta: Mapping[str, Any], data: Path, rename: Renaming
+        self, meta: PolicyMeta, data: Path, rename: Renaming
     ) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
         own = layout.read_info(data).cameras
@@ -401,7 +402,7 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
 
 
 def _check_robot(
-    policy: Policy, meta: Mapping[str, Any], data: Path, learned: Selection, on_event: OnEvent
+    policy: Policy, meta: PolicyMeta, data: Path, learned: Selection, on_event: OnEvent
 ) -> None:
     """Compare the robot with the policy's, before anything is decoded, which may take hours.
 
@@ -414,7 +415,7 @@ def _check_robot(
     _check_rate(robot, meta, data, on_event)
 
 
-def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path) -> None:
+def _check_fit(policy: Policy, robot: Robot, meta: PolicyMeta, data: Path) -> None:
     """Raise AegisError for demonstrations of another robot or other cameras."""
     own, found = (len(policy.proprio_scale.mean), len(policy.action_scale.mean)), robot.sizes
     if own != found:
@@ -435,7 +436,7 @@ def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path
 
 def _shown(
     policy: Policy,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     data: Path,
     learned: Selection,
     chosen: _Chosen,
@@ -452,7 +453,7 @@ def _shown(
     return shown
 
 
-def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any]) -> Demonstrations:
+def _as_deployed(policy: Policy, shown: Demonstrations, meta: PolicyMeta) -> Demonstrations:
     """The demonstrations, each camera's frames in the size in which a robot's are shown.
 
     A policy knows pictures of the sizes of its training; those of another camera are fitted to
@@ -463,7 +464,7 @@ def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any])
     return shown.fitted(sizes) if sizes else shown
 
 
-def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
+def _check_names(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
     """Compare the joints' names with the policy's, where both have them; other names are warned of.
 
     Raises:
@@ -485,7 +486,7 @@ def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: On
         on_event(Warned("evaluate", text))
 
 
-def _check_rate(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
+def _check_rate(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
     """Warn of another control rate than the policy's, whose steps have another length."""
     own = meta.get("fps")
     if own is not None and robot.fps is not None and own != robot.fps:
@@ -529,7 +530,7 @@ def _predict(
 
 def _traces(
     policy: Policy,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     shown: Demonstrations,
     chosen: _Chosen,
     seed: int,
@@ -598,7 +599,7 @@ def compare(
     )
 
 
-def _training_std(policy: Policy, meta: Mapping[str, Any], on_event: OnEvent) -> np.ndarray:
+def _training_std(policy: Policy, meta: PolicyMeta, on_event: OnEvent) -> np.ndarray:
     """Each action's standard deviation [A] over the frames that the policy was trained on.
 
     It is the policy's scale, unless that is one of relative actions or of quantiles. Checkpoints of

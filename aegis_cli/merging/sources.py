@@ -33,7 +33,7 @@ from aegis_cli.methods import ledger_file
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import STORED_TYPES, Backbone
-from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import checkpoint, loading, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training import inputs as places
 
@@ -183,7 +183,7 @@ class PolicyRun:
         """The demonstrations that the policy was trained on, split as they were then."""
         wanted = self._header.inputs["demos"]
         paths = self._settings.demos or self._find_demos(wanted)
-        found = assemble.load_demonstrations(self._recipe, self.base, paths, self._on_event)
+        found = loading.load_demonstrations(self._recipe, self.base, paths, self._on_event)
         if found.sha256 != wanted:
             raise AegisError(
                 f"other demonstrations in {mixture.said(paths)} than those of the run "
