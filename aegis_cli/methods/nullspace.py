@@ -129,9 +129,8 @@ def _grouped(
         return len(protection.factor) if isinstance(protection, Dense) else 0
 
     def alone(site: str) -> bool:
-        return isinstance(
-            protections[site], TableRows
-        )  # each table has rows of its own that are read
+        # Each table has rows of its own that are read.
+        return isinstance(protections[site], TableRows)
 
     pairs = {site: weights(backbone, site) for site in protections}
     groups = []
