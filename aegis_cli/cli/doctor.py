@@ -66,7 +66,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
     """Look at the installation, the machine and the disk, and run a job in miniature.
 
     Args:
-        self_test: with the job, which takes about ten seconds.
+        self_test: with the job, which takes half a minute or more.
     """
     checks = [
         Check("aegis", OK, __version__),

@@ -562,15 +562,15 @@ def _trace(
 
 
 def compare(
-    shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor, spread: np.ndarray
+    shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor, training_std: np.ndarray
 ) -> OpenLoopReport:
     """The errors of chunks [N, H, A] that were predicted at frames [N].
 
     Steps past an episode's end do not count.
 
     Args:
-        spread: [A], the standard deviations in training that errors are relative to; 0 of an action
-            that never varied there.
+        training_std: [A], the standard deviations that errors are relative to; 0 of an action that
+            never varied there.
     """
     actions, is_pad = shown.chunks(at, predicted.shape[1])
     recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
@@ -578,8 +578,8 @@ def compare(
     hold = None
     if _are_positions(shown):
         hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
-    relative = _relative(error, spread)
-    held = None if hold is None else _relative(hold, spread)
+    relative = _relative(error, training_std)
+    held = None if hold is None else _relative(hold, training_std)
     episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
     interval = None if relative is None else _interval(relative[valid], episode_of)
     return OpenLoopReport(
@@ -593,7 +593,7 @@ def compare(
         relative_error=_mean(relative, valid),
         relative_interval=interval,
         hold_error=_mean(held, valid),
-        dimensions=_dimensions(shown, recorded, error, hold, valid, spread),
+        dimensions=_dimensions(shown, recorded, error, hold, valid, training_std),
         horizon=_horizon(relative, held, valid),
         instructions=_instructions(shown, at, relative, held, valid),
     )
@@ -636,12 +636,12 @@ def _are_positions(shown: Demonstrations) -> bool:
     return any(names) and names == shown.proprio_names and sizes == {len(names)}
 
 
-def _relative(error: np.ndarray, spread: np.ndarray) -> np.ndarray | None:
+def _relative(error: np.ndarray, training_std: np.ndarray) -> np.ndarray | None:
     """Squared error over the variance [N, H], mean over the dimensions that varied."""
-    varies = spread > 0
+    varies = training_std > 0
     if not varies.any():
         return None
-    return np.square(error[..., varies] / spread[varies]).mean(axis=-1)
+    return np.square(error[..., varies] / training_std[varies]).mean(axis=-1)
 
 
 def _mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
@@ -658,23 +658,23 @@ def _dimensions(
     error: np.ndarray,
     hold: np.ndarray | None,
     valid: np.ndarray,
-    spread: np.ndarray,
+    training_std: np.ndarray,
 ) -> list[DimensionError]:
     unit = None if shown.task is None else FULL_ACTION
     steps = [own for h in range(valid.shape[1]) if (own := valid[:, h]).any()]
     found = []
     for d, name in enumerate(action_names(shown)):
-        own, by_step = error[..., d][valid], error[..., d]
+        own, by_step, std = error[..., d][valid], error[..., d], float(training_std[d])
         found.append(
             DimensionError(
                 name=name,
                 unit=unit,
                 mae=float(np.abs(own).mean()),
                 rmse=_rmse(own),
-                training_std=float(spread[d]),
+                training_std=std,
                 constant_rmse=float(recorded[..., d][valid].std()),
                 hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
-                relative_error=float(np.square(own / spread[d]).mean()) if spread[d] else None,
+                relative_error=float(np.square(own / std).mean()) if std else None,
                 rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(steps)],
             )
         )

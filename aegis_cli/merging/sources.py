@@ -158,8 +158,8 @@ class PolicyRun:
             # An earlier Aegis did not say on which machine it trained, nor where its inputs lay.
             if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
-        if (inputs := places.of(self._run)) is not None:
-            places.keep(folder, inputs, out)
+        if (kept := places.of(self._run)) is not None:
+            places.keep(folder, kept, out)
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header

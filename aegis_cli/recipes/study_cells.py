@@ -285,8 +285,8 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """Variants that are to be compared with none of the others."""
-    variants = raw.get("variants")
-    named = variants if isinstance(variants, dict) else {}
+    given = raw.get("variants")
+    named = given if isinstance(given, dict) else {}
     found = []
     for name, keys in named.items():
         against = keys.get("against") if isinstance(keys, dict) else None

@@ -716,9 +716,9 @@ class PolicyRunner:
         and None where there is no such set. Holding has an error where it has one in all of them.
         """
         given = self.demos(recipe)
-        sets = [given.path] if isinstance(given.path, Path) else list(given.path)
+        paths = [given.path] if isinstance(given.path, Path) else list(given.path)
         errors, holds = [], []
-        for number, data in enumerate(sets, start=1):
+        for number, data in enumerate(paths, start=1):
             report = self._evaluated(label, recipe, data, given.sha256, number)
             if report["relative_error"] is not None:
                 errors.append(report["relative_error"])
