@@ -54,6 +54,8 @@ class Check:
 
 @dataclass(frozen=True)
 class DoctorReport:
+    """What was looked at, in the order of the table."""
+
     checks: list[Check]
 
     @property

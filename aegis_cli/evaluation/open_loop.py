@@ -270,6 +270,11 @@ class _Source:
 
     @classmethod
     def find(cls, run: Path) -> _Source:
+        """The checkpoint of a run or policy, and what its run, if it lies in one, tells of it.
+
+        Raises:
+            AegisError: no such run, or that of a stream.
+        """
         _refuse_stream(run)
         name, run = str(run), download.locate(run)
         if lerobot_folder.is_policy(run):

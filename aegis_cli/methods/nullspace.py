@@ -90,6 +90,7 @@ class _Group:
     protection: Protection
 
     def pairs(self) -> list[Pair]:
+        """Each site's weight and bias; sharded ones as DTensors."""
         return [weights(self.backbone, site) for site in self.sites]
 
     def here(self) -> list[Pair]:

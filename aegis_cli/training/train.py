@@ -326,6 +326,7 @@ class Window:
         return found
 
     def means(self, batch_size: int) -> dict[str, float]:
+        """A line's figures: means over these steps, and frames per second."""
         step_s = (self.data_s + self.update_s) / self.steps
         return {
             "loss": self.loss / self.steps,

@@ -263,6 +263,7 @@ def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
 
 
 def bench(report: Any) -> RenderableType:
+    """A line per method, and below what an anchor's pass and the guard cost."""
     rows = [
         (name, fixed(ratio, 2), fixed(report.peak_memory[name], 2))
         for name, ratio in report.step_time.items()
@@ -281,6 +282,8 @@ def bench(report: Any) -> RenderableType:
 
 
 def bench_shape(report: Any) -> RenderableType:
+    """A line per method and per part of an anchor, and below what they were measured with."""
+
     def row(name: str, cost: Any) -> tuple[str, ...]:
         if cost.step_s is None:
             return name, "out of memory", *("-",) * 5
