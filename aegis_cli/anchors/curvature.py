@@ -77,11 +77,11 @@ class AnswerEntropy:
 
 @dataclass
 class _Graph:
-    """What of the watched passes' graph a backward pass has to come to.
+    """Where parameters enter the watched passes' graph: a backward pass need go no further.
 
     Attributes:
-        entries: where the outputs of modules are through which parameters enter the graph.
-        lone: parameters that enter it otherwise.
+        entries: at the outputs of modules.
+        lone: parameters that enter it otherwise, themselves.
     """
 
     entries: list[GradientEdge] = field(default_factory=list)

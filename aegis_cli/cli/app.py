@@ -396,10 +396,7 @@ def train(
         raise AegisError("no --out", "a folder for the run", fix)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
-    source = ctx.get_parameter_source("device")  # a class of typer's own click, or of click
-    given_here = source is not None and source.name == "COMMANDLINE"
-    as_they_are = ["--device", str(device)] if given_here else []
-    as_they_are += ["--json"] if as_json else []
+    as_they_are = _kept_options(ctx, device, as_json)
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
         stages.refuse_options(
@@ -430,6 +427,14 @@ def train(
         failed = stage.module.shortage(report) if dry_run else None
         _say_gate(failed)
     _end_at_gate(failed)
+
+
+def _kept_options(ctx: typer.Context, device: str | None, as_json: bool) -> list[str]:
+    """What a command that goes on with the run has of this one, word by word."""
+    source = ctx.get_parameter_source("device")  # a class of typer's own click, or of click
+    given_here = source is not None and source.name == "COMMANDLINE"
+    kept = ["--device", str(device)] if given_here else []
+    return kept + (["--json"] if as_json else [])
 
 
 def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Paths, Recipe]:
@@ -766,12 +771,17 @@ def probe(
         )
         failed = None
         if report.passed is False:
-            dropped = f"a drop of {report.drop_points:.2f} points"
-            if gate is Gate.upper_end:
-                dropped += f", which may be as large as {report.drop_interval[1]:.2f}"
-            failed = f"{dropped}, more than {limit} {max_drop:g}"
+            failed = f"{_dropped(report, gate)}, more than {limit} {max_drop:g}"
         _say_gate(failed)
     _end_at_gate(failed)
+
+
+def _dropped(report: Any, gate: Gate) -> str:
+    """A probe's drop in words, by what of it the gate limits."""
+    said = f"a drop of {report.drop_points:.2f} points"
+    if gate is Gate.upper_end:
+        said += f", which may be as large as {report.drop_interval[1]:.2f}"
+    return said
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
@@ -885,13 +895,9 @@ def scores(
     failed = None
     if report.passed is False:
         lost = [s for s in report.scores if not s.passed]
-        names = ", ".join(f"{s.task} ({s.metric})" for s in lost)
-        limit = f"more than --max-drop {max_drop:g} points"
-        if gate is Gate.upper_end:
-            limit += ", by the upper end of the drop's interval"
-        failed = f"{names} dropped {limit}"
-    _say_gate(failed)
-    _end_at_gate(failed)
+        failing = ", ".join(f"{s.task} ({s.metric})" for s in lost)
+        failed = f"{failing} dropped {_past(f'--max-drop {max_drop:g}', gate)}"
+    _gate(failed)
 
 
 @app.command(short_help="Write a run, job or study as one HTML page.")
@@ -1224,8 +1230,7 @@ def run(
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
     What is up to date is skipped, so the same command also resumes; with --overwrite every stage
-    runs again. Exits 1 if a method drops by
-    more than probe.max_drop.
+    runs again. Exits 1 if a method drops by more than probe.max_drop.
 
     \b
     Example: aegis run recipes/quickstart.yaml
@@ -1246,10 +1251,8 @@ def run(
             _save_tables(resolved, report, stage)
         failed = None
         if one_run and report.gate_failed:
-            limit = f"more than probe.max_drop {resolved.probe.max_drop:g} points"
-            if resolved.probe.gate == Gate.upper_end:
-                limit += ", by the upper end of the drop's interval"
-            failed = f"{', '.join(report.gate_failed)} dropped {limit}"
+            limit, gate = f"probe.max_drop {resolved.probe.max_drop:g}", Gate(resolved.probe.gate)
+            failed = f"{', '.join(report.gate_failed)} dropped {_past(limit, gate)}"
         _say_gate(failed)
     _end_at_gate(failed)
 
@@ -1421,6 +1424,12 @@ def doctor(
     report = stages.DOCTOR.run(not quick, as_json=as_json)
     if report.failed:
         _gate(f"{', '.join(report.failed)} of aegis doctor")
+
+
+def _past(limit: str, gate: Gate) -> str:
+    """By how much something dropped that a gate does not let pass."""
+    of_interval = ", by the upper end of the drop's interval" if gate is Gate.upper_end else ""
+    return f"more than {limit} points{of_interval}"
 
 
 def _gate(failed: str | None) -> None:

@@ -54,6 +54,8 @@ class Check:
 
 @dataclass(frozen=True)
 class DoctorReport:
+    """What was looked at, in the order of the table."""
+
     checks: list[Check]
 
     @property
@@ -66,7 +68,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
     """Look at the installation, the machine and the disk, and run a job in miniature.
 
     Args:
-        self_test: with the job, which takes about ten seconds.
+        self_test: with the job, which takes half a minute or more.
     """
     checks = [
         Check("aegis", OK, __version__),

@@ -26,11 +26,8 @@ from aegis_cli.cli import render
 from aegis_cli.common import interrupts, launch
 from aegis_cli.common.errors import AegisError, PeerLost
 
-_WITH_RESUME = {
-    "train": " --resume",
-    "pretrain": " --resume",
-    "run": "",
-}  # `run` skips what is up to date
+# What a command that goes on needs beside its own words; `run` skips what is up to date.
+_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
 GOES_ON = "aegis.goes_on"  # what finds the words by which a run goes on by itself, or None
 
 
@@ -168,7 +165,10 @@ _UNMAPPED = ("failed to map segment from shared object", "cannot allocate memory
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """The GPU's too, whose class torch has; importing that takes seconds."""
+    """Whether memory was wanting, a GPU's too.
+
+    torch's class for that is known by its name, for importing torch takes seconds.
+    """
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     if isinstance(error, ImportError):

@@ -81,7 +81,7 @@ def verify(path: Path) -> VerifiedReport:
     if bare:
         listed = ", ".join(bare[:_LISTED]) + (" ..." if len(bare) > _LISTED else "")
         render.note(f"{len(bare)} without a digest, written by an earlier Aegis: {listed}")
-    return VerifiedReport("folder", str(path), len(found) - len(bare), len(bare))
+    return VerifiedReport("folder", str(path), agreeing, len(bare))
 
 
 def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:

@@ -191,10 +191,10 @@ def _check_words(model: DualEncoder, task: StreamTask, path: str | None) -> None
     except AegisError as error:
         if path is None:
             raise
-        files = [
+        paths = [
             str(Path(path) / task.name / name) for name in (folders.TEMPLATES, folders.CLASSES)
         ]
-        fix = f"sentences that it knows in '{files[0]}', words for the classes in '{files[1]}'"
+        fix = f"sentences that it knows in '{paths[0]}', words for the classes in '{paths[1]}'"
         raise AegisError(error.found, error.expected, f"{error.fix}; {fix}") from error
 
 

@@ -152,18 +152,7 @@ def shared_moments(
         total: a tensor -> its sum over the processes.
         reads: whether the number of valid tokens may be read, which forces a GPU sync.
     """
-    if reads:
-        rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
-        masks: Sequence[Tensor | None] = [None] * len(rows)
-        here = rows[0].new_tensor(rows[0].shape[1])
-    else:
-        rows, valids = list[Tensor](), list[Tensor]()
-        for layers in _together(hidden):
-            x, valid = _all_rows(layers, mask)
-            rows.append(x.masked_fill(~valid, 0))
-            valids.append(valid)
-        masks = valids
-        here = valids[-1].sum().to(rows[0].dtype)
+    rows, masks, here = _selected(hidden, mask) if reads else _zeroed(hidden, mask)
     count = total(here)
     means = total(torch.cat([x.sum(1) for x in rows])) / count  # [L, D]
     squares = []
@@ -175,6 +164,26 @@ def shared_moments(
             deviations = deviations.masked_fill(~valid, 0)
         squares.append(deviations.square().sum(1))
     return list(zip(means, total(torch.cat(squares)) / count, strict=True))
+
+
+# The rows of some layers [n, rows, D], which of them are valid [rows, 1] (None: all), and how many.
+_Share = tuple[list[Tensor], Sequence[Tensor | None], Tensor]
+
+
+def _selected(hidden: Sequence[Tensor], mask: Tensor) -> _Share:
+    """The valid rows alone, of one layer after the other."""
+    rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
+    return rows, [None] * len(rows), rows[0].new_tensor(rows[0].shape[1])
+
+
+def _zeroed(hidden: Sequence[Tensor], mask: Tensor) -> _Share:
+    """All rows, with zeros in the place of those that are not valid; nothing is read."""
+    rows, valids = list[Tensor](), list[Tensor]()
+    for layers in _together(hidden):
+        x, valid = _all_rows(layers, mask)
+        rows.append(x.masked_fill(~valid, 0))
+        valids.append(valid)
+    return rows, valids, valids[-1].sum().to(rows[0].dtype)
 
 
 def _together(hidden: Sequence[Tensor]) -> list[Tensor]:

@@ -60,18 +60,14 @@ class Dense:
     rest: float | Tensor = 0.0
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        protected, shifted = self._back(
-            self._along(weight, bias) * (self.factor - self.rest)[..., None, :], weight, bias
-        )
-        rest = self.rest
-        if isinstance(rest, Tensor):
-            protected = protected + rest[..., None] * weight
+        # D A = r D + D U (f - r) U^T
+        along = self._along(weight, bias) * (self.factor - self.rest)[..., None, :]
+        protected, shifted = self._back(along, weight, bias)
+        if isinstance(self.rest, Tensor) or self.rest:
+            of_weight = self.rest[..., None] if isinstance(self.rest, Tensor) else self.rest
+            protected = protected + of_weight * weight
             if bias is not None and shifted is not None:
-                shifted = shifted + rest * bias
-        elif rest:
-            protected = protected + rest * weight
-            if bias is not None and shifted is not None:
-                shifted = shifted + rest * bias
+                shifted = shifted + self.rest * bias
         return protected, shifted
 
     def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:

@@ -150,12 +150,12 @@ def compare(
         for task in {recipe.task for recipe in recipes.values()}:
             bench_runs.save_demos(out, task)
         naive_s, ratios = _step_times(recipes, anchor, out, repeats, on_event)
-        memory: dict[str, int] = {}
+        peaks: dict[str, int] = {}
         for done, (name, recipe) in enumerate(recipes.items(), start=1):
-            memory[name] = in_new_process(peak_memory, recipe, anchor, out)
+            peaks[name] = in_new_process(peak_memory, recipe, anchor, out)
             on_event(Progress("bench memory", done, len(recipes), "processes"))
     return {
-        name: Cost(ratio, memory[name] / memory[NAIVE], ratio * naive_s)
+        name: Cost(ratio, peaks[name] / peaks[NAIVE], ratio * naive_s)
         for name, ratio in ratios.items()
     }
 

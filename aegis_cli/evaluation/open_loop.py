@@ -7,7 +7,7 @@ that is not simulated it is the figure there is. It does not say how often the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
 
 TRACED = 3  # episodes that a plot shows
@@ -150,7 +151,7 @@ class OpenLoopReport:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     data: Path,
     episodes: Sequence[int] | None = None,
     frames: int = 1000,
@@ -164,7 +165,7 @@ def run(
     """Compare a run's predictions with demonstrations, frame by frame.
 
     Args:
-        run: the run of one policy, one of its checkpoints, an exported policy, or the id of a
+        run_path: the run of one policy, one of its checkpoints, an exported policy, or the id of a
             policy on the hub.
         data: demonstrations, a file or a LeRobot folder.
         episodes: numbers from 0; None: the run's validation episodes where it was trained on this
@@ -181,8 +182,8 @@ def run(
         AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
             be told from those that it was trained on.
     """
-    run, data = Path(run), Path(data)
-    source = _Source.find(run)
+    run_path, data = Path(run_path), Path(data)
+    source = _Source.find(run_path)
     policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
@@ -207,7 +208,7 @@ def run(
         asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
         asked |= {"rename": dict(rename)} if rename else {}
         name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
-        results.keep_if_possible(run, name, report.kept(), asked, on_event)
+        results.keep_if_possible(run_path, name, report.kept(), asked, on_event)
     return report
 
 
@@ -269,6 +270,11 @@ class _Source:
 
     @classmethod
     def find(cls, run: Path) -> _Source:
+        """The checkpoint of a run or policy, and what its run, if it lies in one, tells of it.
+
+        Raises:
+            AegisError: no such run, or that of a stream.
+        """
         _refuse_stream(run)
         name, run = str(run), download.locate(run)
         if lerobot_folder.is_policy(run):
@@ -281,7 +287,7 @@ class _Source:
         places = frozenset(Path(place).resolve() for place in kept.demos) if kept else frozenset()
         return cls(name, chosen, recipe, mixture.digests(header.inputs), places)
 
-    def selection(self, meta: Mapping[str, Any], data: Path, rename: Renaming = ()) -> Selection:
+    def selection(self, meta: PolicyMeta, data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
 
         Args:
@@ -301,7 +307,7 @@ class _Source:
         return Selection(camera, **known)
 
     def _camera(
-        self, meta: Mapping[str, Any], data: Path, rename: Renaming
+        self, meta: PolicyMeta, data: Path, rename: Renaming
     ) -> str | tuple[str, ...] | None:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
         own = layout.read_info(data).cameras
@@ -401,7 +407,7 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
 
 
 def _check_robot(
-    policy: Policy, meta: Mapping[str, Any], data: Path, learned: Selection, on_event: OnEvent
+    policy: Policy, meta: PolicyMeta, data: Path, learned: Selection, on_event: OnEvent
 ) -> None:
     """Compare the robot with the policy's, before anything is decoded, which may take hours.
 
@@ -414,7 +420,7 @@ def _check_robot(
     _check_rate(robot, meta, data, on_event)
 
 
-def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path) -> None:
+def _check_fit(policy: Policy, robot: Robot, meta: PolicyMeta, data: Path) -> None:
     """Raise AegisError for demonstrations of another robot or other cameras."""
     own, found = (len(policy.proprio_scale.mean), len(policy.action_scale.mean)), robot.sizes
     if own != found:
@@ -435,7 +441,7 @@ def _check_fit(policy: Policy, robot: Robot, meta: Mapping[str, Any], data: Path
 
 def _shown(
     policy: Policy,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     data: Path,
     learned: Selection,
     chosen: _Chosen,
@@ -452,7 +458,7 @@ def _shown(
     return shown
 
 
-def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any]) -> Demonstrations:
+def _as_deployed(policy: Policy, shown: Demonstrations, meta: PolicyMeta) -> Demonstrations:
     """The demonstrations, each camera's frames in the size in which a robot's are shown.
 
     A policy knows pictures of the sizes of its training; those of another camera are fitted to
@@ -463,7 +469,7 @@ def _as_deployed(policy: Policy, shown: Demonstrations, meta: Mapping[str, Any])
     return shown.fitted(sizes) if sizes else shown
 
 
-def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
+def _check_names(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
     """Compare the joints' names with the policy's, where both have them; other names are warned of.
 
     Raises:
@@ -485,7 +491,7 @@ def _check_names(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: On
         on_event(Warned("evaluate", text))
 
 
-def _check_rate(robot: Robot, meta: Mapping[str, Any], data: Path, on_event: OnEvent) -> None:
+def _check_rate(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
     """Warn of another control rate than the policy's, whose steps have another length."""
     own = meta.get("fps")
     if own is not None and robot.fps is not None and own != robot.fps:
@@ -529,7 +535,7 @@ def _predict(
 
 def _traces(
     policy: Policy,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     shown: Demonstrations,
     chosen: _Chosen,
     seed: int,
@@ -561,15 +567,15 @@ def _trace(
 
 
 def compare(
-    shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor, spread: np.ndarray
+    shown: Demonstrations, at: torch.Tensor, predicted: torch.Tensor, training_std: np.ndarray
 ) -> OpenLoopReport:
     """The errors of chunks [N, H, A] that were predicted at frames [N].
 
     Steps past an episode's end do not count.
 
     Args:
-        spread: [A], the standard deviations in training that errors are relative to; 0 of an action
-            that never varied there.
+        training_std: [A], the standard deviations that errors are relative to; 0 of an action that
+            never varied there.
     """
     actions, is_pad = shown.chunks(at, predicted.shape[1])
     recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
@@ -577,8 +583,8 @@ def compare(
     hold = None
     if _are_positions(shown):
         hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
-    relative = _relative(error, spread)
-    held = None if hold is None else _relative(hold, spread)
+    relative = _relative(error, training_std)
+    held = None if hold is None else _relative(hold, training_std)
     episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
     interval = None if relative is None else _interval(relative[valid], episode_of)
     return OpenLoopReport(
@@ -592,13 +598,13 @@ def compare(
         relative_error=_mean(relative, valid),
         relative_interval=interval,
         hold_error=_mean(held, valid),
-        dimensions=_dimensions(shown, recorded, error, hold, valid, spread),
+        dimensions=_dimensions(shown, recorded, error, hold, valid, training_std),
         horizon=_horizon(relative, held, valid),
         instructions=_instructions(shown, at, relative, held, valid),
     )
 
 
-def _training_std(policy: Policy, meta: Mapping[str, Any], on_event: OnEvent) -> np.ndarray:
+def _training_std(policy: Policy, meta: PolicyMeta, on_event: OnEvent) -> np.ndarray:
     """Each action's standard deviation [A] over the frames that the policy was trained on.
 
     It is the policy's scale, unless that is one of relative actions or of quantiles. Checkpoints of
@@ -635,12 +641,12 @@ def _are_positions(shown: Demonstrations) -> bool:
     return any(names) and names == shown.proprio_names and sizes == {len(names)}
 
 
-def _relative(error: np.ndarray, spread: np.ndarray) -> np.ndarray | None:
+def _relative(error: np.ndarray, training_std: np.ndarray) -> np.ndarray | None:
     """Squared error over the variance [N, H], mean over the dimensions that varied."""
-    varies = spread > 0
+    varies = training_std > 0
     if not varies.any():
         return None
-    return np.square(error[..., varies] / spread[varies]).mean(axis=-1)
+    return np.square(error[..., varies] / training_std[varies]).mean(axis=-1)
 
 
 def _mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
@@ -657,23 +663,23 @@ def _dimensions(
     error: np.ndarray,
     hold: np.ndarray | None,
     valid: np.ndarray,
-    spread: np.ndarray,
+    training_std: np.ndarray,
 ) -> list[DimensionError]:
     unit = None if shown.task is None else FULL_ACTION
     steps = [own for h in range(valid.shape[1]) if (own := valid[:, h]).any()]
     found = []
     for d, name in enumerate(action_names(shown)):
-        own, by_step = error[..., d][valid], error[..., d]
+        own, by_step, std = error[..., d][valid], error[..., d], float(training_std[d])
         found.append(
             DimensionError(
                 name=name,
                 unit=unit,
                 mae=float(np.abs(own).mean()),
                 rmse=_rmse(own),
-                training_std=float(spread[d]),
+                training_std=std,
                 constant_rmse=float(recorded[..., d][valid].std()),
                 hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
-                relative_error=float(np.square(own / spread[d]).mean()) if spread[d] else None,
+                relative_error=float(np.square(own / std).mean()) if std else None,
                 rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(steps)],
             )
         )

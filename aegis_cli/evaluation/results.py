@@ -110,7 +110,7 @@ def _in_utf8(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _soon_alone(folder: Path) -> Generator[None]:
+def _soon_alone(place: Path) -> Generator[None]:
     """Be the only process that writes there, after some seconds at most: others do not take long.
 
     Raises:
@@ -120,7 +120,7 @@ def _soon_alone(folder: Path) -> Generator[None]:
     with contextlib.ExitStack() as held:
         while True:
             try:
-                held.enter_context(locks.alone(folder))
+                held.enter_context(locks.alone(place))
                 break
             except AegisError:
                 # It may be gone by now: who leaves an empty folder removes it.

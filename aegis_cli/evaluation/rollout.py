@@ -160,7 +160,7 @@ def load_run(run: Path, task: str | None) -> Acting:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     task: str | None,
     episodes: int,
     colors: str,
@@ -202,7 +202,7 @@ def run(
         media.check_video(video_out)
     gl.check()
     asked = task
-    policy, task, planned, cameras, own = (load or load_run)(Path(run), asked)
+    policy, task, planned, cameras, own = (load or load_run)(Path(run_path), asked)
     decay = own if ensemble is None and replan is None else ensemble
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
@@ -231,7 +231,7 @@ def run(
         settings |= {"replan": replan or planned}
         settings |= {} if decay is None else {"ensemble": decay}
         settings |= {} if delay is None else {"delay": delay, "guided": guided}
-        results.keep_if_possible(Path(run), name, report.to_json(), settings, on_event)
+        results.keep_if_possible(Path(run_path), name, report.to_json(), settings, on_event)
     return report
 
 

@@ -111,15 +111,7 @@ class Guard(Removable):
         self._owners = _owners(model, process_groups.resolved(process_group))
         if dual:
             process_groups.check(process_group)
-        _refuse_sparse(model)
-        structure.refuse_offloaded(model)
-        _refuse_spread_together(model)
-        if not structure.learning(model):
-            raise AegisError(
-                f"a {type(model).__name__} without trainable parameters",
-                "at least one",
-                "model.requires_grad_(True)",
-            )
+        _refuse_unfit(model)
         # The other methods look at maps, and need not be told which modules are layers.
         with naming_its_part(model, path, part):
             found = structure.find_layers(model, layers) if dual else {}
@@ -440,6 +432,19 @@ def _check_mask(mask: object) -> None:
     if mask is not None and not isinstance(mask, Tensor):
         raise AegisError(
             f"a mask that is a {type(mask).__name__}", "a tensor [B, T]", "torch.as_tensor(mask)"
+        )
+
+
+def _refuse_unfit(model: nn.Module) -> None:
+    """Raise AegisError for a model that no method can guard, or of which nothing learns."""
+    _refuse_sparse(model)
+    structure.refuse_offloaded(model)
+    _refuse_spread_together(model)
+    if not structure.learning(model):
+        raise AegisError(
+            f"a {type(model).__name__} without trainable parameters",
+            "at least one",
+            "model.requires_grad_(True)",
         )
 
 

@@ -27,6 +27,7 @@ _NEAR = 0.5
 
 
 def ids(found: Mapping[str, Pair]) -> set[int]:
+    """The ids of the sites' parameters."""
     return {id(tensor) for pair in found.values() for tensor in pair if tensor is not None}
 
 
@@ -237,6 +238,7 @@ def _near(parameter: Tensor, weight: Tensor) -> bool:
 
 
 def on_cpu(tensor: Tensor) -> Tensor:
+    """The values in float32 on the CPU, where those of any two devices and types compare."""
     return tensor.detach().cpu().float()
 
 

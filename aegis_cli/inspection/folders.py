@@ -146,27 +146,26 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     facts |= _data_facts(header, settings.demos)
     if base_model := header.meta.get("base_model"):
         facts["base_model"] = base_model
-    loss, validation_loss = metrics.get("loss"), metrics.get("validation_loss")
-    energies = figures.of_ledger(rows, until)
-    if at is not None:
-        return InspectReport(
-            "checkpoint",
-            str(at),
-            facts,
-            loss=loss,
-            validation_loss=validation_loss,
-            **energies,
-        )
-    probed = tuple(_without_pictures(found) for found in results.probes(path))
+    report = InspectReport(
+        "run" if at is None else "checkpoint",
+        str(path if at is None else at),
+        facts,
+        loss=metrics.get("loss"),
+        validation_loss=metrics.get("validation_loss"),
+        **figures.of_ledger(rows, until),
+    )
+    return report if at is not None else _with_results(report, path, settings)
+
+
+def _with_results(report: InspectReport, path: Path, settings: Recipe) -> InspectReport:
+    """The report of a run, and what was measured of it."""
+    facts = dict(report.facts)
     if before := results.steps_measured_before(path):
         facts["measured_before"] = before
-    return InspectReport(
-        "run",
-        str(path),
-        facts,
-        loss=loss,
-        validation_loss=validation_loss,
-        **energies,
+    probed = tuple(_without_pictures(found) for found in results.probes(path))
+    return dataclasses.replace(
+        report,
+        facts=facts,
         probes=probed,
         rollouts=tuple(results.rollouts(path)),
         open_loops=tuple(results.open_loops(path)),

@@ -33,7 +33,7 @@ from aegis_cli.methods import ledger_file
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import STORED_TYPES, Backbone
-from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import checkpoint, loading, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training import inputs as places
 
@@ -158,8 +158,8 @@ class PolicyRun:
             # An earlier Aegis did not say on which machine it trained, nor where its inputs lay.
             if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
-        if (inputs := places.of(self._run)) is not None:
-            places.keep(folder, inputs, out)
+        if (kept := places.of(self._run)) is not None:
+            places.keep(folder, kept, out)
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header
@@ -183,7 +183,7 @@ class PolicyRun:
         """The demonstrations that the policy was trained on, split as they were then."""
         wanted = self._header.inputs["demos"]
         paths = self._settings.demos or self._find_demos(wanted)
-        found = assemble.load_demonstrations(self._recipe, self.base, paths, self._on_event)
+        found = loading.load_demonstrations(self._recipe, self.base, paths, self._on_event)
         if found.sha256 != wanted:
             raise AegisError(
                 f"other demonstrations in {mixture.said(paths)} than those of the run "

@@ -195,15 +195,16 @@ def shares(
 def _unread_shares(
     learning: Sequence[Sequence[Tensor]], squares: Tensor, entries: Sequence[int], balance: float
 ) -> dict[Tensor, float | Tensor]:
+    """What `shares` returns, as tensors []: nothing is read, which would force a GPU sync."""
     counts = devices.send(torch.tensor(entries, dtype=torch.float64, device="cpu"), squares.device)
     rms = (squares / counts).sqrt()
     whole = (squares.sum() / sum(entries)).sqrt()
     # If no map has a gradient, every share is 0.
     found = ratio(rms, rms + balance * whole).float()
-    shares: dict[Tensor, float | Tensor] = {}
+    unread: dict[Tensor, float | Tensor] = {}
     for tensors, share in zip(learning, found, strict=True):
-        shares |= dict.fromkeys(tensors, share)
-    return shares
+        unread |= dict.fromkeys(tensors, share)
+    return unread
 
 
 def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:

@@ -1,8 +1,8 @@
 """MAPS (arXiv 2511.19878): hold modules near the pixels closest to their pre-trained weights.
 
 Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g,
-theta_before - theta0> < 0, that is where the gradient points back to theta0, although momentum may
-have carried the step further away,
+theta_before - theta0> < 0, that is where a step along -g leads back towards theta0, although
+momentum may have carried the weights further away,
 
     theta <- theta - lambda_k r (theta - theta0),
     r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.
@@ -10,8 +10,8 @@ have carried the step further away,
 From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps
 the distance from before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the
 first of K modules to 0 at the last, with weights of 0.5 to 3.2. Ours: the order of the modules,
-which are this backbone's parameter groups (any vision first, then embeddings, the layers, and the
-final norm), and lambda_k r at most 1, so that theta0 is never overshot.
+which are this backbone's parameter groups (any vision first, then embeddings, the layers, the final
+norm and a head), and lambda_k r at most 1, so that theta0 is never overshot.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ def _products(parameter: nn.Parameter, gradient: Tensor, before: Tensor, origin:
 
 
 def _project(parameter: nn.Parameter, origin: Tensor, products: Tensor, strength: float) -> None:
+    """Take SPD's share of a parameter's displacement back, by its `_products`."""
     now = rows_here(parameter) - rows_here(origin)
     far, near = products[:2].sqrt()
     uphill = products[2]  # -c

@@ -90,6 +90,7 @@ class _Group:
     protection: Protection
 
     def pairs(self) -> list[Pair]:
+        """Each site's weight and bias; sharded ones as DTensors."""
         return [weights(self.backbone, site) for site in self.sites]
 
     def here(self) -> list[Pair]:
@@ -129,9 +130,8 @@ def _grouped(
         return len(protection.factor) if isinstance(protection, Dense) else 0
 
     def alone(site: str) -> bool:
-        return isinstance(
-            protections[site], TableRows
-        )  # each table has rows of its own that are read
+        # Each table has rows of its own that are read.
+        return isinstance(protections[site], TableRows)
 
     pairs = {site: weights(backbone, site) for site in protections}
     groups = []

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from aegis_cli.models.backbones import model_folder, outline
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 
 TYPE, KIND = "aegis", "policy"  # LeRobot's name for the policy, and ours for its file
 MODEL, CONFIG, BACKBONE = "model.safetensors", "config.json", "backbone"
@@ -60,29 +61,23 @@ _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 is_policy, is_own_config = model_folder.is_policy, model_folder.is_own_config
 
 
-def write(
-    folder: Path, policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str] = ()
-) -> None:
+def write(folder: Path, policy: Policy, meta: PolicyMeta, cameras: Sequence[str] = ()) -> None:
     """Write everything into an existing folder.
 
     Args:
-        meta: what a policy's user has to know: method, task, replan, normalization and, where they
-            are known, what actions are relative to, the cameras and the sizes of their pictures,
-            the names of actions and positions, the actions' spread, the frames per second, and the
-            id on the hub of the model that the backbone was before it was trained.
         cameras: other names of the pictures, in the order in which the backbone takes them.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)
     # A LeRobot dataset's own names begin so already.
     named = [name.removeprefix(IMAGES) for name in named]
-    write_model(folder, policy, {**meta, "cameras": named})
+    write_model(folder, policy, cast(PolicyMeta, {**meta, "cameras": named}))
     config = _config(policy, meta, named)
     files.save_json(folder / CONFIG, config)
     for name, content in _processors(config).items():
         files.save_json(folder / name, content)
 
 
-def write_model(folder: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
+def write_model(folder: Path, policy: Policy, meta: PolicyMeta) -> None:
     """Write the policy itself into an existing folder; a file that is there is replaced.
 
     The backbone's weights are written in the type that they are in, which the header names as
@@ -105,7 +100,7 @@ def write_model(folder: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
     )
 
 
-def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
+def load(folder: Path) -> tuple[Policy, PolicyMeta]:
     """The policy in a folder, ready to act, and what its user has to know.
 
     Raises:
@@ -113,9 +108,10 @@ def load(folder: Path) -> tuple[Policy, dict[str, Any]]:
     """
     path = folder / MODEL
     artifact = artifacts.load(path, KIND)
-    meta, count = dict(artifact.header.meta), len(artifact.tensors)
+    said, count = dict(artifact.header.meta), len(artifact.tensors)
     with reading_meta(path):
-        sizes = dict(meta.pop("sizes"))
+        sizes = dict(said.pop("sizes"))
+        meta = cast(PolicyMeta, said)
         shape = shape_from(ExpertShape, sizes["expert"], path, count)
     backbone = outline.build(sizes["backbone"], folder / BACKBONE, path, count)
     with reading_meta(path):
@@ -170,7 +166,7 @@ def _unit(size: int) -> Normalizer:
 # --- LeRobot's own files --------------------------------------------------------------------------
 
 
-def _config(policy: Policy, meta: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
+def _config(policy: Policy, meta: PolicyMeta, cameras: Sequence[str]) -> dict[str, Any]:
     """The fields of the plugin's configuration that are not at their defaults."""
     side = policy.backbone.image_size or _ANY_SIZE
     sizes = meta.get("pictures") or [(side, side)] * len(cameras)

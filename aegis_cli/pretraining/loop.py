@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +15,7 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.state_dicts import reading_meta
 from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded_file import EmbeddedModel
-from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest
+from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest, every_key
 from aegis_cli.training import folder, optimizer_state
 from aegis_cli.training.schedule import warmup_cosine
 
@@ -77,16 +75,12 @@ def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
     if saved.inputs.get("recipe") == digest(recipe):
         return
     began = saved.meta.get("recipe")
-    why = f": {folder.differences(began, _plain(recipe))}" if began else ""
+    why = f": {folder.differences(began, every_key(recipe))}" if began else ""
     raise AegisError(
         f"{path} belongs to another recipe{why}",
         "the recipe the run began with",
         "choose another --out",
     )
-
-
-def _plain(recipe: PretrainRecipe | DualRecipe) -> dict[str, Any]:
-    return json.loads(json.dumps(dataclasses.asdict(recipe)))
 
 
 def optimizers(
@@ -164,7 +158,7 @@ def _restore(run: Pretraining, path: Path) -> int:
 def _save(run: Pretraining, path: Path, steps: int) -> None:
     meta = {
         "step": steps,
-        "recipe": _plain(run.recipe),
+        "recipe": every_key(run.recipe),
         optimizer_state.STATELESS: optimizer_state.stateless(run.parameters, run.optimizers),
     }
     artifacts.save(

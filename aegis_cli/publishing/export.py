@@ -22,6 +22,7 @@ from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.publishing import card
 from aegis_cli.training import checkpoint
 from aegis_cli.training import folder as run_folder
@@ -59,7 +60,7 @@ class ExportReport:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     out: Path,
     form: str = card.LEROBOT,
     camera: str | None = None,
@@ -83,7 +84,7 @@ def run(
         AegisError: no policy, the run of a stream, a folder that is there already, a camera's
             name where none is to be given, or a type that the backbone cannot have.
     """
-    refuse_stream(run)
+    refuse_stream(run_path)
     if os.path.lexists(out):  # a link that leads nowhere too
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
     check_utf8(out, "choose another --out")
@@ -93,10 +94,10 @@ def run(
             "a name for LeRobot",
             "leave --camera out, or give --format lerobot",
         )
-    run = download.locate(run)
-    policy, meta = checkpoint.load_policy(run)
-    steps, planned = warn_of_steps_left(run, "export", on_event)
-    warn_of_a_merge(run, "export", on_event)
+    run_path = download.locate(run_path)
+    policy, meta = checkpoint.load_policy(run_path)
+    steps, planned = warn_of_steps_left(run_path, "export", on_event)
+    warn_of_a_merge(run_path, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
     make_folder(out.parent)
@@ -104,9 +105,9 @@ def run(
         if form == card.LEROBOT:
             lerobot_folder.write(aside, policy, meta, cameras)
         else:
-            _write_checkpoint(aside, run, policy, meta)
+            _write_checkpoint(aside, run_path, policy, meta)
         stored = card.Stored(meta.get("stored", FLOAT32), rounded)
-        _write_card(aside, run, form, repo or f"ORG/{out.name}", stored, cameras)
+        _write_card(aside, run_path, form, repo or f"ORG/{out.name}", stored, cameras)
         put(aside, out)
     return ExportReport(
         str(out),
@@ -165,7 +166,7 @@ def warn_of_a_merge(run: Path, stage: str, on_event: OnEvent) -> None:
         on_event(Warned(stage, f"{text} is in '{merged}'"))
 
 
-def _cameras(camera: str | None, meta: Mapping[str, Any]) -> list[str]:
+def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
     """What LeRobot calls the pictures: the policy's own names, or for a single camera `camera`.
 
     Raises:
@@ -199,9 +200,7 @@ def refuse_stream(run: Path) -> None:
         )
 
 
-def _rounded(
-    backbone: Backbone, meta: Mapping[str, Any], dtype: str
-) -> tuple[dict[str, Any], bool]:
+def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMeta, bool]:
     """Round the backbone's weights to a type.
 
     Returns:
@@ -212,9 +211,10 @@ def _rounded(
     """
     # A checkpoint of `train.weights: bf16` has bfloat16 itself, whatever it was made from.
     chosen = meta.get("stored", backbone.stored) if dtype == SOURCE else dtype
-    others = {name: value for name, value in meta.items() if name != "stored"}
+    now = meta.copy()
+    now.pop("stored", None)
     if chosen == FLOAT32:
-        return others, False
+        return now, False
     if not backbone.rounds:
         raise AegisError(
             f"--dtype {dtype} for a policy with the embedded backbone",
@@ -225,10 +225,11 @@ def _rounded(
     backbone.round_weights(STORED_TYPES[chosen])
     after = backbone.parameters()
     lost = any(not torch.equal(a, b.float()) for a, b in zip(before, after, strict=True))
-    return {**others, "stored": chosen}, lost
+    now["stored"] = chosen
+    return now, lost
 
 
-def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: Mapping[str, Any]) -> None:
+def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: PolicyMeta) -> None:
     """Write a policy as our checkpoints are, without what a training needs to go on."""
     inputs: Mapping[str, str] = {}
     seed, about = None, ""

@@ -88,7 +88,7 @@ class PushReport:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     repo: str,
     form: str = card.AEGIS,
     private: bool = False,
@@ -114,17 +114,17 @@ def run(
             be reached or refuses.
     """
     _check_name(repo)
-    export.refuse_stream(run)
-    at = checkpoint.chosen(run)
+    export.refuse_stream(run_path)
+    at = checkpoint.chosen(run_path)
     home = checkpoint.run_of(at)
     if home is None:
         raise AegisError(
-            f"'{run}', a checkpoint outside of its run",
+            f"'{run_path}', a checkpoint outside of its run",
             "a run, whose recipe and results make the model card",
             "give the run's folder",
         )
-    export.warn_of_steps_left(run, "push", on_event)
-    export.warn_of_a_merge(run, "push", on_event)
+    export.warn_of_steps_left(run_path, "push", on_event)
+    export.warn_of_a_merge(run_path, "push", on_event)
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
         folder = Path(aside) / "policy"

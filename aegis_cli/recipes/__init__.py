@@ -43,6 +43,7 @@ from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Tow
 from aegis_cli.recipes.reader import (
     digest,
     drawn,
+    every_key,
     from_mapping,
     is_robot_stream_run,
     is_stream_run,
@@ -159,6 +160,7 @@ __all__ = [
     "describe",
     "digest",
     "drawn",
+    "every_key",
     "from_mapping",
     "is_robot_stream_run",
     "is_stream_run",

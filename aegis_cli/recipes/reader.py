@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -145,6 +146,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _plain(inner) for name, inner in value.items()}
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def every_key(recipe: AnyRecipe) -> dict[str, Any]:
+    """Every key with its value, also retired ones, as a JSON file would give them back."""
+    return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
 
 
 def digest(recipe: AnyRecipe) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,12 +157,12 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
 
     A study's `shared` has every key of its cells' recipes that the study does not give them.
     """
-    plain = {"kind": recipes.name_of(type(recipe)), **_plain(recipe)}
+    plain = {"kind": recipes.name_of(type(recipe)), **recipes.every_key(recipe)}
     if not isinstance(recipe, AnyStudy):
         return plain
     rules = _CELL_RULES[type(recipe)]
     given = {"name": "cell", rules.place: rules.any_place}
-    shared = _plain(build(rules.recipe, {**recipe.shared, **given}, []))
+    shared = recipes.every_key(build(rules.recipe, {**recipe.shared, **given}, []))
     given_below = [dotted for dotted in rules.given if "." in dotted]
     for dotted in (*given_below, *_drawn(recipe)):
         section, name = dotted.split(".")
@@ -183,10 +182,6 @@ def _places(name: str, study: type) -> list[str]:
     own = [name] if name in {f.name for f in dataclasses.fields(rules.recipe)} else []
     shared = [place for place in own + below(name, rules.recipe) if place not in rules.given]
     return below(name, study) + [f"shared.{place}" for place in shared]
-
-
-def _plain(recipe: AnyRecipe) -> dict[str, Any]:
-    return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
 
 
 # --- all problems at once -------------------------------------------------------------------------
@@ -290,8 +285,8 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """Variants that are to be compared with none of the others."""
-    variants = raw.get("variants")
-    named = variants if isinstance(variants, dict) else {}
+    given = raw.get("variants")
+    named = given if isinstance(given, dict) else {}
     found = []
     for name, keys in named.items():
         against = keys.get("against") if isinstance(keys, dict) else None

@@ -40,17 +40,17 @@ class LatencyReport:
     repeats: int
 
 
-def run(run: Path, repeats: int = 50, on_event: OnEvent = ignore) -> LatencyReport:
+def run(run_path: Path, repeats: int = 50, on_event: OnEvent = ignore) -> LatencyReport:
     """Time `repeats` predictions of a run's policy, on random pictures.
 
     Raises:
         AegisError: no such run.
     """
-    policy = load_policy(run)
+    policy = load_policy(run_path)
     taken = 1000 * np.array(seconds(policy, repeats, on_event))
     p50, p95 = (float(ms) for ms in np.quantile(taken, (0.5, 0.95)))
     return LatencyReport(
-        run=str(run),
+        run=str(run_path),
         device=str(devices.pick()),
         precision=policy.precision,
         p50_ms=p50,

@@ -42,7 +42,7 @@ class Serving:
 
 
 def run(
-    run: Path,
+    run_path: Path,
     task: str | None,
     host: str,
     port: int,
@@ -71,7 +71,7 @@ def run(
         raise AegisError("an empty --host", "an address of this machine", "--host 127.0.0.1")
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
-    policy = load_policy(run, task, seed, precision, ensemble=ensemble)
+    policy = load_policy(run_path, task, seed, precision, ensemble=ensemble)
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:

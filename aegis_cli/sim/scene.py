@@ -103,17 +103,14 @@ class Stage:
     def __init__(self, physics: Physics, tip: str, half_width_m: float) -> None:
         self.physics = physics
         self._model = physics.model.ptr
-        self._tip = self._geom(tip)
-        self._floor = self._geom("ground")
-        self._discs = [self._geom(f"disc{i}") for i in range(SLOTS)]
+        self._tip = self._model.geom(tip).id
+        self._floor = self._model.geom("ground").id
+        self._discs = [self._model.geom(f"disc{i}").id for i in range(SLOTS)]
         self._half_width_m = half_width_m
         self._distance_m = half_width_m / np.tan(np.radians(_FOVY_DEG / 2))
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = 90, -90  # x to the right, y up
         self._renderer: mujoco.Renderer | None = None
-
-    def _geom(self, name: str) -> int:
-        return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, physics: Physics, look: Look, colors: Sequence[str]) -> np.ndarray:
         """Picture [64, 64, 3] uint8 of one environment's state.

@@ -18,7 +18,7 @@ from aegis_cli.models import backbones
 from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
-from aegis_cli.training import assemble, track
+from aegis_cli.training import loading, track
 
 _LEAST_DROP = 1.0  # points of VQA that naive has to lose before protection is worth a word
 _KEPT_SHARE = 0.5  # of naive's drop: at most so much a method loses that is said to keep VQA
@@ -209,7 +209,7 @@ def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     for method in recipe.methods:
         runner.vqa_state(_of(recipe, method))
     runner.check_questions(recipe, "probe")
-    assemble.check_named(recipe, runner.on_event)
+    loading.check_named(recipe, runner.on_event)
 
 
 def _refuse_own_models(folder: Path, recipe: Recipe) -> None:

@@ -36,6 +36,7 @@ from aegis_cli.evaluation.probe import ProbeReport
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.models import backbones
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import (
     Anchor,
     Cotrain,
@@ -52,7 +53,7 @@ from aegis_cli.studies.cells import Cell, CellStore, MakeRunner
 from aegis_cli.studies.comparison import Cost, Findings, StudyReport, task_results
 from aegis_cli.studies.figures import Divergence, Figures, Outcome, PolicyFigures, VqaFigures
 from aegis_cli.studies.tuning import POLICY_RULE, PolicyPoint
-from aegis_cli.training import assemble, checkpoint, track, train
+from aegis_cli.training import checkpoint, loading, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
@@ -120,7 +121,7 @@ class PolicyStudy:
         recipes_of = (cell.recipe for cell in cells)
         distinct = {(recipe.backbone, recipe.demos, recipe.task): recipe for recipe in recipes_of}
         for recipe in distinct.values():
-            assemble.check_named(recipe, runner.on_event)
+            loading.check_named(recipe, runner.on_event)
         for cell in cells if together else ():
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
@@ -148,7 +149,7 @@ class PolicyStudy:
         if NAIVE not in self.recipe.variants:
             return {}
         made = {name: self._first(name, chosen) for name in self.recipe.variants}
-        runner = cast(PolicyRunner, store.runner)
+        runner = _runner(store)
         keys = {
             name: _cost_key(recipe, made[NAIVE], runner.backbone_sha256(recipe))
             for name, recipe in made.items()
@@ -178,7 +179,7 @@ class PolicyStudy:
 
         Variants whose anchors differ are timed apart, each with its own.
         """
-        runner = cast(PolicyRunner, store.runner)
+        runner = _runner(store)
         for settings in dict.fromkeys(made[name].anchor for name in names):
             group = {name: made[name] for name in names if made[name].anchor == settings}
             anchor_path = runner.anchor(next(iter(group.values()))).path
@@ -217,6 +218,12 @@ class PolicyStudy:
         study = self.recipe
         value = chosen.get(variant, study.variants[variant].values[0])
         return bool(_trained_on(self.cell(variant, study.tasks[0], study.seeds[0], value)))
+
+
+def _runner(store: CellStore[Recipe]) -> PolicyRunner:
+    """The runner that a study of policies has had made."""
+    assert isinstance(store.runner, PolicyRunner)
+    return store.runner
 
 
 def _trained_on(recipe: Recipe) -> list[Cotrain | Insulate]:
@@ -481,8 +488,8 @@ class PolicyRunner:
             asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
         first, *further = asked
         last = self._policy(label, recipe) / "checkpoints" / "last"
-        meta = artifacts.read_header(last / checkpoint.EXPERT).meta
-        playable = _playable(meta, recipe)
+        header = artifacts.read_header(last / checkpoint.EXPERT)
+        playable = _playable(cast(PolicyMeta, header.meta), recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
         success = {colors: report["success"] for colors, report in played.items()}
         error, hold = None, None
@@ -709,9 +716,9 @@ class PolicyRunner:
         and None where there is no such set. Holding has an error where it has one in all of them.
         """
         given = self.demos(recipe)
-        sets = [given.path] if isinstance(given.path, Path) else list(given.path)
+        paths = [given.path] if isinstance(given.path, Path) else list(given.path)
         errors, holds = [], []
-        for number, data in enumerate(sets, start=1):
+        for number, data in enumerate(paths, start=1):
             report = self._evaluated(label, recipe, data, given.sha256, number)
             if report["relative_error"] is not None:
                 errors.append(report["relative_error"])
@@ -787,7 +794,7 @@ def _sha256(run: Path) -> list[str]:
     return [files.sha256_file(last / name) for name in POLICY]
 
 
-def _playable(meta: dict[str, Any], recipe: Recipe) -> tuple[str, ...]:
+def _playable(meta: PolicyMeta, recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
     task = meta["task"]
     cameras = {layout.short(name) for name in meta.get("cameras", ())}

@@ -1,47 +1,45 @@
-"""Everything a training run needs, built and checked before the first step."""
+"""A training run, built before the first step from what `loading` has loaded and checked."""
 
 from __future__ import annotations
 
 import copy
-import shlex
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli import recipes
-from aegis_cli.anchors import anchor_file
-from aegis_cli.common import artifacts, devices, launch, prefetch
+from aegis_cli.common import devices, prefetch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned
+from aegis_cli.common.events import OnEvent
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
-from aegis_cli.data import demonstrations, joints, mixture
+from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.batch import Share
-from aegis_cli.data.relative import Places
 from aegis_cli.data.selection import Paths
-from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
 from aegis_cli.methods.base import Method, MethodContext, Parts, Pass
 from aegis_cli.methods.stepper import Stepper
-from aegis_cli.models import backbones, structure
+from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, Train
 from aegis_cli.training import (
     card,
     checkpoint,
     eight_bit,
     freezing,
+    loading,
     optimizers,
     parallel,
     retention,
@@ -50,8 +48,6 @@ from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.step_figures import UnreadFigures
-
-Questions = sets.Scenes | sets.Listed
 
 
 @dataclass
@@ -101,18 +97,8 @@ class TrainingRun:
         return [p for group in self.rates for p in group["params"]]
 
     @property
-    def meta(self) -> dict[str, Any]:
-        """What a policy's user has to know.
-
-        `task` is None for one that is not simulated; `cameras`, in their order, are there if they
-        are several, or not the task's own; `stored`, the type that the backbone's weights came in,
-        if it is not float32; `ensemble`, the decay of its temporal ensemble, if it has one;
-        `relative`, for each action the place of the position that it is predicted relative to, or
-        None, if any is; `action_names`, `proprio_names` and `fps` as far as the demonstrations say
-        them; `action_std`, the actions' standard deviations, where one of the policy's scales is
-        another; `dataset`, their id or those of several, and `base_model`, that of the model that
-        the backbone began as, if they come from the hub.
-        """
+    def meta(self) -> PolicyMeta:
+        """What a policy's user has to know."""
         found: dict[str, Any] = {
             "method": self.method.name,
             "task": self.demos.task,
@@ -142,7 +128,7 @@ class TrainingRun:
             found["pictures"] = [list(frames.shape[1:3]) for frames in self.demos.frames]
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
-        return found
+        return cast(PolicyMeta, found)
 
     @property
     def order(self) -> BatchOrder:
@@ -248,11 +234,11 @@ def build(
     parallel.check(recipe, method, ranks)
     check_masters(recipe.train, ranks)
     eight_bit.check(recipe.train, ranks)
-    device, shards = devices.pick(), _shards(recipe.train, ranks)
-    read = _read(recipe, method, demos, anchor, on_event, ranks)
-    backbone, measured = read.backbone, read.measured
-    policy = _begun_policy(recipe, read)
-    source = _trained_on(method, recipes.options(recipe), on_event)
+    device, shards = devices.pick(), parallel.shards(recipe.train, ranks)
+    loaded = loading.load(recipe, method, demos, anchor, on_event, ranks)
+    backbone, measured = loaded.backbone, loaded.measured
+    policy = _begun_policy(recipe, loaded)
+    source = loading.questions(method, recipes.options(recipe), on_event)
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     masters = _adapted(recipe, method, backbone, on_event)
@@ -261,7 +247,7 @@ def build(
     owners = ranks if shards else ALONE
     if shards:
         parallel.shard(policy, recipe.train.precision, device)
-    parts = _start(recipe, method, policy, read.demos, measured, sites, source, owners, on_event)
+    parts = _start(recipe, method, policy, loaded.demos, measured, sites, source, owners, on_event)
     _check_weights(recipe, parts)
     if recipe.train.compile:
         backbone.compile_passes()
@@ -271,8 +257,8 @@ def build(
         recipe=recipe,
         method=method,
         out=out,
-        inputs=_digests(recipe, read, source),
-        demos=read.demos,
+        inputs=loading.digests(recipe, loaded, source),
+        demos=loaded.demos,
         policy=policy,
         parts=parts,
         stepper=Stepper(backbone, parts, may_shard=owners.several),
@@ -280,68 +266,19 @@ def build(
         ledger=_ledger(parts, backbone),
         ranks=ranks,
         plain=plain,
-        watched=read.watched,
+        watched=loaded.watched,
         unread=UnreadFigures.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
         average=_average(recipe.train, policy),
     )
 
 
-@dataclass(frozen=True)
-class _Read:
-    """What a training reads, each checked against the others.
-
-    Attributes:
-        backbone: as it was stored, where it is to learn.
-        fingerprint: of its weights.
-        watched: the anchor's file, if there is one, and `anchor` its digest.
-        measured: what the anchor holds; None where there is none.
-    """
-
-    backbone: Backbone
-    fingerprint: str
-    demos: demonstrations.Demonstrations
-    watched: WatchedFiles
-    anchor: str | None
-    measured: Anchor | None
-
-
-def _read(
-    recipe: Recipe,
-    method: Method,
-    demos: Paths,
-    anchor: Path | None,
-    on_event: OnEvent,
-    ranks: Ranks,
-) -> _Read:
-    """Load backbone, demonstrations and anchor.
-
-    Raises:
-        AegisError: inputs that do not fit together.
-    """
-    device = devices.pick()
-    # Weights to be sharded stay on the CPU: a GPU may have room for its own shard only.
-    backbone = backbones.load(recipe.backbone).to("cpu" if _shards(recipe.train, ranks) else device)
-    fingerprint = backbone.fingerprint()
-    watched = WatchedFiles([] if anchor is None else [anchor])
-    measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
-    _check_parts(method, measured, recipe)
-    # Last, since it may decode hours of video.
-    recorded = _loaded(recipe, backbone, demos, on_event, ranks)
-    _warn_of_no_instruction(demos, recorded, on_event)
-    if anchor is not None and method.needs:
-        _warn_of_another_prompt(anchor, recipe, on_event)
-        _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
-    digest = None if anchor is None else watched.sha256[anchor]
-    return _Read(backbone, fingerprint, recorded, watched, digest, measured)
-
-
-def _begun_policy(recipe: Recipe, read: _Read) -> Policy:
+def _begun_policy(recipe: Recipe, loaded: loading.Loaded) -> Policy:
     """The policy as it begins, its backbone in the type that the recipe asks for."""
     # After the fingerprint: the anchor is of the weights before they are rounded.
-    _fit(read.backbone, recipe)
+    _fit(loaded.backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
-    return _policy(recipe, read.backbone, read.demos)
+    return _policy(recipe, loaded.backbone, loaded.demos)
 
 
 def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
@@ -360,116 +297,11 @@ def _average(settings: Train, policy: Policy) -> Average:
     return Average(learning, settings.ema_decay)
 
 
-def _trained_on(method: Method, options: Mapping[str, Any], on_event: OnEvent) -> Questions | None:
-    """The questions that a method trains on, which most do not."""
-    if not method.trains_on_questions(options):
-        return None
-    return sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
-
-
-def _digests(recipe: Recipe, read: _Read, source: Questions | None) -> dict[str, str]:
-    """Digests of what a training reads, by their names."""
-    found = {**mixture.inputs(read.demos), "backbone": read.fingerprint}
-    if read.anchor is not None:
-        found["anchor"] = read.anchor
-    if recipe.expert.start is not None:
-        found["expert"] = checkpoint.expert_sha256(recipe.expert.start)
-    return found if source is None else found | source.sha256
-
-
-def _shards(settings: Train, ranks: Ranks) -> bool:
-    """Whether each process is to keep some rows of each weight alone."""
-    return ranks.several and settings.parallel == "fsdp"
-
-
-def _loaded(
-    recipe: Recipe, backbone: Backbone, demos: Paths, on_event: OnEvent, ranks: Ranks
-) -> demonstrations.Demonstrations:
-    """The demonstrations; one process per machine decodes their frames, the others reuse them."""
-    decodes = launch.local_rank() == 0
-    found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
-    ranks.wait()
-    return load_demonstrations(recipe, backbone, demos, on_event) if found is None else found
-
-
 def _ledger(parts: Parts, backbone: Backbone) -> Ledger:
     """A ledger of what learns and of all layers, or without columns for one backward pass."""
     if not parts.dual:
         return Ledger([], [])
     return Ledger(list(backbone.learning_groups()), [f"layers.{i}" for i in range(backbone.depth)])
-
-
-def check_named(recipe: Recipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what `build` would find wrong with the files that the recipe names.
-
-    These are demonstrations, and another run's expert.
-    """
-    if recipe.expert.start is not None:
-        checkpoint.load_expert(recipe.expert.start)
-    if recipe.demos.path is not None:
-        backbone, paths = backbones.load(recipe.backbone), mixture.at(recipe.demos.path)
-        if recipe.anchor.source == "demos" and len(mixture.each(paths)) > 1:
-            raise AegisError(
-                f"anchor.source: demos with demonstrations in {mixture.said(paths)}",
-                "one set, whose frames an anchor is measured on",
-                "measure it on one of them with aegis anchor --demos, and train with aegis train "
-                "--anchor; or set anchor.source to questions",
-            )
-        load_demonstrations(recipe, backbone, paths, on_event)
-        return
-    belonging = {
-        "camera": ("a LeRobot folder, to choose of", "set demos.path to it"),
-        "rename": ("demonstrations with names of their own", "set demos.path to them"),
-        "only": ("demonstrations, to choose of", "set demos.path to it"),
-        "weights": ("several sets of demonstrations", "set demos.path to a list of them"),
-    }
-    for name, (expected, fix) in belonging.items():
-        if getattr(recipe.demos, name) is not None:
-            raise AegisError(f"demos.{name} without demos.path", expected, fix)
-
-
-def load_demonstrations(
-    recipe: Recipe, backbone: Backbone, paths: Paths, on_event: OnEvent
-) -> demonstrations.Demonstrations:
-    """Load what the backbone is to learn from.
-
-    Raises:
-        AegisError: demonstrations of another task, with words that the backbone does not know, or
-            of which the recipe's weights are not.
-    """
-    _check_cameras(backbone, recipe)
-    mixture.check_weights(recipe.demos.weights, len(mixture.each(paths)))
-    found = mixture.load(
-        paths,
-        recipe.train.validation_share,
-        recipe.seed,
-        recipe.demos.selection,
-        backbone.image_size,
-        on_event=on_event,
-        cache=recipe.demos.cache,
-        check_text=backbone.check_prompt,
-    )
-    if found.task not in (None, recipe.task):
-        raise AegisError(
-            f"demonstrations of '{found.task}' for a recipe of '{recipe.task}'",
-            "one and the same task",
-            f"--set task={found.task}, or record with: aegis demos {recipe.task}",
-        )
-    mixture.drawn(found, recipe.demos.weights)
-    # A word that the backbone does not know is found here, and ends no training half-way.
-    backbone.check_prompts(found.images(found.read[:1]), found.texts)
-    return found
-
-
-def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
-    """Refuse several cameras before their frames are decoded."""
-    named = recipe.demos.camera
-    if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
-        raise AegisError(
-            f"demos.camera: {', '.join(named)} with a backbone that reads one image",
-            "one camera, or a Hugging Face backbone",
-            f"--set demos.camera={named[0]}",
-        )
 
 
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
@@ -511,102 +343,6 @@ def _check_weights(recipe: Recipe, parts: Parts) -> None:
         )
 
 
-def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """What the method reads of the anchor."""
-    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
-    return anchor_file.to_device(found, device)
-
-
-def _warn_of_no_instruction(
-    paths: Paths, found: demonstrations.Demonstrations, on_event: OnEvent
-) -> None:
-    """Warn of episodes that are learned from and whose instruction is an empty text, or blanks."""
-    learned = found.episode_of[found.read].unique()
-    if bare := len(found.without_instruction):
-        text = (
-            f"{bare} of the {len(learned)} episodes to learn from in {mixture.said(paths)} have no "
-            "instruction, but an empty text: a policy learns from them to act without being told "
-            "what to do. Write what they do as the dataset's tasks, or choose others with "
-            "demos.only"
-        )
-        on_event(Warned("train", text))
-
-
-def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> None:
-    """Warn of an anchor whose questions were asked in another way than the recipe asks.
-
-    A chat model answers `{}` in sentences, and `{} Give a very brief answer.` in a word: what keeps
-    the one need not keep the other.
-    """
-    meta = artifacts.read_header(path).meta
-    asked = meta.get("ask", sets.PLAIN)
-    if "vqa" in meta and asked != recipe.anchor.ask:
-        wanted, own = shlex.quote(recipe.anchor.ask), shlex.quote(f"anchor.ask={asked}")
-        text = (
-            f"the questions of '{path}' were asked as '{asked}', and the recipe asks them as "
-            f"'{recipe.anchor.ask}' (anchor.ask): measure the anchor with --ask {wanted}, or --set "
-            f"{own}; and probe with the same --ask"
-        )
-        on_event(Warned("train", text))
-
-
-def _warn_of_other_cameras(
-    path: Path,
-    demos: Paths,
-    shown: Sequence[str],
-    rename: Mapping[str, str] | None,
-    on_event: OnEvent,
-) -> None:
-    """Warn of an anchor of robot frames from other cameras than those that are learned from.
-
-    Each camera's frame is an image of the prompt. Of frames of one camera that nobody has named
-    nothing is said, and nothing of questions, which have one image each.
-    """
-    meta = artifacts.read_header(path).meta
-    own = meta.get("cameras", [])
-    unnamed = not (own and shown) and max(len(own), len(shown)) < 2
-    if "demos" not in meta or own == list(shown) or unnamed:
-        return
-    words = [word for camera in shown for word in ("--camera", camera)]
-    for old, new in (rename or {}).items():
-        words += ["--rename", f"{old}={new}"]
-    names = shlex.join(words)
-    text = (
-        f"the anchor '{path}' was measured on frames of {', '.join(own) or 'no camera by name'}, "
-        f"and the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "
-        f"anchor --demos {shlex.quote(str(mixture.each(demos)[0]))} {names}".rstrip()
-    )
-    on_event(Warned("train", text))
-
-
-def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:
-    """Raise AegisError where the anchor lacks what the method needs."""
-    held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
-    missing = [part for part in sorted(method.needs) if not held.get(part)]
-    if not missing:
-        return
-    found = "no anchor" if anchor is None else f"an anchor without {' and '.join(missing)}"
-    raise AegisError(
-        f"{found} for method '{method.name}'",
-        f"an anchor of the backbone with its {' and '.join(missing)}",
-        f"add --anchor FILE, measured by: {_measuring(recipe, missing)}",
-    )
-
-
-def _measuring(recipe: Recipe, parts: Sequence[str]) -> str:
-    """The command that measures these parts on the questions of which the recipe speaks."""
-    asked, usual = recipe.anchor, type(recipe.anchor)()
-    words = ["aegis", "anchor"]
-    if recipe.backbone != backbones.EMBEDDED:
-        words += ["--backbone", recipe.backbone]
-    for option, name in (("--vqa", "vqa"), ("--ask", "ask"), ("--temperature", "temperature")):
-        if getattr(asked, name) != getattr(usual, name):
-            words += [option, f"{getattr(asked, name)}"]
-    if asked.skip_bad:
-        words.append("--skip-bad")
-    return shlex.join([*words, "--parts", ",".join(parts), "--out", "FILE"])
-
-
 def _start(
     recipe: Recipe,
     method: Method,
@@ -614,7 +350,7 @@ def _start(
     demos: demonstrations.Demonstrations,
     anchor: Anchor | None,
     sites: Mapping[str, str],
-    source: Questions | None,
+    source: loading.Questions | None,
     owners: Ranks,
     on_event: OnEvent,
 ) -> Parts:
@@ -655,7 +391,7 @@ def _learning_sites(
 
 
 def _vqa_loss(
-    backbone: Backbone, recipe: Recipe, source: Questions, on_event: OnEvent
+    backbone: Backbone, recipe: Recipe, source: loading.Questions, on_event: OnEvent
 ) -> Callable[[Pass], Tensor]:
     """Mean cross-entropy, in nats, of an answer over a step's batch of training questions."""
     options, checks = recipes.options(recipe), [backbone.check_text]
@@ -697,57 +433,9 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrat
     expert = ActionExpert(shape)
     expert.recomputes = train.gradient_checkpointing
     if recipe.expert.start is not None:
-        begun = _begun_expert(recipe.expert.start, shape, relative, demos.recorded)
+        begun = loading.begun_expert(recipe.expert.start, shape, relative, demos.recorded)
         expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
-
-
-def _begun_expert(
-    start: str, shape: ExpertShape, relative: Places, recorded: Mapping[str, Any]
-) -> ActionExpert:
-    """The expert of another run, which has to be of the shape that this one needs.
-
-    Args:
-        recorded: what the demonstrations say of the robot, as in `Demonstrations.recorded`.
-    """
-    found, meta = checkpoint.load_expert(start)
-    for other in joints.differences(meta, recorded):
-        if other.moved is not None:
-            raise AegisError(
-                f"'{other.moved}' in another place than the expert of '{start}' has it, with "
-                f"{other.what} {', '.join(other.found)}",
-                f"{', '.join(other.known)}, in this order, as that expert was trained on",
-                "give demonstrations in that order, or delete expert.start",
-            )
-    if tuple(meta.get("relative", ())) != tuple(relative):
-        raise AegisError(
-            f"the expert of '{start}' predicts {_told(meta.get('relative', ()))}, this training "
-            f"{_told(relative)}",
-            "an expert that predicts the same",
-            "set train.relative_actions and train.relative_exclude to those of that run, or delete "
-            "expert.start",
-        )
-    here, there = shape.to_json(), found.shape.to_json()
-    other = [
-        f"{name} {there[name]} instead of {here[name]}"
-        for name in here
-        if here[name] != there[name]
-    ]
-    if other:
-        raise AegisError(
-            f"the expert of '{start}' has {', '.join(other)}",
-            "an expert of the same robot and the same kind of backbone",
-            "set train.chunk, expert.width and expert.mlp_ratio to those of that run, give it as "
-            "--set backbone=… too, or delete expert.start",
-        )
-    return found
-
-
-def _told(relative: Places) -> str:
-    if not relative:
-        return "absolute actions"
-    own = ", ".join("absolute" if place is None else f"to {place}" for place in relative)
-    return f"actions relative to positions ({own})"
 
 
 def expert_shape(

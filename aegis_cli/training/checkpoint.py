@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import math
 import os
 import shutil
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from safetensors import SafetensorError
@@ -34,11 +33,12 @@ from aegis_cli.data.batch import Normalizer
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.methods.base import Method
-from aegis_cli.models import backbones, download, lerobot_folder, structure
+from aegis_cli.models import backbones, download, lerobot_folder, policy_meta, structure
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import optimizer_state
 from aegis_cli.training.average import Average
 
@@ -101,7 +101,7 @@ def save(
     policy: Policy,
     method: Method,
     state: State,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     inputs: Mapping[str, str],
     seed: int,
     card: str = "",
@@ -157,7 +157,7 @@ def write_policy(
     folder: Path,
     plain: Backbone,
     policy: Policy,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     inputs: Mapping[str, str],
     seed: int | None,
     card: str = "",
@@ -188,7 +188,7 @@ def _save_expert(
     path: Path,
     policy: Policy,
     fingerprint: str,
-    meta: Mapping[str, Any],
+    meta: PolicyMeta,
     inputs: Mapping[str, str],
     seed: int | None,
 ) -> None:
@@ -350,12 +350,11 @@ def step_of(path: Path) -> int:
     return int(artifacts.read_header(path / STATE).meta["step"])
 
 
-def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
+def load_policy(folder: str | Path) -> tuple[Policy, PolicyMeta]:
     """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
-    Its meta holds the task, the method and what else a user has to know. How its chunks are
-    executed is read from the recipe of its run, where it lies in one: a job's `rollout` may be
-    another than when it was trained.
+    How its chunks are executed is read from the recipe of its run, where it lies in one: a job's
+    `rollout` may be another than when it was trained.
 
     Args:
         folder: such a folder, or the id on the hub of a policy that was pushed.
@@ -368,8 +367,7 @@ def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
         policy, meta = lerobot_folder.load(folder)
         sizes = len(policy.action_scale.mean), len(policy.proprio_scale.mean)
         with reading_meta(folder / lerobot_folder.MODEL):
-            _check_user_meta(meta)
-            _check_recorded(meta, *sizes)
+            policy_meta.check(meta, *sizes)
         return policy, meta
     path = chosen(folder)
     backbone = backbones.load(str(path / BACKBONE))
@@ -378,20 +376,21 @@ def load_policy(folder: str | Path) -> tuple[Policy, dict[str, Any]]:
     return Policy(backbone, expert, proprio, action, relative).eval(), _executed_now(path, meta)
 
 
-def _executed_now(path: Path, meta: Mapping[str, Any]) -> dict[str, Any]:
+def _executed_now(path: Path, meta: PolicyMeta) -> PolicyMeta:
     """A checkpoint's meta with `replan` and `ensemble` as its run's recipe says them by now."""
     run = run_of(path)
+    now = meta.copy()
     if run is None:
-        return dict(meta)
+        return now
     settings = recipes.load(run / "recipe.yaml", kind=recipes.Recipe).rollout
-    now = {name: value for name, value in meta.items() if name != "ensemble"}
     now["replan"] = settings.replan
+    now.pop("ensemble", None)
     if settings.ensemble is not None:
         now["ensemble"] = settings.ensemble
     return now
 
 
-def load_expert(folder: str | Path) -> tuple[ActionExpert, dict[str, Any]]:
+def load_expert(folder: str | Path) -> tuple[ActionExpert, PolicyMeta]:
     """The expert alone of what `load_policy` takes, and the meta."""
     folder = download.locate(folder)
     if lerobot_folder.is_policy(folder):
@@ -412,7 +411,7 @@ def _expert_file(folder: str | Path) -> Path:
 
 def _load_expert(
     file: Path, backbone: Backbone | None = None
-) -> tuple[ActionExpert, dict[str, Any], Normalizer, Normalizer]:
+) -> tuple[ActionExpert, PolicyMeta, Normalizer, Normalizer]:
     """The expert in a checkpoint's file, the meta, and the scales of proprioception and actions.
 
     Args:
@@ -421,13 +420,12 @@ def _load_expert(
     artifact = artifacts.load(
         file, "expert", fingerprint=None if backbone is None else backbone.fingerprint()
     )
-    meta, tensors = artifact.header.meta, artifact.tensors
+    meta, tensors = cast(PolicyMeta, artifact.header.meta), artifact.tensors
     with reading_meta(file):
-        shape = shape_from(ExpertShape, meta["shape"], file, len(tensors))
+        shape = shape_from(ExpertShape, artifact.header.meta["shape"], file, len(tensors))
         if backbone is not None:
             check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
-        _check_user_meta(meta)
-        _check_recorded(meta, shape.actions, shape.proprio)
+        policy_meta.check(meta, shape.actions, shape.proprio)
         relative_of(meta, shape.actions, shape.proprio)
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
@@ -444,55 +442,7 @@ def _load_expert(
     return expert, meta, Normalizer(**parts["proprio"]), Normalizer(**parts["action"])
 
 
-def _check_user_meta(meta: Mapping[str, Any]) -> None:
-    """Raise ValueError unless what a policy's user has to know is of the types that they read."""
-    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str, "only": str}
-    for name, kind in kinds.items():
-        if name in meta and not isinstance(meta[name], kind):
-            raise ValueError(f"'{name}' is {meta[name]!r}")
-    for name in ("state", "action"):
-        if not isinstance(meta.get(name, ""), str | list):
-            raise ValueError(f"'{name}' is {meta[name]!r}")
-    if not isinstance(meta.get("rename", {}), dict):
-        raise ValueError(f"'rename' is {meta['rename']!r}")
-    if "replan" in meta and meta["replan"] < 1:
-        raise ValueError(f"'replan' is {meta['replan']}")
-    ensemble = meta.get("ensemble", 0.0)
-    if type(ensemble) not in (int, float) or not math.isfinite(ensemble):
-        raise ValueError(f"'ensemble' is {ensemble!r}")
-    if meta.get("stored", FLOAT32) not in STORED_TYPES:
-        raise ValueError(f"'stored' is {meta['stored']!r}")
-    if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
-        raise ValueError(f"'cameras' is {meta['cameras']!r}")
-    for size in meta.get("pictures", []):
-        if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
-            raise ValueError(f"'pictures' has the size {size!r}")
-
-
-def _check_recorded(meta: Mapping[str, Any], actions: int, positions: int) -> None:
-    """Raise ValueError unless names, spread and rate, where there are any, are of such a robot.
-
-    Checkpoints that were written before these were kept have none of them.
-    """
-    for key, count in (("action_names", actions), ("proprio_names", positions)):
-        names = meta.get(key)
-        if names is None:
-            continue
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"'{key}' is {names!r}")
-        if len(names) != count:
-            raise ValueError(f"'{key}' has {len(names)} names for {count} numbers")
-    spread = meta.get("action_std", [0.0] * actions)
-    if not isinstance(spread, list) or len(spread) != actions:
-        raise ValueError(f"'action_std' is {spread!r} for {actions} numbers")
-    if not all(type(one) in (int, float) and 0 <= one < math.inf for one in spread):
-        raise ValueError(f"'action_std' is {spread!r}")
-    fps = meta.get("fps", 1.0)
-    if type(fps) not in (int, float) or not 0 < fps < math.inf:
-        raise ValueError(f"'fps' is {fps!r}")
-
-
-def sizes_of(meta: Mapping[str, Any]) -> tuple[tuple[int, int], ...]:
+def sizes_of(meta: PolicyMeta) -> tuple[tuple[int, int], ...]:
     """(height, width) of the pictures that each camera showed in training; () where none is known.
 
     Only a backbone that reads pictures of any size has to know.
@@ -500,7 +450,7 @@ def sizes_of(meta: Mapping[str, Any]) -> tuple[tuple[int, int], ...]:
     return tuple((height, width) for height, width in meta.get("pictures", ()))
 
 
-def cameras_of(meta: Mapping[str, Any], task: str | None) -> tuple[str, ...]:
+def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     """The cameras of a simulated task that a policy looks by; empty for the task's own.
 
     Raises:

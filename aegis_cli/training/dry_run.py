@@ -60,8 +60,7 @@ class DryRunReport:
         sets: of several sets of demonstrations, by their paths, what is said of all together and
             the `share` of the frames that are seen; None where there is one.
         tokens_per_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it, `method` being what it keeps all
-            along.
+        memory_mb: by what takes it; `method` is what the method keeps from beginning to end.
         memory_measured_mb: the most that building and these steps took, and what a checkpoint takes
             more; None where no step was taken.
         memory_together_mb: measured, else estimated, of all processes on one machine, whose memory

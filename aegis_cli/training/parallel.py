@@ -55,7 +55,7 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
                 f"at least {parts}, one for each",
                 f"--set {name}={parts}, or a lower train.accumulate, or fewer processes",
             )
-    if ranks.several and settings.parallel == "fsdp":
+    if shards(settings, ranks):
         _check_sharding(settings, method)
     if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
@@ -63,6 +63,11 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
             "the anchor gradient of the whole batch, of which each has its share",
             "--set aegis.fraction=1, and aegis.refresh for a cheaper step; or one process",
         )
+
+
+def shards(settings: Train, ranks: Ranks) -> bool:
+    """Whether each process is to keep some rows of each weight alone."""
+    return ranks.several and settings.parallel == "fsdp"
 
 
 def _check_sharding(settings: Train, method: Method) -> None:

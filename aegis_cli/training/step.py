@@ -266,36 +266,17 @@ def _backward(
         the anchor gradient, by the parameters' ids.
     """
     policy, method, parts = settings.policy, settings.method, settings.parts
-    backbone, device = policy.backbone, policy.backbone.device
-    total = settings.ranks.total if settings.ranks.several else None
-
-    def encode(shown: RobotBatch, inputs: Batch | None) -> tuple[Encoding, Pass]:
-        """The backbone's pass over frames of the batch."""
-        if inputs is None:
-            inputs = backbone.prepare(shown.images, shown.instructions)
-        encoding = backbone.encode(inputs)
-        seen = Pass(
-            step=settings.index,
-            inputs=inputs,
-            hidden=encoding.hidden,
-            mask=encoding.mask,
-            image=encoding.image,
-            frames=shown,
-            share=of.share,
-            total=total,
-            prepared=prepared.by_method,
-        )
-        return encoding, seen
+    device = policy.backbone.device
 
     def encode_part() -> Pass:
         shown = first_frames(batch, parts.fraction)
         with devices.autocast(device, settings.precision), torch.enable_grad():
-            return encode(shown, prepared.anchor_inputs)[1]
+            return _encode(settings, shown, of, prepared.anchor_inputs, prepared.by_method)[1]
 
     with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
         # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding, seen = encode(batch, prepared.inputs)
+            encoding, seen = _encode(settings, batch, of, prepared.inputs, prepared.by_method)
         if method.stop_gradient:
             # Before torch 2.11 autocast keeps weights that it has rounded without a graph for later
             # passes with one, such as a method's own, and these then give the weights no gradient.
@@ -311,6 +292,33 @@ def _backward(
         return loss.detach(), None, {}
     w2, taken = _dual_backward(settings, whole, seen, encode_part)
     return loss.detach(), w2.detach(), taken
+
+
+def _encode(
+    settings: _Settings, frames: RobotBatch, of: WholeBatch, inputs: Batch | None, by_method: Any
+) -> tuple[Encoding, Pass]:
+    """The backbone's pass over frames, and what a method sees of it.
+
+    Args:
+        inputs: what the backbone has made of the frames ahead of the step; None: nothing.
+        by_method: what the method has made of them.
+    """
+    backbone, ranks = settings.policy.backbone, settings.ranks
+    if inputs is None:
+        inputs = backbone.prepare(frames.images, frames.instructions)
+    encoding = backbone.encode(inputs)
+    seen = Pass(
+        step=settings.index,
+        inputs=inputs,
+        hidden=encoding.hidden,
+        mask=encoding.mask,
+        image=encoding.image,
+        frames=frames,
+        share=of.share,
+        total=ranks.total if ranks.several else None,
+        prepared=by_method,
+    )
+    return encoding, seen
 
 
 def _dual_backward(

@@ -326,6 +326,7 @@ class Window:
         return found
 
     def means(self, batch_size: int) -> dict[str, float]:
+        """A line's figures: means over these steps, and frames per second."""
         step_s = (self.data_s + self.update_s) / self.steps
         return {
             "loss": self.loss / self.steps,
@@ -440,8 +441,8 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Generator[Iterator[Rob
             yield batches
         return
     with (
-        prefetch.for_device(_fetching(run), steps, device) as prepared,
-        prefetch.ahead(lambda _: next(prepared).with_prepared_on(device), steps, 1) as sent,
+        prefetch.for_device(_fetching(run), steps, device) as ready,
+        prefetch.ahead(lambda _: next(ready).with_prepared_on(device), steps, 1) as sent,
     ):
         yield sent
 
@@ -717,9 +718,9 @@ def validation_loss(
     parts = frames.split(settings.batch_size)
     with (
         _evaluating(policy),
-        prefetch.for_device(prepare, parts, backbone.device) as prepared,
+        prefetch.for_device(prepare, parts, backbone.device) as ready,
     ):
-        for numbers, own, sharing, passes in prepared:
+        for numbers, own, sharing, passes in ready:
             losses = []
             each = [batch for batch, _ in step.passes(own, sharing, passes, backbone.device)]
             shares = numbers.split(list(map(len, each)))

@@ -53,8 +53,8 @@ def _load(path: Path) -> dict[str, Any]:
     """
     records = files.load_json(path)
     try:
-        for record in records.values():
-            key, outputs = record["key"], record["outputs"]
+        for noted in records.values():
+            key, outputs = noted["key"], noted["outputs"]
             if not all(isinstance(text, str) for text in (key, *outputs, *outputs.values())):
                 raise TypeError("a digest that is no text")
     except (AttributeError, TypeError, KeyError) as error:

@@ -14,7 +14,7 @@ from samples.command import ROOT
 
 from aegis_cli import recipes
 from aegis_cli.common.events import Event, Warned
-from aegis_cli.training import assemble
+from aegis_cli.training import loading
 
 Bad = Callable[..., str]
 
@@ -60,7 +60,7 @@ def test_the_advice_for_a_missing_anchor_asks_the_questions_of_the_recipe(
 def test_the_advice_for_an_anchor_of_another_prompt_can_be_followed(anchor_file: Path) -> None:
     point, said = ROOT / "recipes" / "point.yaml", list[Event]()
     recipe = recipes.load(point, ["anchor.ask=Now {}"])
-    assemble._warn_of_another_prompt(anchor_file, recipe, said.append)
+    loading._warn_of_another_prompt(anchor_file, recipe, said.append)
     assert isinstance(said[0], Warned) and "--ask 'Now {}'" in said[0].text
     advised = said[0].text.partition("or --set ")[2].partition(";")[0]
     assert recipes.load(point, shlex.split(advised)).anchor.ask == "{}"

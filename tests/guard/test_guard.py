@@ -40,7 +40,7 @@ from aegis_cli.core.moments import merge
 from aegis_cli.models import backbones
 from aegis_cli.recipes import Aegis as Options
 from aegis_cli.recipes import Kfac, Nullspace, Recipe
-from aegis_cli.training import assemble, schedule, train
+from aegis_cli.training import assemble, loading, schedule, train
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_equal_to_training_step_for_step(
     section = {"aegis": Options, "nullspace": Nullspace, "kfac": Kfac}[method](**options)
     settings = dataclasses.replace(recipe.train, method=method)
     changed = dataclasses.replace(recipe, **{method: section}, train=settings)
-    monkeypatch.setattr(assemble.backbones, "load", lambda name: in_double(LOAD(name)))
+    monkeypatch.setattr(loading.backbones, "load", lambda name: in_double(LOAD(name)))
     theirs, ours = (
         assemble.build(
             changed, methods.get(method), demos_file, anchor_file, Path("unused"), ignore

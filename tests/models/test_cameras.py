@@ -31,7 +31,7 @@ from aegis_cli.evaluation import open_loop
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Anchor, Demos, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import assemble, checkpoint, train
+from aegis_cli.training import checkpoint, loading, train
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -293,7 +293,7 @@ def test_of_one_camera_that_nobody_has_named_nothing_is_said(
     artifacts.save(anchor, "anchor", moments | {"count": torch.tensor([5, 5])}, meta=meta)
     told: list[Event] = []
     sets = Path("my demos"), Path("others")
-    assemble._warn_of_other_cameras(anchor, sets, shown, {"cam": "top"}, told.append)
+    loading._warn_of_other_cameras(anchor, sets, shown, {"cam": "top"}, told.append)
     assert bool(told) is warns
     if told:
         assert "aegis anchor --demos 'my demos' " in told[0].text

@@ -35,7 +35,7 @@ from aegis_cli.recipes import Recipe
 from aegis_cli.reporting import gather
 from aegis_cli.studies.cells import Cell
 from aegis_cli.studies.policy_cells import cell_key
-from aegis_cli.training import assemble, dry_run
+from aegis_cli.training import assemble, dry_run, loading
 
 EPISODES = 8
 Aegis = Callable[..., tuple[int, str, str]]
@@ -228,13 +228,13 @@ def test_a_card_names_every_set_of_the_hub() -> None:
 def test_an_anchor_of_frames_is_of_one_set(recipe: Recipe, sets: tuple[Path, Path]) -> None:
     shown = replace(recipe.anchor, source="demos", parts=("moments",))
     with pytest.raises(AegisError, match=r"anchor.source: demos with demonstrations in .* and"):
-        assemble.check_named(replace(mixed(recipe, sets), anchor=shown), ignore)
+        loading.check_named(replace(mixed(recipe, sets), anchor=shown), ignore)
 
 
 def test_weights_belong_to_a_path(recipe: Recipe) -> None:
     alone = replace(recipe, demos=replace(recipe.demos, weights=(1.0, 1.0)))
     with pytest.raises(AegisError, match=r"demos.weights without demos.path"):
-        assemble.check_named(alone, ignore)
+        loading.check_named(alone, ignore)
 
 
 def test_weights_may_be_equal_and_paths_may_not(tmp_path: Path) -> None:

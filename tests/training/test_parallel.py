@@ -25,7 +25,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Recipe
-from aegis_cli.training import assemble, checkpoint, parallel, step
+from aegis_cli.training import assemble, checkpoint, loading, parallel, step
 from aegis_cli.training.train import LEDGER
 
 Make = Callable[..., Job]
@@ -280,11 +280,11 @@ def test_one_process_of_a_machine_decodes_and_the_others_find_the_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     order: list[str] = []
-    load = assemble.load_demonstrations
+    load = loading.load_demonstrations
     monkeypatch.setenv("LOCAL_RANK", str(number))
     monkeypatch.setattr(Ranks, "wait", lambda _: order.append("wait"))
     monkeypatch.setattr(
-        assemble, "load_demonstrations", lambda *given: order.append("load") or load(*given)
+        loading, "load_demonstrations", lambda *given: order.append("load") or load(*given)
     )
     job = make("naive", tmp_path / "run")
     method = METHODS["naive"]

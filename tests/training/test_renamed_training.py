@@ -27,7 +27,7 @@ from aegis_cli.publishing import export
 from aegis_cli.recipes import Recipe
 from aegis_cli.studies.cells import Cell
 from aegis_cli.studies.policy_cells import cell_key
-from aegis_cli.training import assemble, checkpoint, dry_run
+from aegis_cli.training import checkpoint, dry_run, loading
 
 TOP, OVERHEAD = "observation.images.top", "observation.images.overhead"
 RENAME = {OVERHEAD: TOP, "main_dx": "dx"}
@@ -195,7 +195,7 @@ def test_the_advice_for_an_anchor_of_other_cameras_renames(
     frames = ("anchor", "--backbone", tiny_folder, "--samples", 5, "--demos", sets[1])
     assert aegis(*frames, "--out", tmp_path / "a", "--json")[0] == 0
     said = list[Event]()
-    assemble._warn_of_other_cameras(tmp_path / "a", sets[1], (TOP,), RENAME, said.append)
+    loading._warn_of_other_cameras(tmp_path / "a", sets[1], (TOP,), RENAME, said.append)
     assert isinstance(said[0], Warned)
     assert f"--camera {TOP} --rename {OVERHEAD}={TOP}" in said[0].text
 
@@ -226,11 +226,11 @@ def test_what_is_no_renaming_is_refused(value: str, tmp_path: Path) -> None:
 
 def test_a_renaming_belongs_to_a_path(recipe: Recipe) -> None:
     with pytest.raises(AegisError, match="demos.rename without demos.path"):
-        assemble.check_named(renaming(recipe), ignore)
+        loading.check_named(renaming(recipe), ignore)
 
 
 def test_a_policy_is_built_of_what_was_renamed(recipe: Recipe, sets: tuple[Path, Path]) -> None:
     backbone = backbones.load(recipe.backbone)
     chosen = renaming(recipe, camera="top")
-    found = assemble.load_demonstrations(chosen, backbone, sets, ignore)
+    found = loading.load_demonstrations(chosen, backbone, sets, ignore)
     assert found.cameras == (TOP,) and SETTINGS.chunk > 1

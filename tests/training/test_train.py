@@ -40,7 +40,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.models.expert import ActionExpert
 from aegis_cli.recipes import Nullspace, Recipe
-from aegis_cli.training import assemble, checkpoint, dry_run, schedule, train
+from aegis_cli.training import checkpoint, dry_run, loading, schedule, train
 
 FIGURES = {"step", "loss", "lr_expert"} | TIMES
 
@@ -171,7 +171,7 @@ def test_running_averages_that_move_are_told_once_with_what_keeps_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """No known family has any, but a model of the hub may."""
-    load = assemble.backbones.load
+    load = loading.backbones.load
 
     def with_averages(name: str) -> Backbone:
         backbone = load(name)
@@ -179,7 +179,7 @@ def test_running_averages_that_move_are_told_once_with_what_keeps_them(
         backbone.stem.register_forward_pre_hook(lambda stem, given: stem.norm(*given))
         return backbone
 
-    monkeypatch.setattr(assemble.backbones, "load", with_averages)
+    monkeypatch.setattr(loading.backbones, "load", with_averages)
     chosen = replace(recipe, train=replace(SETTINGS, steps=2, checkpoint_every=2, freeze=freeze))
     for run in (train.run, dry_run.run):
         told: list[str] = []

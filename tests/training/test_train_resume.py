@@ -38,7 +38,7 @@ from aegis_cli.methods import METHODS
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Cotrain, Insulate, Lora, Probe, Recipe, Rollout
-from aegis_cli.training import checkpoint, folder, step, train
+from aegis_cli.training import checkpoint, folder, loading, step, train
 
 # --- resuming -------------------------------------------------------------------------------------
 
@@ -61,7 +61,7 @@ def test_running_averages_of_a_resumed_run_go_on_from_where_they_were(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No known family has any, but a model of the hub may."""
-    load, save = train.assemble.backbones.load, checkpoint.save
+    load, save = loading.backbones.load, checkpoint.save
     found: dict[str, torch.Tensor] = {}
 
     def with_averages(name: str) -> Backbone:
@@ -76,7 +76,7 @@ def test_running_averages_of_a_resumed_run_go_on_from_where_they_were(
         found[folder.name] = norm.running_mean.clone()  # in the end the last checkpoint's
         return save(folder, step, policy, *rest, **more)
 
-    monkeypatch.setattr(train.assemble.backbones, "load", with_averages)
+    monkeypatch.setattr(loading.backbones, "load", with_averages)
     monkeypatch.setattr(checkpoint, "save", saved)
     start("naive", tmp_path / "whole", anchor=None)
     with pytest.raises(KeyboardInterrupt):

@@ -31,8 +31,7 @@ def frontier(compared: At, report: Any) -> Markup | None:
 
     As in the terminal's plot, at most six methods have a colour.
     """
-    named = coloured_methods(report)
-    number = {method: named.index(method) if method in named else _REST for method in named}
+    number = {method: place for place, method in enumerate(coloured_methods(report))}
     chosen = chosen_task(report)
     spots = [] if chosen is None else _means(compared, report.tasks.index(chosen), number)
     tried, curves = _tried(compared, number)

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.page.html import Child, Markup, element
+from aegis_cli.cli.render.layout import paragraphs
 
 
 def table(
@@ -68,7 +69,8 @@ def view(shown: RenderableType) -> Iterator[Markup]:
         case Table():
             yield _terminal_table(shown)
         case Text():
-            yield from _paragraphs(shown)
+            for line in paragraphs(shown):
+                yield element("h3" if shown.style == "bold" else "p", line)
         case _:
             raise TypeError(f"no HTML for a {type(shown).__name__}")
 
@@ -79,10 +81,3 @@ def _terminal_table(shown: Table) -> Markup:
     rows = zip(*(map(str, column.cells) for column in shown.columns), strict=True)
     title = str(shown.title) if shown.title else None
     return table(header, [list(row) for row in rows], left, title)
-
-
-def _paragraphs(text: Text) -> Iterator[Markup]:
-    """One a line; an indented line goes on with the one before."""
-    for line in text.plain.replace("\n  ", " ").splitlines():
-        if line.strip():
-            yield element("h3" if text.style == "bold" else "p", line.strip())

@@ -185,14 +185,8 @@ def _spectra(what: str, sites: Sequence[Any]) -> Table:
 
 def _features(features: Sequence[Any]) -> Table:
     """A line a feature, or one for each of its numbers where the dataset has statistics."""
-    shown = (
-        "min",
-        "q01",
-        "q99",
-        "max",
-        "mean",
-        "std",
-    )  # LeRobot merges medians into the least of the episodes'
+    # Without medians: LeRobot merges those of episodes into the least, which is no median.
+    shown = ("min", "q01", "q99", "max", "mean", "std")
     rows = []
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))

@@ -90,6 +90,12 @@ def number(value: float | None, significant: int = 4) -> str:
     return f"{value:,.0f}" if whole else f"{value:.{significant}g}"
 
 
+def paragraphs(text: Text) -> list[str]:
+    """The lines of a text that are not blank; an indented line goes on with the one before."""
+    lines = text.plain.replace("\n  ", " ").splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
 def spread(estimate: Any, show: Callable[[float], str]) -> str:
     """`mean ±half`: the distance of the farther end; the mean alone of a single run."""
     if estimate is None or estimate.half is None:

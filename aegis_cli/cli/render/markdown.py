@@ -13,7 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import BEST, unmarked
+from aegis_cli.cli.render.layout import BEST, paragraphs, unmarked
 from aegis_cli.common.files import write_text
 
 
@@ -41,7 +41,8 @@ def _parts(view: RenderableType) -> Iterator[str]:
                 yield f"**{view.title}**"
             yield _table(view)
         case Text():
-            yield from _paragraphs(view)
+            for line in paragraphs(view):
+                yield f"**{line}**" if view.style == "bold" else line
         case _:
             raise TypeError(f"no Markdown for a {type(view).__name__}")
 
@@ -63,10 +64,3 @@ def _cell(cell: RenderableType) -> str:
 
 def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
-
-
-def _paragraphs(text: Text) -> Iterator[str]:
-    """One a line; an indented line goes on with the one before."""
-    for line in text.plain.replace("\n  ", " ").splitlines():
-        if line.strip():
-            yield f"**{line.strip()}**" if text.style == "bold" else line.strip()

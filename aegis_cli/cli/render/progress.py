@@ -53,6 +53,7 @@ class Pace:
         self.first = 0  # units that were done before the first of these points
 
     def update(self, done: int) -> None:
+        """Note how many units are done now."""
         now_s = self.clock()
         if not self.points:
             self.first = done

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -166,37 +166,38 @@ def dual(report: Any) -> RenderableType:
     return Group(pairs(rest), plain_table(("Task", "Zero-shot accuracy %"), tasks))
 
 
+class _Column(NamedTuple):
+    """A column of the table of methods: a field of its rows, and how that is written.
+
+    Attributes:
+        more_is_better: None where neither end is good.
+    """
+
+    name: str
+    field: str
+    write: Callable[[float | None], str]
+    more_is_better: bool | None
+
+
 def pipeline(report: Any) -> RenderableType:
+    """A line per method; what no method has, such as a success, has no column."""
     acts = acting(report.rows)
-    header = (
-        "Method",
-        "VQA %",
-        "Drop (points)",
-        "Cross-entropy (nats)",
-        *acts,
-        "Open-loop error",
-        "W2²",
-        "Energy shed %",
-        "Step time (x naive)",
-        "Validation loss",
-    )
-    columns: list[tuple[str, Callable[[float | None], str], bool | None]] = [
-        ("accuracy", percent, True),
-        ("drop_points", partial(fixed, digits=2), False),
-        ("cross_entropy", partial(fixed, digits=3), False),
-        *((field, percent, field != "wrong_target") for field in acts.values()),
-        ("open_loop_error", partial(fixed, digits=3), False),
-        ("w2", number, False),
-        ("energy_shed", partial(percent, digits=2), None),
-        ("step_time_ratio", partial(fixed, digits=2), False),
-        ("validation_loss", partial(fixed, digits=4), False),
+    columns = [
+        _Column("VQA %", "accuracy", percent, True),
+        _Column("Drop (points)", "drop_points", partial(fixed, digits=2), False),
+        _Column("Cross-entropy (nats)", "cross_entropy", partial(fixed, digits=3), False),
+        *(_Column(name, field, percent, field != "wrong_target") for name, field in acts.items()),
+        _Column("Open-loop error", "open_loop_error", partial(fixed, digits=3), False),
+        _Column("W2²", "w2", number, False),
+        _Column("Energy shed %", "energy_shed", partial(percent, digits=2), None),
+        _Column("Step time (x naive)", "step_time_ratio", partial(fixed, digits=2), False),
+        _Column("Validation loss", "validation_loss", partial(fixed, digits=4), False),
     ]
-    # What no method has, such as a success where nothing can be rolled out, is left out.
-    there = [any(getattr(row, field) is not None for row in report.rows) for field, *_ in columns]
-    drawn = [_marked_column(report.rows, *column) for column in itertools.compress(columns, there)]
-    header = (header[0], *itertools.compress(header[1:], there))
+    shown = [c for c in columns if any(getattr(row, c.field) is not None for row in report.rows)]
+    header = ("Method", *(column.name for column in shown))
     named = [r.method if report.merge is None else f"{r.method}, merged" for r in report.rows]
-    rows = zip(named, *drawn, strict=True)
+    figures = [_marked_column(report.rows, column) for column in shown]
+    rows = zip(named, *figures, strict=True)
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
     return Group(
@@ -240,14 +241,9 @@ def _merged(merge: Mapping[str, Any]) -> str:
     return f"{how}: the policies are those in METHOD/merged"
 
 
-def _marked_column(
-    rows: Sequence[Any],
-    field: str,
-    write: Callable[[float | None], str],
-    more_is_better: bool | None,
-) -> list[Cell]:
-    values = [getattr(row, field) for row in rows]
-    return marked([write(value) for value in values], values, more_is_better)
+def _marked_column(rows: Sequence[Any], column: _Column) -> list[Cell]:
+    values = [getattr(row, column.field) for row in rows]
+    return marked([column.write(value) for value in values], values, column.more_is_better)
 
 
 def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
@@ -267,6 +263,7 @@ def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
 
 
 def bench(report: Any) -> RenderableType:
+    """A line per method, and below what an anchor's pass and the guard cost."""
     rows = [
         (name, fixed(ratio, 2), fixed(report.peak_memory[name], 2))
         for name, ratio in report.step_time.items()
@@ -285,6 +282,8 @@ def bench(report: Any) -> RenderableType:
 
 
 def bench_shape(report: Any) -> RenderableType:
+    """A line per method and per part of an anchor, and below what they were measured with."""
+
     def row(name: str, cost: Any) -> tuple[str, ...]:
         if cost.step_s is None:
             return name, "out of memory", *("-",) * 5
@@ -382,9 +381,7 @@ def _unit(name: str, value: Any) -> str:
 
 def _is_share(name: str) -> bool:
     return (
-        name in _SHARES
-        or name.endswith(("_accuracy", "accuracy"))
-        or name.startswith(("energy_shed", "success"))
+        name in _SHARES or name.endswith("accuracy") or name.startswith(("energy_shed", "success"))
     )
 
 

@@ -146,11 +146,8 @@ class SceneRenderer:
             mujoco.mjtRndFlag.mjRND_HAZE,
         ):
             self._renderer.scene.flags[flag] = 0
-        self._floor = self._geom("floor")
+        self._floor = self._model.geom("floor").id
         self._materials = [self._model.material(name).id for name in ("flat", "checker")]
-
-    def _geom(self, name: str) -> int:
-        return mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def render(self, rng: np.random.Generator, only: tuple[str, str] | None = None) -> Scene:
         """Draw one scene from `rng` and render it.
@@ -207,7 +204,7 @@ class SceneRenderer:
                 continue
             x_px, y_px = rng.uniform(0, IMAGE_SIZE, 2)
             metres_per_px = camera.distance / _FOCAL_PX
-            geom = self._geom(name)
+            geom = self._model.geom(name).id
             radius = metres_per_px * rng.uniform(0.7, 1.8)
             self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
             brightness = rng.uniform(0.2, 0.85)
@@ -249,7 +246,7 @@ class SceneRenderer:
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
         # So a cube's face covers about the area of a ball.
         side = radius * 0.85 if shape == "cube" else radius
-        geom = self._geom(f"thing{i}")
+        geom = self._model.geom(f"thing{i}").id
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
         self._model.geom_size[geom] = side, half_height if shape == "cylinder" else side, side
         self._model.geom_rbound[geom] = 2 * radius

@@ -1,0 +1,116 @@
+"""What a policy's user has to know beside its weights, as the headers of its files say it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Required, TypedDict
+
+from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES
+
+
+class PolicyMeta(TypedDict, total=False):
+    """What a policy was trained as and on; a key that is not there is not known, or at its default.
+
+    Attributes:
+        method: by which it was trained.
+        task: that it was trained on; None for one that is not simulated.
+        replan: how many actions of a chunk are executed.
+        ensemble: the decay of its temporal ensemble, if it has one.
+        normalization: of positions and actions.
+        relative: for each action the place of the position that it is predicted relative to, or
+            None; not there where all are absolute.
+        only, state, action, rename: what was learned of the demonstrations, as the recipe's section
+            `demos` has it.
+        action_names, proprio_names: a name for each number.
+        fps: frames per second of the demonstrations.
+        action_std: the actions' standard deviations, where one of the policy's scales is another.
+        dataset: the id on the hub of the demonstrations, or the ids of several.
+        base_model: the id on the hub of the model that the backbone began as.
+        cameras: in their order, if they are several, or not the task's own.
+        pictures: (height, width) of what each camera showed, for a backbone that reads pictures of
+            any size.
+        stored: the type that the backbone's weights came in, if it is not float32.
+        merge: by what rule `aegis merge` has moved the backbone back, and how far.
+    """
+
+    method: Required[str]
+    task: Required[str | None]
+    replan: Required[int]
+    ensemble: float
+    normalization: str
+    relative: list[int | None]
+    only: str
+    state: str | list[str]
+    action: str | list[str]
+    rename: dict[str, str]
+    action_names: list[str]
+    proprio_names: list[str]
+    fps: float
+    action_std: list[float]
+    dataset: str | list[str]
+    base_model: str
+    cameras: list[str]
+    pictures: list[list[int]]
+    stored: str
+    merge: dict[str, Any]
+
+
+def check(meta: PolicyMeta, actions: int, positions: int) -> None:
+    """Check what a file says.
+
+    Args:
+        actions, positions: of how many numbers the policy's are.
+
+    Raises:
+        ValueError: a value of another type than its key has, or of another robot.
+    """
+    _check_types(meta)
+    _check_recorded(meta, actions, positions)
+
+
+def _check_types(meta: PolicyMeta) -> None:
+    """Raise ValueError unless what a policy's user has to know is of the types that they read."""
+    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str, "only": str}
+    for name, kind in kinds.items():
+        if name in meta and not isinstance(meta[name], kind):
+            raise ValueError(f"'{name}' is {meta[name]!r}")
+    for name in ("state", "action"):
+        if not isinstance(meta.get(name, ""), str | list):
+            raise ValueError(f"'{name}' is {meta[name]!r}")
+    if not isinstance(meta.get("rename", {}), dict):
+        raise ValueError(f"'rename' is {meta['rename']!r}")
+    if "replan" in meta and meta["replan"] < 1:
+        raise ValueError(f"'replan' is {meta['replan']}")
+    ensemble = meta.get("ensemble", 0.0)
+    if type(ensemble) not in (int, float) or not math.isfinite(ensemble):
+        raise ValueError(f"'ensemble' is {ensemble!r}")
+    if meta.get("stored", FLOAT32) not in STORED_TYPES:
+        raise ValueError(f"'stored' is {meta['stored']!r}")
+    if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
+        raise ValueError(f"'cameras' is {meta['cameras']!r}")
+    for size in meta.get("pictures", []):
+        if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
+            raise ValueError(f"'pictures' has the size {size!r}")
+
+
+def _check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:
+    """Raise ValueError unless names, spread and rate, where there are any, are of such a robot.
+
+    Checkpoints that were written before these were kept have none of them.
+    """
+    for key, count in (("action_names", actions), ("proprio_names", positions)):
+        names = meta.get(key)
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"'{key}' is {names!r}")
+        if len(names) != count:
+            raise ValueError(f"'{key}' has {len(names)} names for {count} numbers")
+    spread = meta.get("action_std", [0.0] * actions)
+    if not isinstance(spread, list) or len(spread) != actions:
+        raise ValueError(f"'action_std' is {spread!r} for {actions} numbers")
+    if not all(type(one) in (int, float) and 0 <= one < math.inf for one in spread):
+        raise ValueError(f"'action_std' is {spread!r}")
+    fps = meta.get("fps", 1.0)
+    if type(fps) not in (int, float) or not 0 < fps < math.inf:
+        raise ValueError(f"'fps' is {fps!r}")
