@@ -400,6 +400,7 @@ def train(
     given_here = source is not None and source.name == "COMMANDLINE"
     as_they_are = ["--device", str(device)] if given_here else []
     as_they_are += ["--json"] if as_json else []
+    advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
         stages.refuse_options(
@@ -1237,7 +1238,7 @@ def run(
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
-    advice.of_run(resolved)
+    advice.of_run(resolved, overrides or [])
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
     with stages.joined(device) if stage.shared else nullcontext():
