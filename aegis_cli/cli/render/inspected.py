@@ -228,14 +228,14 @@ def _as_ranges(layers: Sequence[str]) -> str:
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     size = max(1, math.ceil(len(bins) / rows))
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [
-        (
-            _steps(c[0].first_step, c[-1].last_step),
-            percent(sum(b.energy_shed for b in c) / len(c), 3),
-        )
-        for c in chunks
-    ]
+    lines = [(_steps(c[0].first_step, c[-1].last_step), percent(_mean_shed(c), 3)) for c in chunks]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def _mean_shed(bins: Sequence[Any]) -> float:
+    """The mean over the steps of some bins, of which one may have a step more than another."""
+    steps = [b.last_step - b.first_step + 1 for b in bins]
+    return sum(b.energy_shed * n for b, n in zip(bins, steps, strict=True)) / sum(steps)
 
 
 def _steps(first: int, last: int) -> str:
