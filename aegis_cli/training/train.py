@@ -352,6 +352,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
+    if done < settings.steps:  # before the first step, so that its time is told too
+        on_event(Progress("train", done, settings.steps, "steps"))
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             finished = index + 1
