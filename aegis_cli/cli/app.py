@@ -97,6 +97,7 @@ from aegis_cli.recipes import (
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
+from aegis_cli.studies.metrics import deciding_decimals
 
 app = typer.Typer(
     cls=Commands,
@@ -766,13 +767,20 @@ def probe(
             as_json=as_json,
         )
         failed = None
-        if report.passed is False:
-            dropped = f"a drop of {report.drop_points:.2f} points"
-            if gate is Gate.upper_end:
-                dropped += f", which may be as large as {report.drop_interval[1]:.2f}"
+        if report.passed is False and max_drop is not None:
+            upper = gate is Gate.upper_end
+            shown = f"{report.drop_points:.2f}" if upper else _past(report.drop_points, max_drop)
+            dropped = f"a drop of {shown} points"
+            if upper:
+                dropped += f", which may be as large as {_past(report.drop_interval[1], max_drop)}"
             failed = f"{dropped}, more than {limit} {max_drop:g}"
         _say_gate(failed)
     _end_at_gate(failed)
+
+
+def _past(points: float, max_drop: float) -> str:
+    """Points in two digits after the point, or in as many as show that they are past the limit."""
+    return f"{points:.{deciding_decimals(points, f'<= {max_drop!r}', 2)}f}"
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
