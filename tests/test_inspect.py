@@ -128,6 +128,19 @@ def test_energy_over_time_is_binned_without_losing_a_step(tmp_path):
     assert bins[0].layers[1] == 0
 
 
+def test_a_row_of_the_course_is_the_mean_over_its_steps(tmp_path, capsys):
+    """Of 100 steps some bins have two and others one, which are no means of equal weight."""
+    steps = 100
+    shed = [0.9 if step % 3 == 0 else 0.001 * step for step in range(1, steps + 1)]
+    ta = [[-(share**0.5), 0.0] for share in shed]
+    path = save_ledger(tmp_path / "l.safetensors", [[1.0, 0.0]] * steps, ta, [[1.0, 1.0]] * steps)
+    rows = [line.split() for line in shown(capsys, path).splitlines() if " to " in line]
+    assert len(rows) == 8
+    for first, _, last, mean in rows:
+        own = shed[int(first) - 1 : int(last)]
+        assert float(mean) == pytest.approx(100 * sum(own) / len(own), abs=6e-4)
+
+
 def test_a_ledger_alone_gives_the_runs_figures(tmp_path):
     run, file = (
         inspection.run(save_run(tmp_path / "run")),

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from aegis_cli.cli import render
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import AnyStudy, Recipe, RobotStreamStudyRecipe, StreamStudyRecipe, options
+from aegis_cli.recipes import (
+    AnyStudy,
+    Nullspace,
+    Recipe,
+    RobotStreamRecipe,
+    RobotStreamStudyRecipe,
+    StreamRecipe,
+    StreamStudyRecipe,
+    options,
+)
 from aegis_cli.recipes.study_cells import cell
+from aegis_cli.recipes.variants import SECTIONS
 
 _SCENES = "scenes"
 
@@ -34,11 +44,15 @@ def of_training(recipe: Recipe, anchor: Path | None) -> None:
     of_questions(recipe.backbone, _measured_on(anchor), _trained_on(recipe))
 
 
-def of_run(recipe: Recipe | AnyStudy) -> None:
-    """Warn of what a recipe's anchors and probes ask; streams of images have none."""
+def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
+    """Warn of what a recipe's anchors and probes ask; streams of images have none.
+
+    A recipe of one run is warned of its settings too, of which `overrides` were given.
+    """
     if isinstance(recipe, StreamStudyRecipe):
         return
     if isinstance(recipe, Recipe):
+        of_settings(recipe, overrides, recipe.methods)
         of_questions(recipe.backbone, *_asked(recipe))
         return
     if isinstance(recipe, RobotStreamStudyRecipe):
@@ -53,6 +67,58 @@ def of_run(recipe: Recipe | AnyStudy) -> None:
         of_questions(one.backbone, *names)
         if _SCENES in names:
             return  # one warning is enough
+
+
+def of_settings(
+    recipe: Recipe | StreamRecipe | RobotStreamRecipe,
+    overrides: Sequence[str] = (),
+    methods: Sequence[str] = (),
+) -> None:
+    """Warn of settings that do not do what they seem to, beside the others.
+
+    Args:
+        overrides: the KEY=VALUE that were given, which somebody has in mind. A file's keys may be
+            there for other methods.
+        methods: those that are trained; default: the recipe's `train.method`.
+    """
+    if launch.rank() > 0:
+        return
+    methods = methods or (recipe.train.method,)
+    texts = [*_of_schedule(recipe), *_of_unread(overrides, methods)]
+    if isinstance(recipe, Recipe) and "nullspace" in methods:
+        texts += _of_thresholds(recipe.nullspace)
+    for text in texts:
+        render.note(f"warning: {text}")
+
+
+def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[str]:
+    train = recipe.train
+    if train.warmup >= train.steps:
+        share = 100 * train.steps / train.warmup
+        yield (
+            f"train.warmup: {train.warmup} with train.steps: {train.steps}: the learning rates end "
+            f"at {share:.3g} % of their peaks, where the rise ends, and never fall. Set "
+            "train.warmup lower"
+        )
+
+
+def _of_unread(overrides: Sequence[str], methods: Sequence[str]) -> Iterator[str]:
+    """Options of methods that are not trained, and the rate of a backbone that does not learn."""
+    own = {method.replace("-", "_") for method in methods}
+    named = " and ".join(methods)
+    for dotted in (each.partition("=")[0].strip() for each in overrides):
+        section = dotted.partition(".")[0]
+        frozen = dotted == "train.backbone_lr" and set(methods) == {"stop-gradient"}
+        if frozen or (section in SECTIONS and section not in own):
+            yield f"--set {dotted} changes nothing: {named} does not read it"
+
+
+def _of_thresholds(chosen: Nullspace) -> Iterator[str]:
+    if chosen.energy is not None and chosen.soft != Nullspace().soft:
+        yield (
+            f"nullspace.soft: {chosen.soft:g} changes nothing beside nullspace.energy: "
+            f"{chosen.energy:g}, which is instead of it. Delete one of them"
+        )
 
 
 def _asked(recipe: Recipe) -> Iterator[str | None]:

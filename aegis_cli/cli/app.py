@@ -97,6 +97,7 @@ from aegis_cli.recipes import (
 )
 from aegis_cli.recipes.strict_yaml import did_you_mean
 from aegis_cli.recipes.study_cells import load as load_run
+from aegis_cli.studies.metrics import deciding_decimals
 
 app = typer.Typer(
     cls=Commands,
@@ -397,6 +398,7 @@ def train(
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
     as_they_are = _kept_options(ctx, device, as_json)
+    advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
         stages.refuse_options(
@@ -770,18 +772,24 @@ def probe(
             as_json=as_json,
         )
         failed = None
-        if report.passed is False:
-            failed = f"{_dropped(report, gate)}, more than {limit} {max_drop:g}"
+        if report.passed is False and max_drop is not None:
+            dropped = _dropped(report, gate, max_drop)
+            failed = f"{dropped}, more than {limit} {max_drop:g}"
         _say_gate(failed)
     _end_at_gate(failed)
 
 
-def _dropped(report: Any, gate: Gate) -> str:
+def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
     """A probe's drop in words, by what of it the gate limits."""
-    said = f"a drop of {report.drop_points:.2f} points"
-    if gate is Gate.upper_end:
-        said += f", which may be as large as {report.drop_interval[1]:.2f}"
-    return said
+    if gate is not Gate.upper_end:
+        return f"a drop of {_past(report.drop_points, max_drop)} points"
+    may_be = _past(report.drop_interval[1], max_drop)
+    return f"a drop of {report.drop_points:.2f} points, which may be as large as {may_be}"
+
+
+def _past(points: float, max_drop: float) -> str:
+    """Points in two digits after the point, or in as many as show that they are past the limit."""
+    return f"{points:.{deciding_decimals(points, f'<= {max_drop!r}', 2)}f}"
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
@@ -1242,7 +1250,7 @@ def run(
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
-    advice.of_run(resolved)
+    advice.of_run(resolved, overrides or [])
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
     with stages.joined(device) if stage.shared else nullcontext():

@@ -9,6 +9,7 @@ a model would read other pixels than its anchor did.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -25,12 +26,18 @@ Draw = np.random.Generator
 
 
 def augmented(
-    images: Images, frames: Sequence[int], names: Sequence[str], count: int, seed: int, step: int
+    images: Images,
+    frames: Sequence[int],
+    names: Sequence[str],
+    count: int,
+    seed: int,
+    step: int,
+    repeats: Sequence[int] | None = None,
 ) -> Images:
     """The images of a batch, each changed by transformations of its own.
 
-    What is drawn depends on the seed, the step, the frame and its camera alone: neither a resumed
-    run nor the number of processes changes it.
+    What is drawn depends on the seed, the step, the frame, its camera and its repeat alone: neither
+    a resumed run nor the number of processes changes it.
 
     Args:
         images: [B, H, W, 3] uint8, or B tuples of one [H, W, 3] per camera.
@@ -38,21 +45,32 @@ def augmented(
         names: keys of `TRANSFORMATIONS` that are drawn from.
         count: how many of them change one image; all of them if there are fewer.
         step: number of steps before this one.
+        repeats: how often each of the B frames has come before in this step, as `earlier` counts
+            it; None where none comes twice.
     """
+
+    def changed(image: Tensor, place: int, camera: int) -> Tensor:
+        again = 0 if repeats is None else repeats[place]
+        # Earlier versions drew nothing for a repeat, and what they drew for a frame stays.
+        key = [seed, step, frames[place], camera, *([again] if again else [])]
+        return _augmented(image, names, count, np.random.default_rng(key))
+
     if isinstance(images, Tensor):
-        return torch.stack(
-            [
-                _augmented(image, names, count, np.random.default_rng([seed, step, frame, 0]))
-                for image, frame in zip(images, frames, strict=True)
-            ]
-        )
+        return torch.stack([changed(image, place, 0) for place, image in enumerate(images)])
     return [
-        tuple(
-            _augmented(image, names, count, np.random.default_rng([seed, step, frame, camera]))
-            for camera, image in enumerate(several)
-        )
-        for several, frame in zip(images, frames, strict=True)
+        tuple(changed(image, place, camera) for camera, image in enumerate(several))
+        for place, several in enumerate(images)
     ]
+
+
+def earlier(frames: Sequence[int]) -> list[int]:
+    """How often each frame comes before its place: a batch may be larger than the dataset."""
+    seen = Counter[int]()
+    found = []
+    for frame in frames:
+        found.append(seen[frame])
+        seen[frame] += 1
+    return found
 
 
 def _augmented(image: Tensor, names: Sequence[str], count: int, draw: Draw) -> Tensor:

@@ -58,8 +58,9 @@ class StepCost:
         peak_memory: that over naive's.
         tflop: 10^12 operations of its matrix products.
         mfu: share of the device's peak that the operations which training needs make: at most
-            naive's, since a second backward pass is no use in itself. None where the device's peak
-            is not known.
+            naive's, since a second backward pass is no use in itself. Under gradient checkpointing
+            the second forward pass counts, in naive's too. None where the device's peak is not
+            known.
     """
 
     step_s: float | None = None

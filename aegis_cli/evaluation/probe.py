@@ -155,7 +155,8 @@ def run(
     report = compare(after, reference, layers, max_drop, asked.skipped, between, gate)
     told = {"target": target, **settings, "anchor": None if anchor is None else str(anchor)}
     report = replace(report, asked=told)
-    _warn_of_little_knowledge(report, target if baseline is None else baseline, on_event)
+    known = target if baseline is None else baseline
+    warn_of_little_knowledge(report, known, "probe", on_event)
     warn_of_few_questions(report.questions, report.drop_interval, max_drop, "probe", on_event)
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
@@ -213,7 +214,9 @@ def _answered(
     return graded, found
 
 
-def _warn_of_little_knowledge(report: ProbeReport, model: str, on_event: OnEvent) -> None:
+def warn_of_little_knowledge(
+    report: ProbeReport, model: str, stage: str, on_event: OnEvent
+) -> None:
     """Warn where a drop says nothing, since the questions were not answered before either."""
     known = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
     if known >= report.majority:
@@ -224,7 +227,7 @@ def _warn_of_little_knowledge(report: ProbeReport, model: str, on_event: OnEvent
         "know. A model that answers in sentences needs e.g. --ask '{} Answer with a single word "
         "or phrase.' (anchor.ask and probe.ask in a recipe)"
     )
-    on_event(Warned("probe", text))
+    on_event(Warned(stage, text))
 
 
 def warn_of_few_questions(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from aegis_cli.anchors import anchor_file
+from aegis_cli.anchors.second_moments import shared
 from aegis_cli.common import artifacts
 from aegis_cli.core import ledger
 from aegis_cli.core.spectrum import Spectrum, rank
@@ -30,10 +32,21 @@ def of_anchor(path: Path) -> dict[str, Any]:
         for kind, layers in (("image", anchor.image), ("text", anchor.text))
         if layers[i].count
     )
-    inputs, curvature = (
-        tuple(_site(*item) for item in part.items()) for part in (anchor.inputs, anchor.curvature)
-    )
+    inputs, curvature = (_sites(part) for part in (anchor.inputs, anchor.curvature))
     return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
+
+
+def _sites(spectra: Mapping[str, Spectrum]) -> tuple[SiteSpectrum, ...]:
+    """A line for each map; those that share a spectrum follow the one that it is stored with."""
+    followers = shared(spectra)
+    found = []
+    for leader, spectrum in spectra.items():
+        if leader in followers:
+            continue
+        first = _site(leader, spectrum)
+        others = [name for name, own in followers.items() if own == leader]
+        found += [first, *(dataclasses.replace(first, name=x, same_as=leader) for x in others)]
+    return tuple(found)
 
 
 def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:

@@ -67,6 +67,8 @@ class SiteSpectrum:
         kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows
             that are read.
         stored: eigenvectors in the file; None for a table, whose directions are its rows.
+        same_as: the map that reads the same tensor, with which the spectrum is stored; None where
+            it is this map's own.
     """
 
     name: str
@@ -74,6 +76,7 @@ class SiteSpectrum:
     size: int
     kept: tuple[int, ...]
     stored: int | None
+    same_as: str | None = None
 
 
 @dataclass(frozen=True)

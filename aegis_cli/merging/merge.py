@@ -133,6 +133,8 @@ def _run(
     tried, chosen = _Sweep(), strength
     if strength is None:
         judge = _Judge(source, settings, on_event)
+        if max_drop is not None:
+            probe.warn_of_little_knowledge(judge.baseline, source.base_name, "merge", on_event)
         tried = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
         chosen = _weakest(tried.points, max_drop, gate)
         # The one that passes, or the strongest, which comes nearest to it.
@@ -241,8 +243,9 @@ class _Judge:
         return len(self._asked.questions)
 
     @property
-    def baseline_accuracy(self) -> float:
-        return probe.compare(self._before, None, [], None).accuracy
+    def baseline(self) -> probe.ProbeReport:
+        """What the pre-trained model answers."""
+        return probe.compare(self._before, None, [], None)
 
     def point(self, strength: float, kept: float) -> MergePoint:
         """What the backbone's weights of now are worth."""
@@ -265,7 +268,7 @@ def _try(
         points.append(judge.point(strength, displacement.keep(strength)))
         shown = {"accuracy": points[-1].accuracy}
         on_event(Progress("merge", number, len(strengths), "strengths", shown))
-    return _Sweep(tuple(points), judge.baseline_accuracy, judge.questions)
+    return _Sweep(tuple(points), judge.baseline.accuracy, judge.questions)
 
 
 def _weakest(points: Sequence[MergePoint], max_drop: float | None, gate: str) -> float | None:

@@ -183,6 +183,7 @@ def _step(run: Pretraining, loss: Tensor, step: int) -> float:
     for optimizer in run.optimizers:
         optimizer.zero_grad()
     loss.backward()
+    # Not of the cell head, which is left behind in the end: the models that ship were made so.
     norm = nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
     _check_finite("gradient norm", norm, step)  # clipped by it, all weights would be NaN
     for optimizer in run.optimizers:

@@ -323,7 +323,8 @@ class Train:
     final_lr_share: float = key(
         UP_TO_ONE,
         default=0.1,
-        doc="Share of the peak learning rates that is left at the last step.",
+        doc="Share of the peak learning rates to which they fall. The step after the last would "
+        "have it; the last is a little above.",
     )
     ema_decay: float | None = key(
         SHARE,

@@ -71,7 +71,8 @@ class StreamTrain:
     final_lr_share: float = key(
         UP_TO_ONE,
         default=0.1,
-        doc="Share of the peak learning rates that is left at a task's last step.",
+        doc="Share of the peak learning rates to which they fall. The step after a task's last "
+        "would have it; the last is a little above.",
     )
     label_smoothing: float = key(
         BELOW_ONE, default=0.2, doc="Share of each label that is spread over all classes."
@@ -121,7 +122,8 @@ class RobotTrain:
     final_lr_share: float = key(
         UP_TO_ONE,
         default=0.1,
-        doc="Share of the peak learning rates that is left at a task's last step.",
+        doc="Share of the peak learning rates to which they fall. The step after a task's last "
+        "would have it; the last is a little above.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,

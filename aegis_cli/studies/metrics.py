@@ -239,6 +239,14 @@ def _once(values: Values) -> dict[Setting, float]:
 # --- bars -----------------------------------------------------------------------------------------
 
 
+_SIGNS: dict[str, Callable[[float, float], bool]] = {
+    "<=": lambda value, limit: value <= limit + ROUNDING,
+    ">=": lambda value, limit: value >= limit - ROUNDING,
+    ">": lambda value, limit: value > limit + ROUNDING,
+}
+_ALL_DECIMALS = 9  # what differs by less than ROUNDING is judged alike
+
+
 @dataclass(frozen=True)
 class Check:
     """A demand's number, if it could be measured, and whether that is good enough.
@@ -252,6 +260,23 @@ class Check:
     interval: tuple[float, float] | None
     passed: bool | None
     by_design: bool = False
+
+
+def deciding_decimals(value: float, demand: str, decimals: int) -> int:
+    """Digits after the point, `decimals` or more, that show a plain value as it is judged.
+
+    1.0204 is above a limit of 1.02, and 1.02 is not.
+
+    Args:
+        demand: in words, as a `Check` has it.
+    """
+    sign, _, rest = demand.partition(" ")
+    if sign not in _SIGNS:
+        return decimals
+    holds, limit = _SIGNS[sign], float(rest.partition(" ")[0])
+    while decimals < _ALL_DECIMALS and holds(round(value, decimals), limit) != holds(value, limit):
+        decimals += 1
+    return decimals
 
 
 @dataclass(frozen=True)

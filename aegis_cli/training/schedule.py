@@ -13,7 +13,8 @@ from aegis_cli.recipes import Train
 def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> float:
     """The factor on the peak learning rate at `step`, from 0.
 
-    It rises linearly over `warmup` steps, then follows a cosine to `final_share`.
+    It rises linearly over `warmup` steps, then follows a cosine to `final_share`, which the step
+    after the last would have.
     """
     if step < warmup:
         return (step + 1) / warmup  # at a rate of 0 the first step would be lost

@@ -353,6 +353,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
+    if done < settings.steps:  # before the first step, so that its time is told too
+        on_event(Progress("train", done, settings.steps, "steps"))
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
         for index in range(done, settings.steps):
             finished = index + 1
@@ -463,13 +465,16 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
 
     def fetch(index: int) -> RobotBatch:
         rows = order.rows(index)
-        frames = run.demos.train[step.own_rows(rows, run.ranks, settings.accumulate)]
+        of_step = run.demos.train[rows]
+        own = step.own_rows(torch.arange(len(rows)), run.ranks, settings.accumulate)
+        frames = of_step[own]
         batch = run.demos.batch(frames, settings.chunk)
         if settings.augment is not None:
             drawn_from = settings.augment, settings.augment_count
-            images = augment.augmented(batch.images, frames.tolist(), *drawn_from, seed, index)
-            batch = dataclasses.replace(batch, images=images)
-        return prepared(run, batch, run.demos.train[rows], index) if waits else batch
+            repeats = torch.tensor(augment.earlier(of_step.tolist()))[own].tolist()
+            drawn = frames.tolist(), *drawn_from, seed, index, repeats
+            batch = dataclasses.replace(batch, images=augment.augmented(batch.images, *drawn))
+        return prepared(run, batch, of_step, index) if waits else batch
 
     return fetch
 

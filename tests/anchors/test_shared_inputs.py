@@ -11,6 +11,7 @@ from samples.tiny import make_tiny
 from samples.training import images
 from torch import Tensor, nn
 
+from aegis_cli import inspection
 from aegis_cli.anchors import anchor_file, curvature, inputs, passes, second_moments
 from aegis_cli.anchors.curvature import CurvatureRecorder
 from aegis_cli.anchors.inputs import InputRecorder
@@ -22,6 +23,7 @@ from aegis_cli.core.nullspace import Strength, allowed, protect
 from aegis_cli.core.spectrum import Spectrum, second_moment
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.questions import Question
+from aegis_cli.inspection import InspectReport
 from aegis_cli.models import structure
 
 WIDTH, OUT = 12, (8, 4, 4)  # of the input, and of queries, keys and values
@@ -163,6 +165,22 @@ def test_a_shared_spectrum_is_in_the_file_once(tmp_path: Path) -> None:
     moved = anchor_file.to_device(again, torch.device("cpu"))
     assert moved.inputs["query"] is moved.inputs["key"]
     assert second_moments.shared(moved.inputs) == second_moments.shared(anchor.inputs)
+
+
+def test_inspect_names_the_map_with_which_a_spectrum_is_stored(tmp_path: Path) -> None:
+    model = Apart()
+    anchor = Anchor(inputs=read(model, draw(0)), curvature=curved(model, draw(0)))
+    saved(tmp_path / "a.safetensors", anchor)
+    report = inspection.run(tmp_path / "a.safetensors")
+    assert isinstance(report, InspectReport)
+    told = [(site.name, site.same_as) for site in report.inputs]
+    first = told.index(("query", None))
+    assert told[first + 1 : first + 3] == [("key", "query"), ("value", "query")]
+    assert {site.same_as for site in report.inputs if site.name in ("norm", "out")} == {None}
+    assert len({name for name, _ in told}) == len(told) == len(anchor.inputs)
+    ends = tuple(f"{name}.inputs" for name in ("query", "key", "value"))
+    own = [site.same_as or site.name for site in report.curvature if site.name in ends]
+    assert len(own) == 3 and len(set(own)) == 1
 
 
 def test_beside_a_sketch_vectors_are_in_half_precision_and_come_back_orthonormal(

@@ -59,7 +59,7 @@ def measure(folder: Path, steps: int, points: int) -> tuple[dict[int, int], int]
     found: dict[int, int] = {}
 
     def note(event: Progress) -> None:
-        if event.stage == "train" and event.done % (steps // points) == 0:
+        if event.stage == "train" and event.done and event.done % (steps // points) == 0:
             found[event.done] = resident_bytes()
 
     train.run(recipe, "aegis", demos, anchor, out, on_event=note)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 from samples.command import refused
-from samples.small_run import recipe
+from samples.small_run import recipe, write
 from samples.vqa_files import write_jsonl
 
 from aegis_cli.cli import advice
 from aegis_cli.common import artifacts
-from aegis_cli.recipes import Anchor, Cotrain, Probe, StudyRecipe, shipped
+from aegis_cli.recipes import Anchor, Cotrain, Nullspace, Probe, StudyRecipe, shipped
 from aegis_cli.recipes.studies import PolicyVariant
 from aegis_cli.recipes.study_cells import load
 
@@ -75,6 +75,52 @@ def test_a_training_is_warned_of_its_anchor(
     assert said() == ""
     advice.of_training(recipe(real), tmp_path / "missing")
     assert said() == ""
+
+
+def test_a_rate_that_never_falls_is_warned_of(said: Said) -> None:
+    for steps, warmup, warned in ((4, 3, ""), (4, 4, "end at 100 %"), (4, 100, "end at 4 %")):
+        advice.of_settings(recipe("embedded", steps=steps, warmup=warmup))
+        text = said()
+        assert warned in text and text.count("warning: train.warmup") == bool(warned)
+
+
+def test_a_threshold_that_another_replaces_is_warned_of(said: Said) -> None:
+    both = replace(recipe("embedded"), nullspace=Nullspace(soft=1e-3, energy=0.9))
+    advice.of_settings(both, methods=("naive", "nullspace"))
+    assert "nullspace.soft: 0.001 changes nothing" in said()
+    advice.of_settings(both)  # naive alone
+    advice.of_settings(replace(both, nullspace=Nullspace(energy=0.9)), methods=("nullspace",))
+    assert said() == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "methods", "warned"),
+    [
+        ("train.backbone_lr=1e-3", ("stop-gradient",), True),
+        ("train.backbone_lr=1e-3", ("stop-gradient", "naive"), False),
+        ("train.expert_lr=1e-3", ("stop-gradient",), False),
+        ("kfac.weight=1", ("naive", "nullspace"), True),
+        ("kfac.weight=1", ("naive", "kfac"), False),
+        ("moe_adapters.rank=2", ("moe-adapters",), False),
+    ],
+)
+def test_a_key_that_no_method_reads_is_warned_of_where_it_is_given(
+    given: str, methods: tuple[str, ...], warned: bool, said: Said
+) -> None:
+    advice.of_settings(recipe("embedded"), [given], methods)
+    text = said()
+    assert ("changes nothing: " + " and ".join(methods) in text) == warned
+    assert bool(text) == warned
+
+
+def test_a_training_tells_of_settings_and_goes_on(
+    aegis: Callable[..., tuple[int, str, str]], tiny_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    small = write(tmp_path, tiny_folder)
+    given = ("--set", "train.warmup=9", "--set", "kfac.weight=1")
+    code, _, err = aegis("train", small, "--demos", demos_file, "--out", tmp_path / "run", *given)
+    assert code == 0
+    assert err.count("warning: train.warmup: 9") == err.count("warning: --set kfac.weight") == 1
 
 
 def test_the_commands_warn_and_go_on(

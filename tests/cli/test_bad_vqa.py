@@ -112,6 +112,14 @@ LINES = {
     "answers that are no list": (line(answers=True), ("answers [True]", "a list")),
     "answers of fractions": (line(answers=[2.5]), ("answers [2.5]",)),
     "answers of truth": (line(answers=[False]), ("answers [False]",)),
+    "several images": (
+        line(image=["images/0.png", "images/1.png"]),
+        ("a list of 2 images", "one image of"),
+    ),
+    "several images by another key": (
+        json.dumps({"images": ["images/0.png"], "question": "what?", "answers": ["a"]}),
+        ("a list of 1 images", "one image of each"),
+    ),
     "an image that is no path": (line(image=7), ("image 7", "relative")),
     "an id that is no name": (line(id=[1]), ("id [1]",)),
     "an id of truth": (line(id=True), ("id True",)),
@@ -412,6 +420,12 @@ def test_a_bad_row(
     datasets.Dataset.from_dict(hub_rows(IMAGES, **columns)).save_to_disk("data")
     bad("data", *says)
     assert skipped("data") == count
+
+
+def test_rows_of_several_images(bad: Callable[..., str], place: Path) -> None:
+    several = [[picture(i), picture(i + 1)] for i in range(48)]
+    datasets.Dataset.from_dict(hub_rows(IMAGES, image=several)).save_to_disk("data")
+    bad("data", "lists of images", "one image of each question")
 
 
 @pytest.mark.parametrize("missing", ["image", "question", "answers"])

@@ -397,6 +397,16 @@ def test_the_probes_gate_is_the_exit_code(passed, code, aegis, stage):
     assert ("gate failed: a drop of 2.00 points, more" in err) == (code == 1)
 
 
+def test_a_drop_that_fails_by_little_is_shown_to(aegis, stage):
+    """2.00 points are not more than a limit of 2."""
+    stage("probe", Report(passed=False, drop_points=2.004, drop_interval=(1.0, 3.0004)))
+    _, _, err = aegis("probe", "runs/x", "--baseline", "embedded", "--max-drop", "2")
+    assert "a drop of 2.004 points, more than --max-drop 2" in err
+    limits = ("--max-drop", "3", "--gate", "upper")
+    _, _, err = aegis("probe", "runs/x", "--baseline", "embedded", *limits)
+    assert "a drop of 2.00 points, which may be as large as 3.0004, more than" in err
+
+
 def test_a_gate_on_the_upper_end_says_it(aegis, stage):
     calls = stage("probe", Report(passed=False))
     limits = ("--max-drop", "2.5", "--gate", "upper")

@@ -6,7 +6,7 @@ import dataclasses
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,10 +37,12 @@ from aegis_cli.evaluation.open_loop import (
 )
 from aegis_cli.evaluation.results import Result
 from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
-from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy
+from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy, SiteSpectrum
 from aegis_cli.merging.merge import MergeReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
+from aegis_cli.studies.comparison import POLICY_BAR
 from aegis_cli.studies.metrics import Column as Declared
+from aegis_cli.studies.metrics import bar
 
 # --- progress -------------------------------------------------------------------------------------
 
@@ -545,6 +547,21 @@ def test_maps_that_share_a_spectrum_are_rows_of_the_table_alone() -> None:
     facts = {"samples": 3, "shared": {"inputs.k_proj": "inputs.q_proj"}}
     shown = text_of(render.inspect(InspectReport("anchor", "x", facts)))
     assert "samples" in shown and "shared" not in shown and "k_proj" not in shown
+    first = SiteSpectrum("layers.0.q_proj", "dense", 4, (1, 2, 3), 4)
+    other = replace(first, name="layers.0.k_proj", same_as="layers.0.q_proj")
+    shown = text_of(render.inspect(InspectReport("anchor", "x", facts, inputs=(first, other))))
+    lines = [line.split() for line in shown.splitlines() if "dense" in line]
+    assert lines[0][-2:] == ["3", "4"] and lines[1][-3:] == ["3", "with", "q_proj"]
+
+
+@pytest.mark.parametrize(("step_time", "shown"), [(1.0204, "1.0204 no"), (1.9, "1.90 no")])
+def test_a_step_time_beside_its_verdict_has_the_digits_that_decide(
+    step_time: float, shown: str
+) -> None:
+    made = found(("naive", "x"), 5)
+    result = replace(made.tasks[0].results[1], step_time=step_time)
+    made.tasks[0].results[1] = replace(result, bar=bar(POLICY_BAR, result))
+    assert shown in text_of(study(made))
 
 
 def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:

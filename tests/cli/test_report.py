@@ -20,6 +20,8 @@ from samples.studies import found
 
 from aegis_cli.common import files
 from aegis_cli.evaluation import results
+from aegis_cli.studies.comparison import POLICY_BAR
+from aegis_cli.studies.metrics import bar
 from aegis_cli.studies.tuning import PolicyPoint
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
@@ -425,6 +427,19 @@ def test_each_demand_of_the_bar_shows_the_interval_that_it_is_judged_by(
     for number, check in enumerate(checks):
         ends = {f"{place}/{number}/interval/{end}" for end in (0, 1)}
         assert (ends <= paths) is (check["interval"] is not None)
+
+
+def test_a_step_time_is_shown_in_the_digits_that_decide(aegis, tmp_path: Path) -> None:
+    """1.0204 fails a limit of 1.02, and `1.02`, failed, would contradict itself."""
+    study = found(("naive", "x"), 5)
+    result = study.tasks[0].results[1]
+    barred = bar(POLICY_BAR, replace(result, step_time=1.0204))
+    study.tasks[0].results[1] = replace(result, step_time=1.0204, bar=barred)
+    files.save_json(tmp_path / "table.json", study.to_json())
+    page, document = reported(aegis, tmp_path)
+    check_figures(page, document)
+    place = "/tasks/0/results/1/bar/checks/3/value"
+    assert [text for path, _, text in page.figures if path.endswith(place)] == ["1.0204"]
 
 
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:

@@ -69,6 +69,15 @@ def test_draws_follow_from_seed_step_and_frame_alone() -> None:
         assert not torch.equal(whole, augment.augmented(given, range(6), names, 3, seed, step))
 
 
+def test_a_frame_that_comes_again_in_a_step_is_drawn_for_anew() -> None:
+    given, numbers = frames(1).expand(3, -1, -1, -1), [7, 7, 7]
+    alone = augment.augmented(given[:1], [7], AUGMENTATIONS, 3, seed=1, step=2)
+    found = augment.augmented(given, numbers, AUGMENTATIONS, 3, 1, 2, augment.earlier(numbers))
+    assert torch.equal(found[:1], alone)
+    assert len({one.numpy().tobytes() for one in found}) == 3
+    assert augment.earlier([4, 5, 4, 4, 5]) == [0, 0, 1, 2, 1]
+
+
 def test_cameras_are_drawn_for_by_themselves() -> None:
     given = frames(2)
     several = [(given[0], given[0]), (given[1], given[1])]

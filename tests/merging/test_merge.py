@@ -304,6 +304,15 @@ def test_a_gate_that_the_questions_cannot_tell_is_warned_of(
     assert "too coarsely for a gate at 1" in " ".join(err.split())
 
 
+def test_a_gate_on_questions_that_the_model_never_knew_is_warned_of(
+    aegis: Aegis, run_folder: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    """Untrained, it has nothing to lose, and every strength passes."""
+    given = ("--method", "linear", "--sweep", "1", "--max-drop", 0.5, "--out", tmp_path / "merged")
+    code, _, err = aegis("merge", run_folder, "--demos", demos_file, *given, "--questions", 14)
+    assert code == 0 and "can hardly lose what it does not know" in " ".join(err.split())
+
+
 def test_a_gate_fails_where_no_strength_passes(
     aegis: Aegis, merge_place: Place, tmp_path: Path
 ) -> None:

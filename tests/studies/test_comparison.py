@@ -30,6 +30,7 @@ from aegis_cli.studies.metrics import (
     Mean,
     bar,
     columns,
+    deciding_decimals,
     lowest,
     over_seeds,
     points,
@@ -181,6 +182,25 @@ def test_each_demand_of_the_bar_is_needed(
     assert made.passed is passed and made.checks[place].passed is passed
     assert made.checks[place].value == (value.mean if isinstance(value, Estimate) else value)
     assert all(check.passed for i, check in enumerate(made.checks) if i != place)
+
+
+@pytest.mark.parametrize(
+    ("value", "demand", "decimals"),
+    [
+        (1.02, "<= 1.02 x naive", 2),
+        (1.0199, "<= 1.02 x naive", 2),
+        (1.0204, "<= 1.02 x naive", 4),
+        (1.024, "<= 1.02 x naive", 3),
+        (0.98, "<= 1.02 x naive", 2),
+        (-1.004, ">= -1 point", 3),
+        (0.0004, "> 0 points", 4),
+        (0.0, "none", 2),
+    ],
+)
+def test_a_value_is_shown_on_the_side_that_it_is_judged_on(
+    value: float, demand: str, decimals: int
+) -> None:
+    assert deciding_decimals(value, demand, 2) == decimals
 
 
 def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:

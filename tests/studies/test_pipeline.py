@@ -403,8 +403,11 @@ def test_what_is_asked_after_the_training_stands_in_each_runs_own_recipe(
 ) -> None:
     trained = {m: content(root / "small" / m / "checkpoints") for m in METHODS}
     now = replace(small, methods=("aegis", "naive"), probe=Probe(questions=14, max_drop=90.0))
-    pipeline.run(now, root)
+    said = list[Event]()
+    pipeline.run(now, root, said.append)
     assert calls == {"probe": 2}
+    warned = [event.text for event in said if isinstance(event, Warned)]
+    assert sum("can hardly lose what it does not know" in text for text in warned) == 2
     for method in METHODS:
         run = root / "small" / method
         assert content(run / "checkpoints") == trained[method]

@@ -47,6 +47,28 @@ def test_it_changes_the_training_and_the_order_of_passes_does_not(
     assert one == pytest.approx(two, rel=1e-5)
 
 
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_a_batch_larger_than_the_dataset_has_no_picture_twice(
+    accumulate: int,
+    recipe: Recipe,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[bytes] = []
+    original = augment.augmented
+
+    def noting(*given: Any) -> Any:
+        images = original(*given)
+        drawn.extend(image.numpy().tobytes() for image in images)
+        return images
+
+    monkeypatch.setattr(train.augment, "augmented", noting)
+    large = changed(recipe, augment=ALL, batch_size=600, steps=1, accumulate=accumulate)
+    start("naive", tmp_path / "run", recipe=large)
+    assert len(drawn) == 600 and len(set(drawn)) == 600
+
+
 def test_the_validation_loss_sees_frames_as_they_are(
     recipe: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ from aegis_cli.cli.render.frontier import (
 )
 from aegis_cli.cli.render.studies import knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
-from aegis_cli.studies.metrics import columns
+from aegis_cli.studies.metrics import columns, deciding_decimals
 
 _DECLARED = columns(PolicyResult)
 _LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
@@ -114,7 +114,7 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
             f"{task['task']}{asked}",
             note(
                 "Means over seeds; below each its 95 % interval, the wider of Student's "
-                "t and the crossed bootstrap. ",
+                "t, which may reach beyond 0 and 100 %, and the crossed bootstrap. ",
                 *_before(task),
             ),
             table(header + ["Bar"] * barred, rows, left=1 + turned),
@@ -182,5 +182,7 @@ def _demands(results: At) -> Markup:
 
 def _checked(check: At) -> Sequence[Child]:
     """A demand's figure, its verdict, and below them the interval by whose end it is judged."""
-    judged = verdict(check["passed"].value)
-    return [decimal(check["value"], 2), " ", judged, between(check["interval"], decimal)]
+    judged, value, digits = verdict(check["passed"].value), check["value"].value, 2
+    if value is not None and not check["interval"]:
+        digits = deciding_decimals(value, check["demand"].value, digits)
+    return [decimal(check["value"], digits), " ", judged, between(check["interval"], decimal)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import takewhile
 from shlex import quote
 from typing import Any
 
@@ -174,13 +175,22 @@ def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> st
 
 
 def _spectra(what: str, sites: Sequence[Any]) -> Table:
-    """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy."""
+    """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy.
+
+    What is stored with another map, which reads the same tensor, is told by its name.
+    """
     header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
-    rows = [
-        (x.name, x.kind, str(x.size), *map(str, x.kept), "-" if x.stored is None else str(x.stored))
-        for x in sites
-    ]
+    rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), _stored(x)) for x in sites]
     return plain_table(header, rows, left=2)
+
+
+def _stored(site: Any) -> str:
+    if site.same_as is not None:
+        # It stands right above: what both names begin with says nothing.
+        first = zip(site.name.split("."), site.same_as.split("."), strict=False)
+        alike = sum(1 for _ in takewhile(lambda words: words[0] == words[1], first))
+        return f"with {'.'.join(site.same_as.split('.')[alike:])}"
+    return "-" if site.stored is None else str(site.stored)
 
 
 def _features(features: Sequence[Any]) -> Table:
@@ -212,14 +222,14 @@ def _as_ranges(layers: Sequence[str]) -> str:
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
     size = max(1, math.ceil(len(bins) / rows))
     chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [
-        (
-            _steps(c[0].first_step, c[-1].last_step),
-            percent(sum(b.energy_shed for b in c) / len(c), 3),
-        )
-        for c in chunks
-    ]
+    lines = [(_steps(c[0].first_step, c[-1].last_step), percent(_mean_shed(c), 3)) for c in chunks]
     return plain_table(("Steps", "Energy shed, mean %"), lines)
+
+
+def _mean_shed(bins: Sequence[Any]) -> float:
+    """The mean over the steps of some bins, of which one may have a step more than another."""
+    steps = [b.last_step - b.first_step + 1 for b in bins]
+    return sum(b.energy_shed * n for b, n in zip(bins, steps, strict=True)) / sum(steps)
 
 
 def _steps(first: int, last: int) -> str:

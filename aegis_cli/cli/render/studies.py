@@ -25,7 +25,7 @@ from aegis_cli.cli.render.layout import (
     spread,
     unmarked,
 )
-from aegis_cli.studies.metrics import Column, columns
+from aegis_cli.studies.metrics import Column, columns, deciding_decimals
 from aegis_cli.studies.tuning import POLICY_RULE, ROBOT_STREAM_RULE, STREAM_RULE, Rule
 
 
@@ -222,6 +222,13 @@ def _references(results: Sequence[Any]) -> list[RenderableType]:
     return [plain_table(header, rows, left=2)]
 
 
+def _decimals_of_step_time(result: Any) -> int:
+    """Two, or as many as the bar's verdict hangs on."""
+    checks = result.bar.checks if result.bar else ()
+    judged = [c for c in checks if c.value is not None and c.value == result.step_time]
+    return max([2, *(deciding_decimals(c.value, c.demand, 2) for c in judged)])
+
+
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     """One line per variant: its differences by seed, and its verdict.
 
@@ -247,7 +254,7 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
         figures = (
             _figure(r, "drop_points"),
             *(_figure(r, field) for field in gains),
-            fixed(r.step_time, 2),
+            fixed(r.step_time, _decimals_of_step_time(r)),
             "",
         )
         # Without a bar, another naive has no VQA data either; the rest are ceilings.
@@ -344,9 +351,19 @@ def _bars(results: Sequence[Any]) -> Table:
 
 
 def _checked(check: Any) -> str:
-    value = "-" if check.value is None else f"{check.value:.3g}"
+    value = "-" if check.value is None else _judged(check)
     design = ", by design" if check.by_design and check.passed else ""
     return f"{value} {verdict_text(check.passed)}{design}"
+
+
+def _judged(check: Any) -> str:
+    """A value in three digits, or in as many as its verdict hangs on."""
+    shown = f"{check.value:.3g}"
+    if check.interval is not None:  # judged by an end, which is another figure
+        return shown
+    decimals = len(shown.partition(".")[2]) if "e" not in shown else 2
+    needed = deciding_decimals(check.value, check.demand, decimals)
+    return shown if needed == decimals else fixed(check.value, needed)
 
 
 def _stream_notes(report: Any) -> list[str]:

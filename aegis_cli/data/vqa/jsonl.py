@@ -50,6 +50,13 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
             "an object with image, question and answers",
             "correct that line",
         )
+    if isinstance(several := raw.get("image", raw.get("images")), list):
+        raise bad(
+            where,
+            f"a list of {len(several)} images",
+            "one image of each question, as a path",
+            "name the one that is asked about, or join them into one picture",
+        )
     if missing := [key for key in ("image", "question", "answers") if key not in raw]:
         raise bad(
             where,

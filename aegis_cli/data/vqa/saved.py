@@ -167,11 +167,27 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
         else:
             rows = datasets.load_from_disk(str(path))
-        if "image" in rows.column_names:
+        several = _has_lists_of_images(rows)
+        if "image" in rows.column_names and not several:
             rows = rows.cast_column("image", datasets.Image(decode=False))
-        return rows
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
         raise _unreadable(path, error) from error
+    if several:
+        raise AegisError(
+            f"lists of images in the column image of '{path}'",
+            "one image of each question",
+            "keep the one that is asked about, or join them into one picture (datasets: map)",
+        )
+    return rows
+
+
+def _has_lists_of_images(rows: Any) -> bool:
+    import pyarrow as pa
+
+    if "image" not in rows.column_names:
+        return False
+    kind = rows.data.schema.field("image").type
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind))
 
 
 def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
