@@ -219,10 +219,10 @@ def _warn_of_little_knowledge(report: ProbeReport, model: str, on_event: OnEvent
     if known >= report.majority:
         return
     text = (
-        f"'{model}' answers {known:.1%} of these questions, and always the commonest answer of "
-        f"their family would answer {report.majority:.1%}: it can hardly lose what it does not "
-        "know. A model that answers in sentences needs e.g. --ask '{} Answer with a single word "
-        "or phrase.' (anchor.ask and probe.ask in a recipe)"
+        f"'{model}' answers {100 * known:.1f} % of these questions, and always the commonest "
+        f"answer of their family would answer {100 * report.majority:.1f} %: it can hardly lose "
+        "what it does not know. A model that answers in sentences needs e.g. --ask '{} Answer with "
+        "a single word or phrase.' (anchor.ask and probe.ask in a recipe)"
     )
     on_event(Warned("probe", text))
 

@@ -40,7 +40,7 @@ from aegis_cli.training import inputs as places
 _CARD = """# `{method}` merge of strength {strength:g}
 
 The fine-tuned model was moved back towards the pre-trained `{base}` by `aegis merge`, which kept
-{kept:.1%} of the displacement of its maps. Damping {damping:g}.
+{100 * kept:.1f} % of the displacement of its maps. Damping {damping:g}.
 """
 
 

@@ -138,7 +138,7 @@ def test_the_report(start: Start, tmp_path: Path) -> None:
     assert report.energy_shed_mean == pytest.approx(
         np.mean([line["energy_shed"] for line in lines])
     )
-    assert [event.done for event in events] == list(range(1, STEPS + 1))
+    assert [event.done for event in events] == list(range(STEPS + 1))
     assert report.to_json()["step_s"] > 0
 
 
