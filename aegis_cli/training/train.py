@@ -140,9 +140,16 @@ def run(
                 folder.remove(out)
             folder.begin(out, recipe)
             inputs.keep(out, places)
-            files.save_json(out / machine.NAME, machine.describe())
+            files.save_json(out / machine.NAME, _machine(training))
             _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
+
+
+def _machine(run: TrainingRun) -> dict[str, str | int]:
+    """The machine, and what `train.precision` has come to there, which `auto` does not say."""
+    device = run.policy.backbone.device
+    taken = devices.precision_taken(device, run.recipe.train.precision)
+    return machine.describe() | {"precision": taken}
 
 
 def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event: OnEvent) -> None:
