@@ -145,7 +145,8 @@ def run(
         after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
         if before is not None:
-            reference, then = _answered(before, asked, measured, batch_size, ranks, on_event)
+            of_baseline = _of_baseline(on_event)
+            reference, then = _answered(before, asked, measured, batch_size, ranks, of_baseline)
     layers = _layers(now, then)
     between = None if anchor is None else two_sets(anchor, source.name, ask)
     if between is not None and anchor is not None and layers:
@@ -192,6 +193,11 @@ def _path_of(vqa: str) -> dict[str, str]:
         return {}
     is_here = Path(vqa).parent.is_dir()
     return {"path": str(Path(vqa).absolute()) if is_here else vqa}
+
+
+def _of_baseline(on_event: OnEvent) -> OnEvent:
+    """A listener that tells the baseline's answers from those of the model itself."""
+    return lambda event: on_event(replace(event, stage=f"{event.stage} baseline"))
 
 
 def _answered(
