@@ -458,6 +458,16 @@ def stop(stage: str, at: int, event: Progress) -> None:
 
 
 ONE, TWO = "task 1 one", "task 2 two"
+
+
+def test_each_task_tells_its_beginning(tmp_path: Path) -> None:
+    events: list[Progress] = []
+    train.run(recipe("sequential"), tmp_path / "run", on_event=events.append)
+    for stage in (ONE, TWO):
+        done = [event.done for event in events if event.stage == stage]
+        assert done == list(range(len(done))) and len(done) > 2
+
+
 PLACES = [
     (task, at)
     for task, steps in ((ONE, (2, 5, 6, 7, 12)), (TWO, (1, 6, 9, 12)), ("stream", (1, 2)))
