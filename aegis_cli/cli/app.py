@@ -782,12 +782,12 @@ def probe(
 def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
     """A probe's drop in words, by what of it the gate limits."""
     if gate is not Gate.upper_end:
-        return f"a drop of {_past(report.drop_points, max_drop)} points"
-    may_be = _past(report.drop_interval[1], max_drop)
+        return f"a drop of {_beyond(report.drop_points, max_drop)} points"
+    may_be = _beyond(report.drop_interval[1], max_drop)
     return f"a drop of {report.drop_points:.2f} points, which may be as large as {may_be}"
 
 
-def _past(points: float, max_drop: float) -> str:
+def _beyond(points: float, max_drop: float) -> str:
     """Points in two digits after the point, or in as many as show that they are past the limit."""
     return f"{points:.{deciding_decimals(points, f'<= {max_drop!r}', 2)}f}"
 

@@ -140,6 +140,11 @@ def takes_bf16(device: torch.device, precision: str) -> bool:
     return precision == "bf16" or (precision == "auto" and multiplies_bf16(device))
 
 
+def precision_taken(device: torch.device, precision: str) -> str:
+    """What `autocast` takes matrix products in there: bf16 or float32, for `auto` too."""
+    return "bf16" if takes_bf16(device, precision) else "float32"
+
+
 def multiplies_bf16(device: torch.device) -> bool:
     """Whether the hardware multiplies in bfloat16: a GPU of NVIDIA's since Ampere, one of another
     maker, or a processor with AMX.

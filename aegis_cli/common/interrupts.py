@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Generator
+from contextlib import contextmanager, nullcontext
 from types import FrameType
 from typing import Any, NoReturn
+
+from aegis_cli.common.events import OnEvent, Warned
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.01  # after which a signal comes again whose exception was dropped
@@ -153,21 +156,70 @@ class Deferred:
 
 
 @contextmanager
-def deferred() -> Generator[Deferred]:
+def deferred(tell: Callable[[], None] | None = None) -> Generator[Deferred]:
     """Hold back the signals that would raise, until the block calls `leave`, or ends.
 
     A signal with another handler, or none, keeps it.
+
+    Args:
+        tell: is called once, from a thread of its own, as soon as a signal has come.
     """
     held = Deferred()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
     raising = (signal.default_int_handler, stop)
     before = {n: handler for n, handler in handlers.items() if _in_main() and handler in raising}
-    for number in before:
-        signal.signal(number, held.handle)
-    try:
-        yield held
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    telling = _telling(tell, before) if tell is not None and before else nullcontext()
+    with telling:
+        for number in before:
+            signal.signal(number, held.handle)
+        try:
+            yield held
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
     if held.number is not None:
         held.leave()
+
+
+@contextmanager
+def saved_first(stage: str, on_event: OnEvent) -> Generator[Deferred]:
+    """As `deferred`, for a stage that saves its steps before it leaves; it says so at once."""
+    text = (
+        "a signal came: the step under way is finished and saved first. Another one ends this at "
+        "once, without the steps since the last checkpoint"
+    )
+    with deferred(lambda: on_event(Warned(stage, text))) as held:
+        yield held
+
+
+@contextmanager
+def _telling(tell: Callable[[], None], numbers: Collection[int]) -> Generator[None]:
+    """Call `tell` once one of these signals has come inside the block.
+
+    A handler of Python's waits for a call into C, such as a backward pass of many seconds. Python
+    also writes the signal's number to a file at the moment at which it comes, and a thread may
+    read it there. Where somebody else reads it, nothing is told.
+    """
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        if before != -1:
+            signal.set_wakeup_fd(before)
+            yield
+            return
+
+        def listen() -> None:
+            while came := reader.recv(1):
+                if came[0] in numbers:
+                    tell()
+                    return
+
+        thread = threading.Thread(target=listen, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(-1)
+            writer.shutdown(socket.SHUT_WR)
+            thread.join()

@@ -75,7 +75,10 @@ def learn(
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
     ahead = prefetch.ahead(fetch, range(current.step, steps))
-    with ahead as batches, interrupts.deferred() as signaled:
+    stage = f"task {current.task + 1} {training.objective.name}"
+    with ahead as batches, interrupts.saved_first(stage, on_event) as signaled:
+        if current.step < steps:
+            on_event(Progress(stage, current.step, steps, "steps"))
         for step in range(current.step, steps):
             loss = _step(run, training, step, next(batches))
             current.window.append(loss)
@@ -89,7 +92,6 @@ def learn(
             # before a task's end or after it, and nowhere in between
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
                 state.save(run, training.optimizer)
-            stage = f"task {current.task + 1} {training.objective.name}"
             on_event(Progress(stage, current.step, steps, "steps", {"loss": loss}))
             if signaled.number is not None and current.step < steps:
                 state.save(run, training.optimizer)

@@ -196,8 +196,8 @@ def _report(
     if naive is None:
         raise AegisError(f"naive at the shape '{shape}' ran out of memory", "more memory", _FIX)
     on_gpu = devices.on_gpu()
-    bf16 = used.precision == "bf16" or (used.precision == "auto" and on_gpu)
-    assumed = peak_of(torch.cuda.get_device_name(), bf16) if on_gpu else None
+    precision = devices.precision_taken(devices.pick(), used.precision)
+    assumed = peak_of(torch.cuda.get_device_name(), precision == "bf16") if on_gpu else None
     about = machine.describe()
     return ShapeReport(
         shape=shape,
@@ -207,7 +207,7 @@ def _report(
         clock="wall" if on_gpu else "cpu",
         assumed=assumed,
         batch_size=used.batch_size,
-        precision=used.precision,
+        precision=precision,
         weights=used.weights,
         tokens=naive.tokens,
         turns=turns,

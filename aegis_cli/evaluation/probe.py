@@ -145,7 +145,8 @@ def run(
         after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
         if before is not None:
-            reference, then = _answered(before, asked, measured, batch_size, ranks, on_event)
+            of_baseline = _of_baseline(on_event)
+            reference, then = _answered(before, asked, measured, batch_size, ranks, of_baseline)
     layers = _layers(now, then)
     between = None if anchor is None else two_sets(anchor, source.name, ask)
     if between is not None and anchor is not None and layers:
@@ -195,6 +196,11 @@ def _path_of(vqa: str) -> dict[str, str]:
     return {"path": str(Path(vqa).absolute()) if is_here else vqa}
 
 
+def _of_baseline(on_event: OnEvent) -> OnEvent:
+    """A listener that tells the baseline's answers from those of the model itself."""
+    return lambda event: on_event(replace(event, stage=f"{event.stage} baseline"))
+
+
 def _answered(
     model: Backbone,
     asked: VQASet,
@@ -222,10 +228,10 @@ def warn_of_little_knowledge(
     if known >= report.majority:
         return
     text = (
-        f"'{model}' answers {known:.1%} of these questions, and always the commonest answer of "
-        f"their family would answer {report.majority:.1%}: it can hardly lose what it does not "
-        "know. A model that answers in sentences needs e.g. --ask '{} Answer with a single word "
-        "or phrase.' (anchor.ask and probe.ask in a recipe)"
+        f"'{model}' answers {100 * known:.1f} % of these questions, and always the commonest "
+        f"answer of their family would answer {100 * report.majority:.1f} %: it can hardly lose "
+        "what it does not know. A model that answers in sentences needs e.g. --ask '{} Answer with "
+        "a single word or phrase.' (anchor.ask and probe.ask in a recipe)"
     )
     on_event(Warned(stage, text))
 

@@ -127,7 +127,9 @@ def train(
     peak = [[group["lr"] for group in o.param_groups] for o in run.optimizers]
     done = _restore(run, path) if path.exists() else 0
     run.model.train()
-    with interrupts.deferred() as signaled:
+    with interrupts.saved_first("pretrain", on_event) as signaled:
+        if done < recipe.steps:
+            on_event(Progress("pretrain", done, recipe.steps, "steps"))
         for step in range(done, recipe.steps):
             factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
             for optimizer, rates in zip(run.optimizers, peak, strict=True):

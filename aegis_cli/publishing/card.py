@@ -55,7 +55,7 @@ fine-tuned by Aegis {version} with the method `{method}`:
 ## Training
 
 {steps} steps, of {batch} frames each, seed {seed}; learning rate {backbone_lr:g} for the backbone
-and {expert_lr:g} for the expert. Options of the method: `{options}`.{frozen}{averaged}{merged}
+and {expert_lr:g} for the expert. Options of the method: {options}.{frozen}{averaged}{merged}
 
 {stored}
 
@@ -123,7 +123,7 @@ def text(
     found = _measured(run, at)
     facts = found.facts
     # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
-    options = json.dumps(without_places(recipes.options(recipe)), sort_keys=True)
+    options = without_places(recipes.options(recipe))
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
@@ -139,7 +139,7 @@ def text(
         seed=recipe.seed,
         backbone_lr=recipe.train.backbone_lr,
         expert_lr=recipe.train.expert_lr,
-        options=options,
+        options=f"`{json.dumps(options, sort_keys=True)}`" if options else "none",
         frozen=freezing.sentence(recipe.train.freeze, before=" "),
         averaged="" if decay is None else _AVERAGED.format(decay),
         merged=_merged(merge),

@@ -51,6 +51,7 @@ class DryRunReport:
     are those of one frame, times the frames of a pass.
 
     Attributes:
+        precision: of the matrix products, bf16 or float32, also where the recipe says `auto`.
         processes: how many share the training.
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
             are projected.
@@ -77,6 +78,7 @@ class DryRunReport:
     method: str
     backbone: str
     device: str
+    precision: str
     processes: int
     parameters: int
     trainable: int
@@ -188,6 +190,7 @@ def _report(
         method=training.method.name,
         backbone=recipe.backbone,
         device=str(policy.backbone.device),
+        precision=devices.precision_taken(policy.backbone.device, recipe.train.precision),
         processes=training.ranks.count,
         parameters=_count(policy.parameters()),
         trainable=_count(p for p in policy.parameters() if p.requires_grad),

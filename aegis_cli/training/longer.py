@@ -93,7 +93,7 @@ def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
     share = rate_factor(planned, settings)
     text = (
         f"'{out}' goes on from step {planned} to {settings.steps}; the learning rates rise again "
-        f"to {share:.0%} of their peaks"
+        f"to {100 * share:.0f} % of their peaks"
     )
     on_event(Warned("train", text))
 

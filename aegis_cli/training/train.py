@@ -140,9 +140,16 @@ def run(
                 folder.remove(out)
             folder.begin(out, recipe)
             inputs.keep(out, places)
-            files.save_json(out / machine.NAME, machine.describe())
+            files.save_json(out / machine.NAME, _machine(training))
             _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
+
+
+def _machine(run: TrainingRun) -> dict[str, str | int]:
+    """The machine, and what `train.precision` has come to there, which `auto` does not say."""
+    device = run.policy.backbone.device
+    taken = devices.precision_taken(device, run.recipe.train.precision)
+    return machine.describe() | {"precision": taken}
 
 
 def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event: OnEvent) -> None:
@@ -353,9 +360,16 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
+<<<<<<< HEAD
     if done < settings.steps:  # before the first step, so that its time is told too
         on_event(Progress("train", done, settings.steps, "steps"))
     with ahead as batches, interrupts.deferred() as signaled, tracked as log:
+=======
+    signals = interrupts.saved_first("train", on_event)
+    with ahead as batches, signals as signaled, tracked as log:
+        if done < settings.steps:
+            on_event(Progress("train", done, settings.steps, "steps"))
+>>>>>>> review1
         for index in range(done, settings.steps):
             finished = index + 1
             due = _Due.after(finished, settings)

@@ -97,6 +97,13 @@ def test_figures_of_a_job_are_those_of_json(aegis, job: Path) -> None:
     } <= paths
 
 
+def test_the_page_tells_what_an_automatic_precision_was(aegis, job: Path) -> None:
+    path = job / "naive" / "machine.json"
+    assert "Precisionauto" in reported(aegis, job / "naive")[0].said  # an earlier Aegis did not say
+    files.save_json(path, files.load_json(path) | {"precision": "float32"})
+    assert "Precisionfloat32 (auto)" in reported(aegis, job / "naive")[0].said
+
+
 def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path) -> None:
     evaluated = open_loop(1, 2, split="chosen", trained_on=[2])
     results.keep(job / "naive", "evaluate-chosen-arm", evaluated, {})

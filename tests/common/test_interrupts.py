@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -14,7 +16,8 @@ from typing import Any
 import pytest
 
 from aegis_cli.common import interrupts
-from aegis_cli.common.interrupts import Stopped, deferred, ending_at_once, listening
+from aegis_cli.common.events import Event, Warned
+from aegis_cli.common.interrupts import Stopped, deferred, ending_at_once, listening, saved_first
 
 ENDING = [signal.SIGTERM, signal.SIGHUP]
 
@@ -136,6 +139,53 @@ def test_who_asks_twice_does_not_wait() -> None:
         send(signal.SIGTERM)
         send(signal.SIGINT)
         pytest.fail("it went on")
+
+
+def test_it_is_told_while_a_call_into_c_holds_up_the_handler() -> None:
+    order: list[object] = []
+
+    def tell() -> None:
+        order.append("told")
+
+    with listening(), pytest.raises(Stopped), deferred(tell) as held:
+        threading.Timer(0.1, send, [signal.SIGTERM]).start()
+        while "told" not in order:  # one call takes a second or so, and signals do not end it
+            assert held.number is None, "the handler came before the message"
+            hashlib.pbkdf2_hmac("sha256", b"", b"", 3_000_000)
+        order.append(held.number)
+    assert order == ["told", signal.SIGTERM]
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_without_a_signal_nothing_is_told_and_of_several_the_first() -> None:
+    told: list[None] = []
+    with deferred(lambda: told.append(None)):
+        pass
+    assert told == []
+    with pytest.raises(KeyboardInterrupt), deferred(lambda: told.append(None)):
+        send(signal.SIGINT)
+        send(signal.SIGINT)
+    assert len(told) == 1
+
+
+def test_a_stage_that_saves_first_says_so() -> None:
+    said: list[Event] = []
+    with pytest.raises(KeyboardInterrupt), saved_first("train", said.append):
+        send(signal.SIGINT)
+    (event,) = said
+    assert isinstance(event, Warned) and event.stage == "train" and "saved first" in event.text
+
+
+def test_somebody_elses_listener_for_signals_is_kept() -> None:
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        signal.set_wakeup_fd(writer.fileno())
+        try:
+            with deferred(lambda: pytest.fail("it is told")):
+                pass
+        finally:
+            assert signal.set_wakeup_fd(-1) == writer.fileno()
 
 
 def test_in_other_threads_nothing_changes() -> None:

@@ -462,6 +462,14 @@ PLACES = [
 ]
 
 
+def test_each_task_tells_its_beginning(tmp_path: Path) -> None:
+    events: list[Progress] = []
+    train.run(recipe("sequential"), tmp_path / "run", on_event=events.append)
+    for stage in (ONE, TWO):
+        done = [event.done for event in events if event.stage == stage]
+        assert done == list(range(len(done))) and len(done) > 2
+
+
 @pytest.mark.parametrize("name", STRICT)
 def test_igsp_interrupted_anywhere_and_resumed_ends_in_the_same_bytes(
     name: str, tmp_path: Path, done: Done

@@ -434,6 +434,14 @@ def test_it_is_asked_as_is_said(aegis, taught: Path, tmp_path: Path) -> None:
     assert code == 2 and "a text with one {}" in err
 
 
+def test_progress_tells_the_baselines_answers_from_the_models(taught: Path, broken: Path) -> None:
+    seen: list[Event] = []
+    probe.run(str(broken), "scenes", 20, str(taught), None, None, on_event=seen.append)
+    asking = [event.stage for event in seen if event.stage.startswith("probe")]
+    assert list(dict.fromkeys(asking)) == ["probe", "probe baseline"]
+    assert asking == sorted(asking)
+
+
 def test_a_baseline_that_the_run_did_not_begin_from_is_told(
     taught: Path, broken: Path, demos_file: Path, tmp_path: Path
 ) -> None:

@@ -191,6 +191,7 @@ def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
     success = files.load_json(run_folder / results.FOLDER / "rollout-seen.json")["success"]
     assert f"| reach | seen | 2 | {100 * success:.1f} % (" in body
     assert f"aegis probe {REPO} --baseline" in body and "hf download" not in body
+    assert "Options of the method: none." in body
     # Where the backbone lies here is nothing to others.
     assert "--baseline /" not in body and "model `/" not in body
 

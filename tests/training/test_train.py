@@ -28,7 +28,7 @@ from samples.training_runs import (
 from torch import nn
 
 from aegis_cli.anchors import anchor_file as anchor_files
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations
@@ -63,6 +63,22 @@ def test_the_run_folder(finished: tuple[str, Path]) -> None:
     assert (out / "checkpoints" / "last").readlink() == Path(
         steps[-1]
     )  # relative: the run may be moved
+
+
+def test_a_run_says_what_precision_its_automatic_one_was(
+    start: Start,
+    recipe: Recipe,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    automatic = replace(recipe, train=replace(recipe.train, precision="auto", steps=2))
+    for multiplies, taken in ((True, "bf16"), (False, "float32")):
+        monkeypatch.setattr(devices, "multiplies_bf16", lambda _, found=multiplies: found)
+        planned = dry_run.run(automatic, "naive", demos_file, None, tmp_path / "dry")
+        start("naive", tmp_path / taken, recipe=automatic)
+        assert files.load_json(tmp_path / taken / "machine.json")["precision"] == taken
+        assert planned.precision == taken
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))

@@ -114,12 +114,18 @@ def _trained(run: At, anchor: str | None) -> Markup:
         *([("Anchor", anchor)] if anchor else []),
         ("Steps", f"{_steps(run)}, of {train['batch_size']} frames each"),
         ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
-        ("Precision", str(train["precision"])),
+        ("Precision", _precision(run)),
         ("Seed", str(run["facts"]["seed"])),
     ]
     if "merge" in run["facts"].value:
         shown.append(("Merged afterwards", _merge(run["facts"]["merge"])))
     return pairs(shown)
+
+
+def _precision(run: At) -> str:
+    """What matrix products were taken in, as far as the run says it of `auto`."""
+    asked, taken = str(run["recipe"]["train"]["precision"]), run["machine"].value.get("precision")
+    return asked if taken in (None, asked) else f"{taken} ({asked})"
 
 
 def _weights(recipe: At) -> list[tuple[str, str]]:
