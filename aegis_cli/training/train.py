@@ -360,16 +360,10 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
-<<<<<<< HEAD
-    if done < settings.steps:  # before the first step, so that its time is told too
-        on_event(Progress("train", done, settings.steps, "steps"))
-    with ahead as batches, interrupts.deferred() as signaled, tracked as log:
-=======
     signals = interrupts.saved_first("train", on_event)
     with ahead as batches, signals as signaled, tracked as log:
         if done < settings.steps:
             on_event(Progress("train", done, settings.steps, "steps"))
->>>>>>> review1
         for index in range(done, settings.steps):
             finished = index + 1
             due = _Due.after(finished, settings)
