@@ -17,6 +17,7 @@ from samples.streams import STREAMS, TinyDual, recipe, task, write
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import Progress
 from aegis_cli.continual import files, images, learners, loop, probe, train
 from aegis_cli.continual.images import ClassificationLoss, ImageEvaluator, ImageStreamRun
 from aegis_cli.continual.report import (
