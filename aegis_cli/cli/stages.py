@@ -65,12 +65,11 @@ class Stage(NamedTuple):
         """
         if not self.shared:
             launch.check_one()
-        module = self.module
         with computing_on(device):
             if launch.rank() > 0:
-                return module.run(*args, on_event=ignore, **options)
-            with render.progress() as on_event:
-                report = module.run(*args, on_event=on_event, **options)
+                return self.module.run(*args, on_event=ignore, **options)
+            with render.progress() as on_event:  # already while the stage is imported
+                report = self.module.run(*args, on_event=on_event, **options)
         render.show(report, self.view, as_json, wide)
         return report
 

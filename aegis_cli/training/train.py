@@ -59,6 +59,7 @@ from aegis_cli.training.schedule import moving_steps, rate_factor, rate_left
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
+_LONG_S = 20.0  # a validation that takes longer than a step for each of its batches would, is told
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
@@ -371,7 +372,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             if index == done:
                 warn_of_written(run.policy.backbone, buffers, on_event)
             if due.line:
-                shown = _log(run, finished, window, due.validation)
+                shown = _log(run, finished, window, due.validation, on_event)
                 log(shown)
                 window = Window()
             if due.checkpoint:
@@ -677,7 +678,9 @@ def _rates(run: TrainingRun, shares: Mapping[Tensor, float | Tensor]) -> list[fl
     return found
 
 
-def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dict[str, float]:
+def _log(
+    run: TrainingRun, finished: int, window: Window, validate: bool, on_event: OnEvent
+) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
     line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
@@ -685,9 +688,11 @@ def _log(run: TrainingRun, finished: int, window: Window, validate: bool) -> dic
     if len(recent["step"]):  # steps in which the backbone stands still have no row
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        noise = validation_noise(run.recipe.seed)
+        settings, noise = run.recipe.train, validation_noise(run.recipe.seed)
+        batches = min(len(run.demos.validation), VALIDATION_FRAMES) / settings.batch_size
+        heard = on_event if batches * line["step_s"] > _LONG_S else ignore
         with run.average.in_place(), run.masters.rounded():
-            loss = validation_loss(run.policy, run.demos, run.recipe.train, noise, run.ranks)
+            loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
     if run.ranks.first:
@@ -702,6 +707,7 @@ def validation_loss(
     settings: Train | RobotTrain,
     noise: int,
     ranks: Ranks = ALONE,
+    on_event: OnEvent = ignore,
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
@@ -727,8 +733,9 @@ def validation_loss(
         size = demos.size(part, settings.chunk)
         return numbers, step.with_prepared(own, size, backbone, sharing, passes), sharing, passes
 
-    total = 0.0
+    total, done = 0.0, 0
     parts = frames.split(settings.batch_size)
+    on_event(Progress("validation", done, len(frames), "frames"))
     with (
         _evaluating(policy),
         prefetch.for_device(prepare, parts, backbone.device) as ready,
@@ -743,6 +750,8 @@ def validation_loss(
                     encoding = backbone.encode(made.inputs.to(backbone.device))
                     losses.append(policy.flow_loss_at(batch, encoding, *drawn, shown))
             total += sharing.total(torch.stack(losses).sum()).item()
+            done = min(done + settings.batch_size, len(frames))
+            on_event(Progress("validation", done, len(frames), "frames"))
     return total
 
 

@@ -195,6 +195,20 @@ def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
     )
 
 
+def test_a_bar_without_an_end_is_there_while_no_stage_is_at_work() -> None:
+    """While a model is loaded, between two stages, and not on the terminal that is left behind."""
+    stage = TextColumn("{task.description}")
+    with Bars(stage, console=Console(file=io.StringIO(), force_terminal=True, width=80)) as bars:
+        live = Live(bars, Column(), Clock())
+        shown = [[task.description for task in bars.tasks]]
+        for done in (0, 1, 2):
+            live(Progress("train", done, 2, "steps"))
+            shown.append([task.description for task in bars.tasks])
+        live.end()
+        assert not bars.tasks
+    assert shown == [["working"], ["train"], ["train"], ["working"]]
+
+
 # --- tables ---------------------------------------------------------------------------------------
 
 

@@ -30,7 +30,7 @@ OTHERS = [NAME] * POSSIBLE + ["cuda"] * torch.cuda.is_available()
 pytestmark = pytest.mark.skipif(not OTHERS, reason="this torch takes no device of others' making")
 TESTS = Path(__file__).parent.parent
 ANCHOR = "anchor.safetensors"
-STEPS = 3
+STEPS = 2
 PARTS = "moments,inputs,curvature,fisher"
 # What the task leaves alone moves or not by a weight that has to be known: one wait a step.
 WAITS = {"aegis": {"methods/backward.py:combine_gradients": STEPS}}

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from samples.tiny import make_tiny
-from samples.training_runs import SETTINGS, small_policy
+from samples.training_runs import SETTINGS, STEPS, Start, small_policy
 from torch import nn
 
+from aegis_cli.common.events import Event, Progress
 from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.models.policy import Policy
@@ -70,3 +71,19 @@ def test_it_writes_nothing_to_the_policy(demos: Demonstrations, policy: Policy) 
     train.validation_loss(policy, demos, SETTINGS, NOISE)
     assert all(torch.equal(t, before[name]) for name, t in policy.state_dict().items())
     assert policy.training and stem.norm.training
+
+
+@pytest.mark.parametrize("long_s", [0.0, 3600.0])
+def test_a_long_validation_has_progress_of_its_own(
+    long_s: float, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a large model it takes minutes; of a short one each would be two lines of a log."""
+    monkeypatch.setattr(train, "_LONG_S", long_s)
+    events: list[Event] = []
+    start("naive", tmp_path / "run", anchor=None, on_event=events.append)
+    told = [e.done for e in events if isinstance(e, Progress) and e.stage == "validation"]
+    validations = STEPS // SETTINGS.validate_every
+    assert told.count(0) == (validations if long_s == 0 else 0)
+    if told:
+        (total,) = {e.total for e in events if getattr(e, "stage", "") == "validation"}
+        assert told.count(total) == validations

@@ -41,7 +41,11 @@ def progress(clock: Clock = time.monotonic) -> Generator[OnEvent]:
     names = Column(no_wrap=True)
     stage = TextColumn("{task.description}", markup=False, table_column=names)
     with Bars(stage, BarColumn(), figures, console=console) as bars:
-        yield Live(bars, names, clock)
+        live = Live(bars, names, clock)
+        try:
+            yield live
+        finally:
+            live.end()
 
 
 class Pace:
@@ -119,7 +123,8 @@ class Lines:
 class Live:
     """One rich bar a stage at work.
 
-    What is finished becomes a line above, since a terminal has room for few bars.
+    What is finished becomes a line above, since a terminal has room for few bars. While no stage is
+    at work, as where a model is loaded or a file is written, one bar without an end says so.
 
     Args:
         names: the column of the stages' names, which keeps them whole where the terminal is narrow.
@@ -128,6 +133,8 @@ class Live:
     def __init__(self, bars: Bars, names: Column, clock: Clock) -> None:
         self.bars, self.names, self.clock = bars, names, clock
         self.current: dict[str, tuple[TaskID, Pace, Progress]] = {}
+        self.between: TaskID | None = None
+        self._fill()
 
     def __call__(self, event: Event) -> None:
         if isinstance(event, Warned):
@@ -147,6 +154,20 @@ class Live:
         if event.done >= event.total:
             self.bars.remove_task(self.current.pop(event.stage)[0])
             self.bars.console.print(Text(f"{event.stage}: {pace.figures(event)}"), soft_wrap=True)
+        self._fill()
+
+    def end(self) -> None:
+        """Leave no bar on the terminal that says that something goes on."""
+        if self.between is not None:
+            self.bars.remove_task(self.between)
+            self.between = None
+
+    def _fill(self) -> None:
+        """Show the bar without an end if there is no other, and only then."""
+        if self.current:
+            self.end()
+        elif self.between is None:
+            self.between = self.bars.add_task("working", total=None, figures="")
 
 
 def _warning(event: Warned) -> str:
