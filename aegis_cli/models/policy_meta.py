@@ -62,8 +62,12 @@ def check(meta: PolicyMeta, actions: int, positions: int) -> None:
         actions, positions: of how many numbers the policy's are.
 
     Raises:
-        ValueError: a value of another type than its key has, or of another robot.
+        ValueError: no value where there has to be one, one of another type than its key has, or of
+            another robot.
     """
+    for name in ("method", "task", "replan"):
+        if name not in meta:
+            raise ValueError(f"no '{name}'")
     _check_types(meta)
     _check_recorded(meta, actions, positions)
 
@@ -79,7 +83,7 @@ def _check_types(meta: PolicyMeta) -> None:
             raise ValueError(f"'{name}' is {meta[name]!r}")
     if not isinstance(meta.get("rename", {}), dict):
         raise ValueError(f"'rename' is {meta['rename']!r}")
-    if "replan" in meta and meta["replan"] < 1:
+    if meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
     ensemble = meta.get("ensemble", 0.0)
     if type(ensemble) not in (int, float) or not math.isfinite(ensemble):

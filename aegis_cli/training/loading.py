@@ -190,15 +190,33 @@ def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:
     )
 
 
+_MEASURED_AS = (
+    "vqa",
+    "ask",
+    "samples",
+    "batch_size",
+    "seed",
+    "energy",
+    "fisher_samples",
+    "exact_width",
+    "tokens",
+    "temperature",
+    "memory",
+)
+
+
 def _measuring(recipe: Recipe, parts: Sequence[str]) -> str:
-    """The command that measures these parts on the questions of which the recipe speaks."""
+    """The command that measures these parts as the recipe's section `anchor` has it."""
     asked, usual = recipe.anchor, type(recipe.anchor)()
     words = ["aegis", "anchor"]
     if recipe.backbone != backbones.EMBEDDED:
         words += ["--backbone", recipe.backbone]
-    for option, name in (("--vqa", "vqa"), ("--ask", "ask"), ("--temperature", "temperature")):
-        if getattr(asked, name) != getattr(usual, name):
-            words += [option, f"{getattr(asked, name)}"]
+    if asked.source == "demos" and list(parts) == ["moments"]:  # frames tell nothing else
+        words += ["--demos", "DEMOS"]
+    for name in _MEASURED_AS:
+        value = getattr(asked, name)
+        if value != getattr(usual, name):
+            words += ["--" + name.replace("_", "-"), f"{value}"]
     if asked.skip_bad:
         words.append("--skip-bad")
     return shlex.join([*words, "--parts", ",".join(parts), "--out", "FILE"])

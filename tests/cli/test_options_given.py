@@ -45,16 +45,32 @@ def test_what_a_question_becomes_needs_no_quotes(text: str) -> None:
     assert found.probe.ask == found.anchor.ask == text.strip('"')
 
 
-def test_the_advice_for_a_missing_anchor_asks_the_questions_of_the_recipe(
-    bad: Bad, demos_file: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("method", "asked", "command"),
+    [
+        (
+            "nullspace",
+            ("anchor.vqa=own.jsonl", "anchor.ask={} Be brief.", "anchor.skip_bad=true"),
+            "aegis anchor --vqa own.jsonl --ask '{} Be brief.' --skip-bad --parts inputs",
+        ),
+        (
+            "kfac",
+            ("anchor.samples=600", "anchor.batch_size=8", "anchor.memory=900"),
+            "aegis anchor --samples 600 --batch-size 8 --memory 900 --parts curvature",
+        ),
+        (
+            "aegis",
+            ("anchor.source=demos", "anchor.parts=[moments]"),
+            "aegis anchor --demos DEMOS --parts moments",
+        ),
+    ],
+)
+def test_the_advice_for_a_missing_anchor_measures_as_the_recipe_says(
+    method: str, asked: tuple[str, ...], command: str, bad: Bad, demos_file: Path, tmp_path: Path
 ) -> None:
-    asked = ("anchor.vqa=own.jsonl", "anchor.ask={} Be brief.", "anchor.skip_bad=true")
     options = [word for each in asked for word in ("--set", each)]
-    given = ("--method", "nullspace", "--demos", demos_file, "--out", tmp_path / "x")
-    command = (
-        "aegis anchor --vqa own.jsonl --ask '{} Be brief.' --skip-bad --parts inputs --out FILE"
-    )
-    bad("train", "reach", *given, *options, says=("no anchor", command))
+    given = ("--method", method, "--demos", demos_file, "--out", tmp_path / "x")
+    bad("train", "reach", *given, *options, says=("no anchor", f"{command} --out FILE"))
 
 
 def test_the_advice_for_an_anchor_of_another_prompt_can_be_followed(anchor_file: Path) -> None:

@@ -19,6 +19,9 @@ import numpy as np
 from aegis_cli.common import gl, interrupts, palette
 
 gl.choose_backend()
+# dm_control ends the display that all contexts share when the interpreter ends. What is registered
+# last runs first: it has to be imported before a context of ours is registered to be closed.
+import dm_control.mujoco  # noqa: E402, F401
 import mujoco  # noqa: E402  (the OpenGL backend has to be chosen before the first import)
 
 IMAGE_SIZE = 64

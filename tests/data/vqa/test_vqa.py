@@ -298,18 +298,21 @@ def test_a_thread_has_one_renderer_whose_scenes_are_those_of_a_new_one() -> None
 
 
 def test_questions_do_not_depend_on_the_process() -> None:
-    """Sets of words iterate in another order in another process; the questions must not."""
+    """Sets of words iterate in another order in another process; the questions must not.
+
+    Nor is anything said of the renderer at the end, where a simulator has come after it.
+    """
     code = (
         "from aegis_cli.data.vqa.dataset import load_scenes\n"
-        "print(hash('a'), [(q.text, q.answer) for q in load_scenes('probe', 70).questions])"
+        "print(hash('a'), [(q.text, q.answer) for q in load_scenes('probe', 70).questions])\n"
+        "import aegis_cli.sim.reach"
     )
     said = []
     for seed in ("1", "2"):
         env = {**os.environ, "PYTHONHASHSEED": seed}
-        said.append(
-            subprocess.run(
-                [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
-            ).stdout
-        )
+        command = [sys.executable, "-c", code]
+        ran = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+        assert ran.stderr == ""
+        said.append(ran.stdout)
     (first_hash, first), (second_hash, second) = (line.split(" ", 1) for line in said)
     assert first_hash != second_hash and first == second
