@@ -19,7 +19,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class Warned:
-    """`stage` goes on, but its result may not be what the user has in mind; `text` says why."""
+    """`stage` goes on, but its result may not be what the user has in mind; `text` says why.
+
+    That a signal has come is told from a thread of its own, while the stage is at work.
+    """
 
     stage: str
     text: str

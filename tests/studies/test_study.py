@@ -230,10 +230,8 @@ def test_an_interrupted_study_goes_on_to_the_same_table(
     events: list[Progress] = []
     assert without_place(stage.run(small, tmp_path, events.append)) == without_place(finished[1])
     assert trained == COMPARED[1:]
-    assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [
-        3,
-        4,
-    ]  # after the checkpoint of step 2
+    # From the checkpoint of step 2 on.
+    assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [2, 3, 4]
 
 
 def test_while_the_knobs_are_tuned_the_table_is_of_the_values_so_far(

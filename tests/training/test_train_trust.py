@@ -20,7 +20,7 @@ from torch import Tensor
 
 from aegis_cli.common import artifacts, interrupts, locks
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, train
 from aegis_cli.training.assemble import TrainingRun
@@ -61,11 +61,11 @@ def test_a_refused_training_waits_for_nothing(start: Start, tmp_path: Path) -> N
 # --- signals --------------------------------------------------------------------------------------
 
 
-def signal_at(done: int, *numbers: int) -> Callable[[Progress], None]:
+def signal_at(done: int, *numbers: int) -> OnEvent:
     """A process gets these signals after that step."""
 
-    def on_event(event: Progress) -> None:
-        if event.stage == "train" and event.done == done:
+    def on_event(event: Event) -> None:
+        if isinstance(event, Progress) and (event.stage, event.done) == ("train", done):
             for number in numbers:
                 os.kill(os.getpid(), number)
 
