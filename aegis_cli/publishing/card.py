@@ -101,7 +101,7 @@ class Stored:
     def __str__(self) -> str:
         said = f"The VLM's weights are stored in {self.dtype}."
         if self.rounded:
-            said += " What was measured above was measured in float32, before they were rounded."
+            said += " Any figures above are of the weights in float32, before they were rounded."
         return said
 
 

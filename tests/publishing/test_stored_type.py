@@ -96,7 +96,7 @@ def test_an_export_has_the_sources_type_and_acts_like_the_rounded_policy(
     assert {p.dtype for p in found.parameters()} == {torch.float32}
     assert torch.equal(acts(rounded(own)), acts(found))
     said = (tmp_path / "x" / card.NAME).read_text()
-    assert "stored in bfloat16. What was measured above was measured in float32" in said
+    assert "stored in bfloat16. Any figures above are of the weights in float32" in said
 
 
 @pytest.mark.parametrize("form", FORMATS)
