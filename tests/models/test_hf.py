@@ -23,12 +23,19 @@ from torch import Tensor
 from aegis_cli.common import devices, prefetch
 from aegis_cli.core.attention import rotate
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones import hf
 from aegis_cli.models.backbones.families import FAMILIES
-from aegis_cli.models.backbones.hf import MAX_ANSWER, HFBackbone
+from aegis_cli.models.backbones.hf import HFBackbone
 from aegis_cli.models.backbones.prompting import Processors
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
+MAX_ANSWER = 10  # tokens that a model may say here, fewer than usual
+
+
+@pytest.fixture(autouse=True)
+def short_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hf, "MAX_ANSWER", MAX_ANSWER)
 
 
 @pytest.fixture(params=FAMILIES)
