@@ -66,7 +66,9 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
     scale = 1 + Z_95**2 / trials
     middle = (share + Z_95**2 / (2 * trials)) / scale
     half = Z_95 * math.sqrt(share * (1 - share) / trials + Z_95**2 / (4 * trials**2)) / scale
-    return max(0.0, middle - half), min(1.0, middle + half)
+    low, high = max(0.0, middle - half), min(1.0, middle + half)
+    # Both sums end there but for rounding.
+    return 0.0 if successes == 0 else low, 1.0 if successes == trials else high
 
 
 def alike_interval(value: float, samples: int) -> Interval:

@@ -47,6 +47,7 @@ def test_the_interval_is_symmetric_narrows_and_stays_inside() -> None:
             low, high = wilson_interval(k, n)
             assert 0 <= low <= k / n <= high <= 1
             assert wilson_interval(n - k, n) == pytest.approx((1 - high, 1 - low), abs=1e-12)
+        assert wilson_interval(0, n)[0] == 0 and wilson_interval(n, n)[1] == 1
     widths = [np.diff(wilson_interval(n // 2, n))[0] for n in (10, 100, 1000)]
     assert widths[0] > 2 * widths[1] > 4 * widths[2]
 
