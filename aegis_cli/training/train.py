@@ -59,7 +59,8 @@ from aegis_cli.training.schedule import moving_steps, rate_factor, rate_left
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
-_LONG_S = 20.0  # a validation that takes longer than a step for each of its batches would, is told
+# A validation has progress of its own if steps with as many batches would take longer than this.
+_LONG_S = 20.0
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
