@@ -18,7 +18,7 @@ from aegis_cli.continual import state
 from aegis_cli.continual.learners.base import Constraint, Flows, TaskContext
 from aegis_cli.continual.report import SiteRouting, TaskRecord, history_mass, record_from, untouched
 from aegis_cli.continual.state import AnyStreamRun, Objective
-from aegis_cli.core.identification import Flow, flow, read, total_variation
+from aegis_cli.core.identification import Flow, flow, total_variation, where_read
 from aegis_cli.core.routing import activate, traced
 from aegis_cli.training import folder
 from aegis_cli.training.schedule import BatchOrder, warmup_cosine
@@ -107,12 +107,14 @@ def _prepare(
 ) -> TaskTraining:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
     current, objective = run.current, run.objective(run.current.task)
+    # What is drawn follows from seed and task alone, so that a resumed run draws it again.
     generator = torch.Generator().manual_seed(run.recipe.seed * 1_000_003 + current.task)
     means = torch.stack(list(prototypes)) if prototypes else torch.empty(0)
     sites = run.growing(current.task)
     context = TaskContext(
         current.task, len(run.names), run.model, sites, run.options, means, generator
     )
+    # In a task that goes on, the state has brought back what its beginning made.
     if current.step == 0:
         run.learner.begin(context)
         run.task_begun()
@@ -154,6 +156,7 @@ def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> f
     for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
     optimizer.zero_grad()
+    # A measurement may have left another task's routers active.
     activate(run.sites, run.learner.router(current.task))
     identification = run.learner.identification if current.phase == 1 else None
     with devices.autocast(run.device, settings.precision):
@@ -163,12 +166,16 @@ def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> f
             with traced(run.sites) as traces:
                 loss = training.objective.loss(batch, step)
             total = loss + identification.penalty(training.context, traces)
+    # Outside autocast, as PyTorch advises: the way back is in the types of the way there anyway.
     total.backward()
-    learning = [p for group in optimizer.param_groups for p in group["params"]]
+    learning = []
+    for group in optimizer.param_groups:
+        learning += group["params"]
     norm = nn.utils.clip_grad_norm_(learning, settings.clip_norm)
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
     where = f"at step {step + 1} of task '{training.objective.name}'"
     check_finite(figures, where, training.slower, step)
+    # After the clipping: to project a gradient never makes it longer.
     if training.constraint is not None:
         training.constraint.gradient()
     optimizer.step()
@@ -199,13 +206,14 @@ def _watch(run: AnyStreamRun, training: TaskTraining) -> None:
     current, options = run.current, run.options
     limit = max(1, round(options["identify"] * run.recipe.train.steps))
     check = current.step % options["check_every"] == 0
+    # To measure takes a pass over the calibration examples, so it is done only where it counts.
     if not check and current.step < limit:
         return
     flows = measure(run, training)
     masses = {name: found.mass.tolist() for name, found in flows.items()}
     if check:
         still = _moved(current.masses, masses) < options["tolerance"]
-        current.quiet = current.quiet + 1 if still else 0
+        current.quiet = current.quiet + 1 if still else 0  # checks on end, so it begins anew
         current.masses = masses
     if current.quiet >= options["checks"] or current.step >= limit:
         _settle(run, training, flows)
@@ -233,10 +241,13 @@ def _settle(run: AnyStreamRun, training: TaskTraining, flows: Flows) -> None:
     identification.settle(training.context, flows)
     for name, site in run.sites.items():
         gone = [n for n in before[name] if n not in _used(run, name)]
+        # What an earlier task's router uses is still there; the rest is deleted for good.
         current.dropped[name] = [n for n in gone if n in site.numbers]
         current.pruned[name] = [n for n in gone if n not in site.numbers]
-    current.phase, current.phase1_steps, current.quiet, current.masses = 2, current.step, 0, {}
+    current.phase, current.phase1_steps = 2, current.step
+    current.quiet, current.masses = 0, {}
     training.objective.trainable_changed()
+    # Over what still learns: experts are gone, and routers may be fixed.
     training.optimizer = state.optimizer(run, before=training.optimizer)
     training.constraint = run.learner.constrain(training.context)
 
@@ -252,15 +263,16 @@ def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
     task = run.learner.router(run.current.task)
     activate(run.sites, task)
     run.model.eval()
+    # With its graph: `where_read` goes back from the loss to find the positions that it reads.
     with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
         loss = training.objective.calibration_loss()
     run.model.train()
-    used = {
-        name: site.of(router.experts)
-        for name, site in run.sites.items()
-        if (router := site.router(task)) is not None
-    }
-    passes = read({name: traces[name] for name in used}, loss)
+    used = {}
+    for name, site in run.sites.items():
+        router = site.router(task)
+        if router is not None:
+            used[name] = site.of(router.experts)
+    passes = where_read({name: traces[name] for name in used}, loss)
     return {name: flow(passed, used[name]) for name, passed in passes.items()}
 
 
@@ -271,6 +283,7 @@ def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> Ta
     """Let the learner end the task, freeze everything, and say what was learned."""
     current, steps = run.current, run.recipe.train.steps
     flows = measure(run, training) if run.sites else {}
+    # Counted before the learner freezes anything.
     trained = sum(p.numel() for p in run.learning().values())
     maps = _learning_maps(run)
     run.learner.finish(training.context, flows)
@@ -279,13 +292,15 @@ def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> Ta
         _routing(run, name, flows.get(name, NOTHING), maps[name]) for name in training.context.sites
     )
     first, trained_first = current.phase1_steps or 0, current.learning_phase1
+    trained_steps = (trained_first or 0) * first + trained * (steps - first)
     masses = history_mass(sites, [record_from(raw) for raw in current.records])
     return TaskRecord(
         task=training.objective.name,
         phase1_steps=current.phase1_steps,
         trained_phase1=trained_first,
         trained=trained,
-        trained_mean=((trained_first or 0) * first + trained * (steps - first)) / steps,
+        trained_mean=trained_steps / steps,
+        # All that is stored now, less what the tasks before have added.
         added=run.stored() - sum(r["added"] for r in current.records),
         history_mass=sum(masses) / len(masses) if masses else None,
         untouched=untouched(sites, current.task),
@@ -297,7 +312,9 @@ def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> Ta
 def _routing(run: AnyStreamRun, name: str, found: Flow, trained: int) -> SiteRouting:
     """What one map's router does at the task's end, where `trained` parameters have learned."""
     site, used, current = run.sites[name], _used(run, name), run.current
-    before = sum(s["added"] for r in current.records for s in r["sites"] if s["site"] == name)
+    before = 0  # what earlier tasks have added here
+    for record in current.records:
+        before += sum(s["added"] for s in record["sites"] if s["site"] == name)
     return SiteRouting(
         site=name,
         experts=used,

@@ -48,7 +48,10 @@ def scores(rows: Rows) -> StreamScores:
     """The figures of a full matrix: T rows of T accuracies."""
     before_learning = []
     for i in range(1, len(rows)):
+        # Above the diagonal of column i, task i is tried before it is learned.
         before_learning.append(_mean([rows[t][i] for t in range(i)]))
+    # The mean of the columns' means, not of all entries: else a task would weigh more the later it
+    # comes, since more entries of its column are above the diagonal.
     transfer = _mean(before_learning) if before_learning else None
     average = _mean([accuracy for row in rows for accuracy in row])
     return StreamScores(transfer, average, _mean(rows[-1]), _forgetting(rows))
@@ -63,7 +66,8 @@ def seen_scores(rows: Rows) -> SeenScores:
 def _forgetting(rows: Rows) -> float | None:
     count = len(rows)
     lost = []
-    for i in range(count - 1):
+    for i in range(count - 1):  # nothing was learned after the last task
+        # Rows before i are left out: task i was not learned yet, and a triangle has no such entry.
         best = max(rows[t][i] for t in range(i, count))
         lost.append(best - rows[-1][i])
     return _mean(lost) if lost else None
@@ -78,6 +82,7 @@ def reuse_rate(masses: Sequence[Sequence[float]]) -> float | None:
     Returns:
         The mean; None for a single task, or without maps.
     """
+    # The first task finds no expert of an earlier one.
     later = [mass for task in masses[1:] for mass in task]
     return _mean(later) if later else None
 

@@ -35,5 +35,6 @@ class _SquaredReLU(torch.autograd.Function):
 
 def squared_relu(x: Tensor) -> Tensor:
     """max(x, 0)^2, elementwise."""
-    # The compiler fuses the plain form by itself.
-    return torch.relu(x).square() if torch.compiler.is_compiling() else _SquaredReLU.apply(x)
+    if torch.compiler.is_compiling():
+        return torch.relu(x).square()  # the compiler fuses the plain form by itself
+    return _SquaredReLU.apply(x)

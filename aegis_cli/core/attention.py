@@ -37,6 +37,7 @@ def rotate(x: Tensor, rotation: Rotation) -> Tensor:
 
     This is RoFormer's embedding (arXiv 2104.09864), its channels in GPT-NeoX's order.
     """
+    # In x's type: a product with float32 tables would widen keys and queries in half precision.
     cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)  # [B, 1, 1, S, d]
     low, high = x.chunk(2, dim=-1)
     quarter_turn = torch.cat([-high, low], dim=-1)
@@ -79,8 +80,9 @@ def block_attention(
     # One softmax over both: a token weighs the prefix against its own block.
     weights = torch.cat([prefix_scores, own_scores], dim=-1).softmax(-1)
     to_prefix, to_own = weights.split([prefix.key.shape[2], length], dim=-1)
-    from_prefix = (to_prefix.flatten(2, 3) @ prefix.value).unflatten(2, (blocks, length))
-    return from_prefix + to_own @ own.value
+    from_prefix = to_prefix.flatten(2, 3) @ prefix.value  # [B, h, N*S, d]
+    from_own = to_own @ own.value  # [B, h, N, S, d]
+    return from_prefix.unflatten(2, (blocks, length)) + from_own
 
 
 def additive(mask: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -88,4 +90,6 @@ def additive(mask: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
     The negatives are finite: a row without any True stays free of NaN.
     """
-    return torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill(~mask, -1e4)
+    scores = torch.zeros(mask.shape, dtype=dtype, device=mask.device)
+    # float16 ends at 65,504, and exp(-1e4) is exactly 0 in every type.
+    return scores.masked_fill(~mask, -1e4)

@@ -52,7 +52,9 @@ def weights(left: int, delay: int, horizon: int) -> Tensor:
         horizon: H >= n.
     """
     step = torch.arange(horizon, dtype=torch.float64, device="cpu")
-    # Of a step that is executed the share is 1 or more, and so its weight is 1.
+    # The paper's soft mask: c (e^c - 1) / (e - 1), where c falls linearly from 1 at the last step
+    # that is executed to 0 at the first that the old chunk lacks. Of the executed steps before, the
+    # quotient is above 1, and so their weight is 1.
     share = ((left - step) / (left - delay + 1)).clamp(0, 1)
     return (share * torch.expm1(share) / (math.e - 1)).float()
 
@@ -72,15 +74,19 @@ def guided(velocity: Velocity, continued: Continued, horizon: int) -> Velocity:
         continued: in the units of the flow.
     """
     left = continued.actions.shape[1]
-    held = weights(left, continued.delay, horizon).to(continued.actions.device)[:, None]
+    each_step = weights(left, continued.delay, horizon)
+    held = each_step.to(continued.actions.device)[:, None]  # W as a column [H, 1]
+    # Steps that the old chunk lacks have the weight 0, so it does not matter what stands there.
     target = torch.nn.functional.pad(continued.actions, (0, 0, 0, horizon - left))
 
     def pulled(x: Tensor, time: Tensor) -> Tensor:
+        # Actions are sampled without gradients, so that they are on for this derivative alone.
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             moves = velocity(x, time)
             expected = x - time[:, None, None] * moves
-            missing = held * (target - expected.detach())
+            missing = held * (target - expected.detach())  # W (y - a(x)), [B, H, A]
+            # J^T times that, without J itself.
             (pull,) = torch.autograd.grad(expected, x, missing.to(expected.dtype))
         return moves.detach() - strength(time)[:, None, None] * pull
 

@@ -106,7 +106,7 @@ class Curvature:
         factor: Callable[[Tensor], Tensor],
     ) -> Pair:
         """A displacement whose entries in the eigenbases are multiplied by `factor` of w h_ij."""
-        flat = weight.flatten(self.c.ndim)
+        flat = weight.flatten(self.c.ndim)  # [o, d]; c of stacked maps is [n, k]: [n, o, d]
         width = flat.shape[-1]
         if bias is not None:
             # The bias is the weight of an input that is always 1.
@@ -122,14 +122,18 @@ class Curvature:
                 rest = self.c.new_full((1,), rest)
             of_rest = floor_rest, above_rest = self._shares(strength, rest, factor)
             floor, above = floor - floor_rest, above - above_rest
+        # Of what lies along input direction j, all outputs give up the share floor_j, and stored
+        # output i gives up above_ij more.
         read = flat @ inputs  # [o, k]
-        found = (read * floor + outputs @ (self._stored(outputs, read) * above)) @ inputs.mT
+        more = outputs @ (self._stored(outputs, read) * above)  # [o, k]
+        found = (read * floor + more) @ inputs.mT  # [o, d]
         if of_rest is not None:
             floor_rest, above_rest = of_rest
             found += flat * floor_rest
             found += outputs @ (self._stored(outputs, flat) * above_rest)
         found_weight = found[..., :width].reshape(weight.shape)
-        return found_weight, None if bias is None else found[..., width]
+        found_bias = None if bias is None else found[..., width]
+        return found_weight, found_bias
 
     def _shares(
         self, strength: float | Tensor, c: Tensor, factor: Callable[[Tensor], Tensor]
@@ -142,13 +146,16 @@ class Curvature:
         Returns:
             That of all outputs, [1, k]; and what is added along each stored one, [m, k].
         """
-        floor = factor(strength * (self.g_rest + self.damping) * c)[..., None, :]
+        least = strength * (self.g_rest + self.damping) * c  # w h_j of an output never stored
+        floor = factor(least)[..., None, :]
         damped = self.g + self.damping
-        return floor, factor(strength * (damped[..., :, None] * c[..., None, :])) - floor
+        h = damped[..., :, None] * c[..., None, :]  # (g_i + damping) c_j, [m, k]
+        return floor, factor(strength * h) - floor
 
     def _stored(self, outputs: Tensor, read: Tensor) -> Tensor:
         """A displacement [o, k] along the stored outputs, [m, k], of all processes."""
         stored = outputs.mT @ read
+        # A process has some of the rows that this product sums over.
         return stored if self.total is None else self.total(stored)
 
 
@@ -157,6 +164,7 @@ def stacked(found: Sequence[Curvature]) -> Curvature:
     first = found[0]
     if len(found) == 1:
         return first
+    # Padded directions are columns of zeros: whatever share they get multiplies 0.
     return Curvature(
         inputs=stacking.padded([one.inputs for one in found]),
         outputs=stacking.padded([one.outputs for one in found]),
@@ -189,7 +197,7 @@ def curvatures(
     # that halves their memory and changes a proximal step by a thousandth of what it removes.
     sketched = not all(spectrum.whole for spectrum in anchor.curvature.values())
     found = {}
-    held: dict[tuple[int, torch.device], Tensor] = {}
+    held: dict[tuple[int, torch.device], Tensor] = {}  # by the spectrum's id; the anchor keeps all
     for site, weight in weights.items():
         like = weight.new_empty(0, dtype=wide_type(weight.dtype))
         kept_in = like.half() if sketched else like
@@ -214,7 +222,9 @@ def curvatures(
 def _relative(spectrum: Spectrum) -> Tensor:
     """Its values over the mean of all, as many as have an eigenvector; zeros stay zeros."""
     assert spectrum.vectors is not None
-    return ratio(spectrum.values, spectrum.values.mean())[: spectrum.vectors.shape[1]]
+    stored = spectrum.vectors.shape[1]
+    # The mean is over all directions, also those that have no eigenvector.
+    return ratio(spectrum.values, spectrum.values.mean())[:stored]
 
 
 def bounded(strength: float | Tensor) -> float | Tensor:
@@ -224,7 +234,8 @@ def bounded(strength: float | Tensor) -> float | Tensor:
     return min(strength, _HEAVIEST)
 
 
-def taken(strength: Tensor) -> Tensor:
+def taken(wh: Tensor) -> Tensor:
     """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
-    strength = strength.clamp(max=_HEAVIEST)  # infinity / infinity is NaN
-    return strength / (1 + strength)
+    wh = wh.clamp(max=_HEAVIEST)  # infinity / infinity is NaN
+    # In the form 1 - 1 / (1 + w h), a small share would be 0: 1 + 1e-8 is 1 in float32.
+    return wh / (1 + wh)

@@ -54,13 +54,16 @@ class TemporalEnsemble:
         Args:
             chunk: [..., H, A], predicted at this step; at each step of an episode there is one.
         """
+        # The oldest of H chunks has predicted up to the step before this one.
         if len(self._chunks) == chunk.shape[-2]:
             self._chunks.popleft()
         self._chunks.append(chunk)
+        # A chunk that was predicted `age` steps ago has this step's action in that place.
         ages = range(len(self._chunks) - 1, -1, -1)
-        predictions = torch.stack(
-            [c[..., age, :] for age, c in zip(ages, self._chunks, strict=True)]
-        )
+        found = []
+        for age, predicted in zip(ages, self._chunks, strict=True):
+            found.append(predicted[..., age, :])
+        predictions = torch.stack(found)  # [n, ..., A], the oldest first
         # softmax is the same quotient, and finite for any decay.
         order = torch.arange(len(predictions), dtype=torch.float64, device=predictions.device)
         weights = torch.softmax(-self._decay * order, 0)

@@ -44,8 +44,9 @@ class Gaussian:
         """
         away = features.double() - self.mean  # [N, D]
         along = (away @ self.directions).square()  # [N, r]
-        # The rest is a sum of squares that rounding could leave a little below 0.
-        across = (away.square().sum(-1) - along.sum(-1)).clamp(min=0)  # [N]
+        in_all = away.square().sum(-1)  # [N]
+        # What is left is a sum of squares too, but rounding could put it a little below 0.
+        across = (in_all - along.sum(-1)).clamp(min=0)
         mahalanobis = (along / self.variances).sum(-1) + across / self.noise
         size, rank = self.directions.shape
         log_determinant = self.variances.log().sum() + (size - rank) * self.noise.log()
@@ -68,8 +69,10 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     wide = features.double()
     mean, size = wide.mean(0), wide.shape[1]
     away = wide - mean
-    rising, vectors = torch.linalg.eigh(away.T @ away / len(wide))
+    covariance = away.T @ away / len(wide)  # [D, D]
+    rising, vectors = torch.linalg.eigh(covariance)
     values, vectors = rising.flip(0), vectors.flip(1)
+    # Shrinking towards the mean moves variance between directions and keeps their sum.
     values = (1 - shrinkage) * values + shrinkage * rising.mean()
     # A direction that never varies would make every other value infinitely unlikely.
     rounding = torch.finfo(torch.float32).eps * float(wide.square().mean())

@@ -34,11 +34,17 @@ def flow(passes: Sequence[Traced], experts: Sequence[Expert]) -> Flow:
     """Mass and load of each expert over all positions of `passes`."""
     weights = torch.cat([p.weights.flatten(0, -2) for p in passes]).double()  # [n, E]
     codes = torch.cat([p.codes.flatten(0, -3) for p in passes]).double()  # [n, E, r]
-    grams = torch.stack([e.b.double().T @ e.b.double() for e in experts])  # [E, r, r]
+    inner = []
+    for expert in experts:
+        b = expert.b.double()  # [d_out, r]
+        inner.append(b.T @ b)
+    grams = torch.stack(inner)  # [E, r, r]
     # ||B c||^2 = c^T (B^T B) c needs no B c, which would be [n, d_out] for each expert.
     squares = torch.einsum("ner,ers,nes->ne", codes, grams, codes)
     norms = squares.clamp(min=0).sqrt()  # rounding can leave a square a little below 0
-    return Flow(_shares(weights.sum(0)), _shares((weights * norms).sum(0)))
+    mass = _shares(weights.sum(0))
+    load = _shares((weights * norms).sum(0))
+    return Flow(mass, load)
 
 
 def _shares(parts: Tensor) -> Tensor:
@@ -51,7 +57,7 @@ def _shares(parts: Tensor) -> Tensor:
     return shares.cpu()
 
 
-def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list[Traced]]:
+def where_read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list[Traced]]:
     """The passes of each map at the positions that the loss reads.
 
     The loss reads the positions at whose output its gradient is not 0. All others say nothing about
@@ -66,7 +72,10 @@ def read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list
     gradients = iter(torch.autograd.grad(loss, outputs, materialize_grads=True))
     found: dict[str, list[Traced]] = {}
     for name in passes:
-        found[name] = [_at(_is_read(next(gradients)), passed) for passed in passes[name]]
+        found[name] = []
+        for passed in passes[name]:
+            gradient = next(gradients)  # in the order of `outputs` above
+            found[name].append(_at(_is_read(gradient), passed))
     return found
 
 
@@ -101,7 +110,9 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
 
     def pay(gradient: Tensor) -> Tensor:
         positions = seen.pop()
-        return gradient + positions.unsqueeze(-1) * (charged / positions.sum().clamp(min=1))
+        # The derivative by p_e is price / n at each of the n positions that are read.
+        share = charged / positions.sum().clamp(min=1)  # [E]
+        return gradient + positions.unsqueeze(-1) * share
 
     # A backward pass comes to the outputs first: when `pay` is called, `see` has been.
     passed.outputs.register_hook(see)
@@ -110,12 +121,16 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
 
 def squared_norm(expert: Expert) -> Tensor:
     """||B A||_F^2 = tr((B^T B)(A A^T)), from two r x r matrices instead of one of d_out x d_in."""
-    return ((expert.b.T @ expert.b) * (expert.a @ expert.a.T)).sum()
+    columns = expert.b.T @ expert.b  # [r, r]
+    rows = expert.a @ expert.a.T
+    return (columns * rows).sum()  # the trace of a product of symmetric matrices
 
 
 def total_variation(before: Tensor, after: Tensor) -> float:
     """Total variation distance of two distributions over experts [E], in [0, 1]."""
-    return float((before.double() - after.double()).abs().sum() / 2)
+    moved = (before.double() - after.double()).abs()
+    # Half of it: what leaves one expert arrives at another.
+    return float(moved.sum() / 2)
 
 
 def needed(found: Flow, kappa: float, load: float) -> tuple[int, ...]:
@@ -141,6 +156,7 @@ def basis(matrices: Sequence[Tensor]) -> Tensor:
     left, values, _ = torch.linalg.svd(joined, full_matrices=False)
     # Of matrices of zeros nothing is above the smallest number, and so they span nothing.
     largest = values.max().clamp(min=torch.finfo(torch.float64).tiny)
+    # A smaller value may be no more than the rounding of float32 experts.
     return left[:, values > 1e-6 * largest]
 
 

@@ -70,8 +70,10 @@ class Ledger:
 
     def append(self, step: int, tt: Tensor, ta: Tensor, aa: Tensor, w2: Tensor) -> None:
         """Add one step's row; steps must increase and sizes must be [G], [G], [G], [L]."""
-        if self._count and step <= (last := int(self._steps[self._count - 1])):
-            raise ValueError(f"step {step} after step {last}: steps must increase")
+        if self._count:
+            last = int(self._steps[self._count - 1])
+            if step <= last:
+                raise ValueError(f"step {step} after step {last}: steps must increase")
         row = dict(zip(COLUMNS, (tt, ta, aa, w2), strict=True))
         for name, size in self._sizes().items():
             _check_shape(name, row[name], (size,))
@@ -84,6 +86,7 @@ class Ledger:
 
     def truncate(self, step: int) -> None:
         """Forget every row after `step`: a resumed run repeats those steps."""
+        # The numbers stay in the buffers until `append` writes over them.
         self._count = self._rows_until(step)
 
     def tensors(self, after: int | None = None) -> dict[str, Tensor]:
@@ -92,10 +95,13 @@ class Ledger:
         Args:
             after: leave out the rows of this step and of those before it.
         """
-        rows = slice(0 if after is None else self._rows_until(after), self._count)
-        return {"step": self._steps[rows].clone()} | {
-            name: values[rows].clone() for name, values in self._rows.items()
-        }
+        first = 0 if after is None else self._rows_until(after)
+        rows = slice(first, self._count)
+        # Clones, because a view would keep the whole buffers, and later steps may change them.
+        found = {"step": self._steps[rows].clone()}
+        for name, values in self._rows.items():
+            found[name] = values[rows].clone()
+        return found
 
     def _sizes(self) -> dict[str, int]:
         """How many numbers a row of each column has."""
@@ -103,10 +109,11 @@ class Ledger:
 
     def _rows_until(self, step: int) -> int:
         """How many rows are of `step` and of those before it."""
+        # The steps increase, so that a binary search finds the place.
         return int(torch.searchsorted(self._steps[: self._count], step, right=True))
 
     def _grow(self) -> None:
-        more = max(_LEAST_ROWS, self._count)
+        more = max(_LEAST_ROWS, self._count)  # as many again, so that appending stays cheap
         self._steps = torch.cat([self._steps, self._steps.new_zeros(more)])
         for name, rows in self._rows.items():
             self._rows[name] = torch.cat([rows, rows.new_zeros(more, rows.shape[1])])

@@ -41,7 +41,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core.numerics import ratio
-from aegis_cli.core.pairs import Pair, like, matrix
+from aegis_cli.core.pairs import Pair, from_matrix, matrix
 from aegis_cli.core.spectrum import Spectrum
 
 
@@ -74,28 +74,35 @@ class TwoSided:
 
     def kept(self, moved: Pair, strength: float) -> Pair:
         """The X of the module's docstring, in the shapes of the displacement of weight and bias."""
-        return like(self.kept_matrix(matrix(moved), strength), moved)
+        return from_matrix(self.kept_matrix(matrix(moved), strength), moved)
 
     def kept_matrix(self, moved: Tensor, strength: float) -> Tensor:
         """X [o, d] for the displacement D [o, d], float64."""
         a, p = self.inputs.share, self.inputs
-        in_bases = moved.double() @ p.inverse.T
+        in_bases = moved.double() @ p.inverse.T  # D P^-T
         if self.outputs is None:
+            # With b = 1/2 everywhere, b cancels: the share is a / (a + s (1 - a)).
             return (in_bases * _share(a, 1 - a, strength)) @ p.vectors.T
         b, q = self.outputs.share, self.outputs
-        share = _share(torch.outer(b, a), torch.outer(1 - b, 1 - a), strength)
-        return q.vectors @ (q.inverse @ in_bases * share) @ p.vectors.T
+        share = _share(torch.outer(b, a), torch.outer(1 - b, 1 - a), strength)  # [o, d]
+        kept = q.inverse @ in_bases * share  # Z, of E = Q^-1 D P^-T
+        return q.vectors @ kept @ p.vectors.T
 
 
 def basis(task: Tensor, questions: Tensor) -> Basis:
     """The generalised eigenbasis of two positive definite matrices [n, n], in float64."""
     task, questions = task.double(), questions.double()
+    # With A + B = L L^T, the eigenvalues of L^-1 A L^-T are the shares of A, from 0 to 1. Those of
+    # B^-1 A have no bound, and lose digits where B is nearly singular.
     root = torch.linalg.cholesky(task + questions)
-    half = torch.linalg.solve_triangular(root, task, upper=False)
-    whitened = torch.linalg.solve_triangular(root, half.T, upper=False)
+    half = torch.linalg.solve_triangular(root, task, upper=False)  # L^-1 A
+    whitened = torch.linalg.solve_triangular(root, half.T, upper=False)  # L^-1 A L^-T
+    # eigh reads one triangle only; the mean of both has less of the solver's rounding.
     share, turn = torch.linalg.eigh((whitened + whitened.T) / 2)
+    # T = L^-T V with the eigenvectors V: T^T (A + B) T is V^T V = 1, so T^T B T is 1 - share.
     vectors = torch.linalg.solve_triangular(root.T, turn, upper=True)
-    return Basis(vectors, turn.T @ root.T, share.clamp(0, 1))
+    inverse = turn.T @ root.T
+    return Basis(vectors, inverse, share.clamp(0, 1))  # rounding may lead past either end
 
 
 def damped(spectrum: Spectrum, damping: float) -> Tensor:
@@ -108,6 +115,7 @@ def damped(spectrum: Spectrum, damping: float) -> Tensor:
     values = ratio(values, values.mean())
     stored, left_out = values[: vectors.shape[1]], values[vectors.shape[1] :]
     rest = left_out.mean() if len(left_out) else values.new_zeros(())
+    # V diag(stored) V^T + rest (1 - V V^T), put together without the unstored directions.
     whole = (vectors * (stored - rest)) @ vectors.T
     whole.diagonal().add_(rest + damping)
     return (whole + whole.T) / 2

@@ -116,6 +116,7 @@ class FullSum(MomentSum):
         with torch.autocast(x.device.type, enabled=False):
             for block in x.split(_ROWS):
                 for (start, stop), total in zip(self._strips, self._sums, strict=True):
+                    # The rows above a strip's diagonal block are in an earlier strip, mirrored.
                     total.addmm_(block[:, start:].T, block[:, start:stop])
 
     def plus(self, other: MomentSum) -> MomentSum:
@@ -161,6 +162,7 @@ class Sketch(MomentSum):
         probe = _probe(self._width, columns(self._width), str(self._device))
         with torch.autocast(x.device.type, enabled=False):
             for block in x.split(_ROWS):
+                # X^T (X O) in place of C O: no [d, d] is ever made.
                 self._seen.addmm_(block.T, block @ probe)
                 self._trace += _energy(block)
 
@@ -178,23 +180,27 @@ class Sketch(MomentSum):
         trace = (self._trace / count).cpu()
         # A shift by the rounding of the sum keeps what is inverted positive; it is undone below.
         shift = float(torch.linalg.matrix_norm(self._seen)) / count * _ROUNDING
-        if shift == 0:
+        if shift == 0:  # nothing but zeros was read: no direction, and no energy elsewhere
             return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace * 0)
         root = self._root(count, shift)
-        gram = sum(half.T @ half for half in self._halves(root, count, shift))
+        gram = sum(half.T @ half for half in self._halves(root, count, shift))  # B^T B, [l, l]
         rising, turn = torch.linalg.eigh(gram)  # B^T B has the values of B B^T
         values, turn = rising.flip(0), turn.flip(1)
+        # What the shift makes up half of, or more, is rounding.
         resolved = int((values > 2 * shift).sum())
+        # B = U S V^T has the eigenvectors U = B V S^-1, and S^2 are the values.
         scaled = turn[:, :resolved] / values[:resolved].sqrt()
         values = (values[:resolved] - shift).cpu()
+        # As in `spectrum.rank`, but of the trace, which the values alone do not add up to.
         short_of_it = int((values.cumsum(0) < energy * trace).sum())
         kept = resolved if energy >= 1 else min(resolved, short_of_it + 1)
+        # U is made strip by strip: B in float64 would be twice the sketch.
         vectors = torch.empty(self._width, kept, dtype=torch.float32, device="cpu")
         parts = vectors.split(_WIDE_ROWS)
         for part, half in zip(parts, self._halves(root, count, shift), strict=True):
             part.copy_(half @ scaled[:, :kept])
-        # Rounding may make this slightly negative.
-        rest = (trace - values[:kept].sum()).clamp(min=0) / (self._width - kept)
+        left = (trace - values[:kept].sum()).clamp(min=0)  # rounding may make it negative
+        rest = left / (self._width - kept)
         return with_rest(values[:kept], vectors, rest)
 
     def _shifted(self, count: int, shift: float) -> Iterator[tuple[Tensor, Tensor]]:
@@ -268,6 +274,8 @@ def _probe(width: int, count: int, device: str) -> Tensor:
 
     So few random vectors in so many dimensions are nearly orthogonal, which is all that is needed.
     """
+    # Sketches of several passes or processes add up only if all have the same O. So the seed is the
+    # width, and the numbers are drawn on the CPU, whatever the device.
     generator = torch.Generator("cpu").manual_seed(width)
     drawn = torch.randn(width, count, generator=generator, dtype=torch.float32, device="cpu")
     return drawn.mul_(width**-0.5).to(device)

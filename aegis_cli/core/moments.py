@@ -80,8 +80,9 @@ def merge(a: Moments, b: Moments) -> Moments:
     n = a.count + b.count
     share = b.count / n
     delta = b.mean - a.mean
-    var = a.var * (1 - share) + b.var * share + delta.square() * (share * (1 - share))
-    return Moments(n, a.mean + delta * share, var)
+    within = a.var * (1 - share) + b.var * share
+    between = delta.square() * (share * (1 - share))
+    return Moments(n, a.mean + delta * share, within + between)
 
 
 def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor) -> list[Moments]:
@@ -92,7 +93,10 @@ def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor
         hidden: hidden states [B, T, D], one per layer.
         mask: valid tokens, [B, T] bool.
     """
-    return [merge(so_far, masked_moments(h, mask)) for so_far, h in zip(found, hidden, strict=True)]
+    merged = []
+    for so_far, h in zip(found, hidden, strict=True):
+        merged.append(merge(so_far, masked_moments(h, mask)))
+    return merged
 
 
 def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,6 +120,7 @@ def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """
     x, valid = _all_rows(h, mask)
     count = valid.sum()
+    # Filled, not multiplied by 0: what stands at padding may be NaN.
     mean = x.masked_fill(~valid, 0).sum(-2) / count
     deviations = (x - mean.unsqueeze(-2)).masked_fill(~valid, 0)
     return mean, deviations.square().sum(-2) / count
@@ -154,6 +159,7 @@ def shared_moments(
     """
     rows, masks, here = _selected(hidden, mask) if reads else _zeroed(hidden, mask)
     count = total(here)
+    # Both sums are of all layers at once, since each call of `total` is a message.
     means = total(torch.cat([x.sum(1) for x in rows])) / count  # [L, D]
     squares = []
     # The centre's gradient is left out: over all tokens it is 0, but not over a share of them.
@@ -163,20 +169,21 @@ def shared_moments(
         if valid is not None:
             deviations = deviations.masked_fill(~valid, 0)
         squares.append(deviations.square().sum(1))
-    return list(zip(means, total(torch.cat(squares)) / count, strict=True))
+    variances = total(torch.cat(squares)) / count  # [L, D]
+    return list(zip(means, variances, strict=True))
 
 
 # The rows of some layers [n, rows, D], which of them are valid [rows, 1] (None: all), and how many.
-_Share = tuple[list[Tensor], Sequence[Tensor | None], Tensor]
+_LayerRows = tuple[list[Tensor], Sequence[Tensor | None], Tensor]
 
 
-def _selected(hidden: Sequence[Tensor], mask: Tensor) -> _Share:
+def _selected(hidden: Sequence[Tensor], mask: Tensor) -> _LayerRows:
     """The valid rows alone, of one layer after the other."""
     rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
     return rows, [None] * len(rows), rows[0].new_tensor(rows[0].shape[1])
 
 
-def _zeroed(hidden: Sequence[Tensor], mask: Tensor) -> _Share:
+def _zeroed(hidden: Sequence[Tensor], mask: Tensor) -> _LayerRows:
     """All rows, with zeros in the place of those that are not valid; nothing is read."""
     rows, valids = list[Tensor](), list[Tensor]()
     for layers in _together(hidden):

@@ -61,9 +61,11 @@ class Dense:
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
         # D A = r D + D U (f - r) U^T
-        along = self._along(weight, bias) * (self.factor - self.rest)[..., None, :]
+        above_rest = (self.factor - self.rest)[..., None, :]  # [1, k]
+        along = self._along(weight, bias) * above_rest
         protected, shifted = self._back(along, weight, bias)
         if isinstance(self.rest, Tensor) or self.rest:
+            # Of stacked maps [n, 1, 1], against their weights [n, o, d].
             of_weight = self.rest[..., None] if isinstance(self.rest, Tensor) else self.rest
             protected = protected + of_weight * weight
             if bias is not None and shifted is not None:
@@ -87,10 +89,12 @@ class Dense:
         """
         removed = self._lost(weight, bias, before)  # [o, k]
         width = weight.flatten(1).shape[1]
+        directions = self.basis[:width].T  # [k, d]
         if weight.is_contiguous():
-            weight.view(len(weight), -1).addmm_(removed, self.basis[:width].T, alpha=-1)
+            # In one product, without a copy [o, d] of what is subtracted.
+            weight.view(len(weight), -1).addmm_(removed, directions, alpha=-1)
         else:
-            weight.sub_((removed @ self.basis[:width].T).view(weight.shape))
+            weight.sub_((removed @ directions).view(weight.shape))
         if bias is not None:
             bias.sub_(removed @ self.basis[width])
 
@@ -98,7 +102,7 @@ class Dense:
         """The coordinates [o, k] of a weight and a bias along the directions."""
         flat = weight.flatten(self.factor.ndim)
         width = flat.shape[-1]
-        along = flat @ self.basis[..., :width, :]
+        along = flat @ self.basis[..., :width, :]  # [o, k]
         if bias is None:
             return along
         # The bias is the weight of an input that is always 1, whose row of U is the last.
@@ -132,8 +136,9 @@ class Elementwise:
     inside: Tensor
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        both = weight[..., None] if bias is None else torch.stack([weight, bias], -1)  # [D, m]
-        found = (self.inside @ both[..., None])[..., 0]
+        parts = (weight,) if bias is None else (weight, bias)
+        both = torch.stack(parts, -1)  # [D, m]
+        found = (self.inside @ both[..., None])[..., 0]  # [D, m]
         return found[..., 0], None if bias is None else found[..., 1]
 
     def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
@@ -189,6 +194,7 @@ class TableRows:
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
         read, *along = before
         assert read is not None
+        # Copied back, not subtracted: these rows stay bit for bit what they were.
         if len(self.used) > 1:
             weight.index_copy_(0, self._places, read)
         elif len(self._places):
@@ -283,8 +289,9 @@ def _channels(read: Spectrum, strength: Strength) -> Tensor:
         factor = _soft(read.values, read.values.sum(), strength.soft)
     else:
         factor = _leading(read.values, strength.energy)
-    vectors = read.vectors.double()
-    return vectors * factor[:, None, :] @ vectors.mT
+    vectors = read.vectors.double()  # [D, m, m]
+    scaled = vectors * factor[:, None, :]  # column j of each channel by f_j
+    return scaled @ vectors.mT
 
 
 def _soft(values: Tensor, energy: Tensor, soft: float) -> Tensor:
@@ -298,6 +305,7 @@ def _leading(values: Tensor, energy: float) -> Tensor:
     count = rank(values, energy)
     if count == 0:
         return torch.zeros_like(values)
+    # By value, not by place, which would part values that are equal.
     last = values.flatten().sort(descending=True).values[count - 1]
     return (values >= last).to(values.dtype)
 

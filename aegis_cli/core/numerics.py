@@ -8,6 +8,7 @@ from torch import Tensor
 
 def ratio(x: Tensor, y: Tensor) -> Tensor:
     """x / y, and 0 where y is exactly 0, whatever x is."""
+    # Filled twice: inside, so that no backward pass meets x / 0; outside, for the result.
     zero = y == 0
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
 

@@ -21,7 +21,8 @@ def present(pair: Pair) -> Sequence[Tensor]:
 def copied(pair: Pair) -> Pair:
     """A copy of the values, which later changes of the parameters do not reach."""
     weight, bias = pair
-    return weight.detach().clone(), None if bias is None else bias.detach().clone()
+    copied_bias = None if bias is None else bias.detach().clone()
+    return weight.detach().clone(), copied_bias
 
 
 def copied_small(pair: Pair) -> Pair:
@@ -32,7 +33,8 @@ def copied_small(pair: Pair) -> Pair:
 
 def _small(x: Tensor) -> Tensor:
     half = x.detach().to(torch.bfloat16)
-    return half if torch.equal(half.to(x.dtype), x) else x.detach().clone()
+    loses_nothing = torch.equal(half.to(x.dtype), x)
+    return half if loses_nothing else x.detach().clone()
 
 
 def minus(a: Pair, b: Pair) -> Pair:
@@ -44,6 +46,7 @@ def minus(a: Pair, b: Pair) -> Pair:
 
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
+    # In half precision the difference itself would be rounded. b is widened by type promotion.
     return widened(a) - b
 
 
@@ -54,9 +57,10 @@ def matrix(pair: Pair) -> Tensor:
     return flat if bias is None else torch.cat([flat, bias[:, None]], 1)
 
 
-def like(flat: Tensor, pair: Pair) -> Pair:
-    """The matrix [o, d] as a weight and a bias in the pair's shapes, dtypes and device."""
+def from_matrix(flat: Tensor, pair: Pair) -> Pair:
+    """A matrix [o, d] as a weight and a bias, in the shapes, type and device of the pair."""
     weight, bias = pair
     width = weight[0].numel()
     flat = flat.to(weight)
-    return flat[:, :width].reshape(weight.shape), None if bias is None else flat[:, width]
+    last_column = None if bias is None else flat[:, width]
+    return flat[:, :width].reshape(weight.shape), last_column

@@ -80,15 +80,15 @@ def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
         for block in zip(_blocks(g), _blocks(a), strict=True):
             full = size + len(block[0]) > _GPU_BLOCK
             if waiting and (full or waiting[0][0].device != block[0].device):
-                yield _one(waiting)
+                yield _concatenated(waiting)
                 waiting, size = [], 0
             waiting.append(block)
             size += len(block[0])
     if waiting:
-        yield _one(waiting)
+        yield _concatenated(waiting)
 
 
-def _one(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def _concatenated(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Pairs of blocks as one; a single one is not copied."""
     if len(pairs) == 1:
         return pairs[0]
@@ -108,7 +108,9 @@ def _widened(g: Tensor | None, a: Tensor | None) -> Iterator[tuple[Tensor | None
     """Both in float64, block by block: a whole copy of a large table would be twice its size."""
     of_g, of_a = _blocks(g), _blocks(a)
     for i in range(max(len(of_g), len(of_a))):
-        yield of_g[i].double() if of_g else None, of_a[i].double() if of_a else None
+        u = of_g[i].double() if of_g else None
+        v = of_a[i].double() if of_a else None
+        yield u, v
 
 
 def _blocks(x: Tensor | None) -> Sequence[Tensor]:
@@ -144,6 +146,7 @@ def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
     denominator has no epsilon: with one, the result would not be orthogonal. Where aa = 0 there is
     no projection.
     """
+    # With d = ta < 0, g - (d / <a, a>) a is g + (-d / <a, a>) a; relu leaves out d > 0.
     return torch.ones_like(tt), ratio(torch.relu(-ta), aa)
 
 
@@ -181,9 +184,11 @@ def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor
     """x <- x + scale y in place, for each; a scale that is a tensor [] is not read."""
     if not all(_holds(y.dtype, scale) for y in ys):
         for x, y in zip(xs, ys, strict=True):
-            x.add_(y.double() * scale)
+            x.add_(y.double() * scale)  # the product is small again when it is rounded to x's type
     elif isinstance(scale, Tensor):
-        torch._foreach_add_(list(xs), torch._foreach_mul(list(ys), _like(scale, ys[0])))
+        # `alpha` takes numbers only, and to make one of a tensor would be to read it.
+        added = torch._foreach_mul(list(ys), _like(scale, ys[0]))
+        torch._foreach_add_(list(xs), added)
     else:
         torch._foreach_add_(list(xs), list(ys), alpha=scale)
 
@@ -213,11 +218,13 @@ def _like(scale: float | Tensor, x: Tensor) -> float | Tensor:
 
 def removed_energy(ta: Tensor, aa: Tensor) -> Tensor:
     """The energy |g|^2 - |projected g|^2 that each group loses: relu(-ta)^2 / aa."""
+    # |g|^2 - |g - (ta / aa) a|^2 = ta^2 / aa, where ta < 0.
     return ratio(torch.relu(-ta).square(), aa)
 
 
 def energy_shed(tt: Tensor, ta: Tensor, aa: Tensor) -> Tensor:
     """Share of each group's energy that the projection removes: relu(-cos)^2, in [0, 1]."""
+    # ta^2 / (aa tt) is the squared cosine of g and a.
     return ratio(removed_energy(ta, aa), tt)
 
 

@@ -139,7 +139,7 @@ class Router(nn.Module):
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
         # Minus infinity gives a weight of exactly 0, so that the expert does not learn.
         weights = logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype)
-        return weights.expand(codes.shape[:-1])
+        return weights.expand(codes.shape[:-1])  # [..., T, E], the same at each position
 
     def logit_parameters(self) -> list[nn.Parameter]:
         """The parameters behind the logits; a single expert has none."""
@@ -202,13 +202,17 @@ class RoutedLinear(nn.Module):
             return y
         experts = self.of(router.experts)
         rows = torch.cat([e.a for e in experts])  # [E*r, d_in]
-        codes = nn.functional.linear(x, rows).unflatten(-1, (len(experts), -1))  # [..., E, r]
+        # A router's experts have one rank, so that one product gives all their codes.
+        joined = nn.functional.linear(x, rows)  # [..., E*r]
+        codes = joined.unflatten(-1, (len(experts), -1))  # [..., E, r]
         weights = router(x, codes)  # [..., E]
         # The scale multiplies the codes, which are smaller than y, and one product over all
         # experts' columns takes the sum along.
-        mixed = ((router.scale * weights).unsqueeze(-1) * codes).flatten(-2)  # [..., E*r]
+        strengths = (router.scale * weights).unsqueeze(-1)  # s p_e, [..., E, 1]
+        mixed = (strengths * codes).flatten(-2)  # [..., E*r]
         columns = torch.cat([e.b for e in experts], dim=1)  # [d_out, E*r]
-        y = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T).view_as(y)
+        added_up = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T)
+        y = added_up.view_as(y)
         if self.trace is not None:
             self.trace.append(Traced(weights, codes, y))
         return y
@@ -231,6 +235,7 @@ class RoutedLinear(nn.Module):
 
     def add_expert(self, rank: int, owner: int, generator: torch.Generator) -> int:
         """Draw a new expert and return its number."""
+        # Numbers of deleted experts are not given again: routers and files name experts by them.
         number = self.born
         expert = Expert(self.base, rank, owner)
         expert.draw(generator)
@@ -259,7 +264,9 @@ class RoutedLinear(nn.Module):
         router.restrict(kept)
         if not kept:
             del self.routers[str(task)]
-        used = {e for r in self.routers.values() for e in r.experts}
+        used = set[int]()
+        for other in self.routers.values():
+            used.update(other.experts)
         for number in set(self.numbers) - used:
             del self.experts[str(number)]
 

@@ -41,14 +41,18 @@ class Spectrum:
     @property
     def kind(self) -> str:
         """Either "dense", "elementwise" or "rows"."""
-        return "rows" if self.vectors is None else {2: "dense", 3: "elementwise"}[self.vectors.ndim]
+        if self.vectors is None:
+            return "rows"
+        return {2: "dense", 3: "elementwise"}[self.vectors.ndim]
 
     @property
     def rest(self) -> Tensor:
         """The energy along each direction that was never resolved, [] float64; 0 if all were."""
-        if self.whole or self.vectors is None or self.vectors.shape[1] == len(self.values):
+        if self.whole or self.vectors is None:
             return self.values.new_zeros(())
-        return self.values[-1]
+        if self.vectors.shape[1] == len(self.values):
+            return self.values.new_zeros(())
+        return self.values[-1]  # those without an eigenvector come last, and are equal
 
 
 def lone_row() -> Spectrum:
@@ -65,7 +69,8 @@ def with_rest(found: Tensor, vectors: Tensor, rest: Tensor) -> Spectrum:
         rest: energy along each other direction, [] or [1] float64.
     """
     others = vectors.shape[0] - vectors.shape[1]
-    return Spectrum(torch.cat([found, rest.reshape(1).expand(others)]), vectors, whole=False)
+    values = torch.cat([found, rest.reshape(1).expand(others)])
+    return Spectrum(values, vectors, whole=False)
 
 
 @torch.no_grad()
@@ -97,9 +102,10 @@ def channel_moment(rows: Tensor, bias: bool) -> Tensor:
     if not bias:
         return squares[:, None, None]
     sums = x.sum(0)
+    # [[x x, x 1], [1 x, 1 1]] of each channel, summed over rows.
     of_scale = torch.stack([squares, sums], -1)
     of_shift = torch.stack([sums, torch.full_like(sums, len(x))], -1)
-    return torch.stack([of_scale, of_shift], -2)
+    return torch.stack([of_scale, of_shift], -2)  # [D, 2, 2]
 
 
 def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
@@ -133,11 +139,14 @@ def rank(values: Tensor, energy: float) -> int:
     is what the measurement's own arithmetic left. So energy 1 takes every value above that, and no
     smaller share takes more.
     """
+    # Values of elementwise maps [D, m] compete over all channels.
     falling = values.flatten().sort(descending=True).values
     if energy <= 0 or falling[0] == 0:
         return 0
-    resolved = int((falling > falling[0] * torch.finfo(torch.float32).eps).sum())
+    rounding = falling[0] * torch.finfo(torch.float32).eps
+    resolved = int((falling > rounding).sum())
     if energy >= 1:
         return resolved
+    # As many leading values fall short of the share; one more reaches it.
     short_of_it = int((falling.cumsum(0) < energy * falling.sum()).sum())
     return min(resolved, short_of_it + 1)

@@ -35,14 +35,14 @@ def groups(
         by_kind.setdefault(kind(site), []).append(site)
     found = []
     for alike in by_kind.values():
-        room = 0
+        room = 0  # a new kind begins a new group
         for site in sorted(alike, key=lambda one: size(one)[1]):
             entries = size(site)[0]
             if entries > room:
                 found.append([])
                 room = most
             found[-1].append(site)
-            room -= entries
+            room -= entries  # below 0 after a site larger than `most`, which so stays alone
     return found
 
 

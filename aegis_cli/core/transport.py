@@ -20,7 +20,9 @@ def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
     + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982). The gradient is finite
     everywhere, also where a variance is 0.
     """
-    return (mean1 - mean2).square().sum(-1) + (_std(var1) - _std(var2)).square().sum(-1)
+    between_means = (mean1 - mean2).square().sum(-1)
+    between_deviations = (_std(var1) - _std(var2)).square().sum(-1)
+    return between_means + between_deviations
 
 
 def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
@@ -64,7 +66,8 @@ def transport_penalty(
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
-    w2 = _of_each_layer(moments, anchor)
+    w2 = _of_each_layer(moments, anchor)  # [L]
+    # The paper's mean over layers, of which the weighting `none` is the plain one.
     return (w2 * weights).mean(), w2.detach()
 
 
@@ -75,8 +78,8 @@ def _of_each_layer(moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Mo
         each.append((mean, var, measured.mean, measured.var))
     if len({mean.shape for mean, *_ in each}) == 1:
         # One computation for all layers, where a GPU would start dozens for each.
-        mean, var, then, spread = (torch.stack(part) for part in zip(*each, strict=True))
-        return w2_diag(mean, var, then, spread)
+        means, variances, *measured = (torch.stack(part) for part in zip(*each, strict=True))
+        return w2_diag(means, variances, *measured)  # each is [L, D]
     return torch.stack([w2_diag(*layer) for layer in each])
 
 

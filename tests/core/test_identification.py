@@ -17,9 +17,9 @@ from aegis_cli.core.identification import (
     charge,
     flow,
     needed,
-    read,
     squared_norm,
     total_variation,
+    where_read,
     without_span,
 )
 from aegis_cli.core.routing import Expert, RoutedLinear, Traced, traced
@@ -67,7 +67,7 @@ def test_the_load_of_experts_that_say_nothing_is_zero() -> None:
 def test_where_no_loss_reads_a_map_nothing_flows_and_nothing_is_needed() -> None:
     made = expert(0)
     passed = Traced(torch.ones(2, 1), torch.ones(2, 1, 3), torch.ones(2, 5, requires_grad=True))
-    passes = read({"map": [passed]}, torch.ones((), requires_grad=True) * 2)
+    passes = where_read({"map": [passed]}, torch.ones((), requires_grad=True) * 2)
     found = flow(passes["map"], [made])
     assert found.mass.tolist() == found.load.tolist() == [0.0]
     assert needed(found, kappa=0.5, load=0.1) == ()
@@ -334,6 +334,8 @@ def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
         optimizer.zero_grad()
         (error + 0.01 * squared_norm(made)).backward()
         optimizer.step()
-    of_all, of_read = (flow(p["map"], site.of(numbers)) for p in (passes, read(passes, error)))
+    of_all, of_read = (
+        flow(p["map"], site.of(numbers)) for p in (passes, where_read(passes, error))
+    )
     assert needed(of_read, kappa=0.5, load=0.1) == (HISTORY,) != needed(of_all, kappa=0.5, load=0.1)
     assert of_all.mass[HISTORY] > 0.8  # priced at all positions, the others would leave it

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.core.merging import TwoSided, basis, damped
-from aegis_cli.core.pairs import like, matrix
+from aegis_cli.core.pairs import from_matrix, matrix
 from aegis_cli.core.spectrum import decompose
 
 OUT, IN = 5, 7
@@ -207,7 +207,7 @@ def test_a_map_is_a_matrix_and_back(shape: tuple[int, ...], bias: bool) -> None:
     pair = draw(0, *shape).float(), draw(1, 4).float() if bias else None
     flat = matrix(pair)
     assert flat.shape == (4, math.prod(shape[1:]) + bias)
-    weight, shift = like(flat.double(), pair)
+    weight, shift = from_matrix(flat.double(), pair)
     assert torch.equal(weight, pair[0]) and weight.dtype == torch.float32
     assert shift is None if pair[1] is None else torch.equal(shift, pair[1])
 
