@@ -35,7 +35,8 @@ def get(name: str) -> Method:
 
 
 def _load(name: str) -> Method:
-    module = import_module(f"{__name__}.{name.replace('-', '_')}")
+    file = name.replace("-", "_")  # a module's name has no hyphen
+    module = import_module(f"{__name__}.{file}")
     method: Method = module.METHOD
     if method.name != name:
         raise ValueError(f"{module.__name__} calls itself '{method.name}', recipes '{name}'")

@@ -55,9 +55,9 @@ def start(context: MethodContext) -> Parts:
     """
     options = context.options
     assert context.anchor is not None
-    chosen = {
-        name: options["groups"] == "all" or name.startswith(LANGUAGE) for name in context.groups
-    }
+    chosen = {}
+    for name in context.groups:
+        chosen[name] = options["groups"] == "all" or name.startswith(LANGUAGE)
     if not any(chosen.values()):
         raise AegisError(
             f"aegis.groups: {options['groups']} with no language layer that learns",
@@ -67,15 +67,16 @@ def start(context: MethodContext) -> Parts:
     like = next(p for group in context.groups.values() for p in group)
     # The anchor is compared in float32, also where the weights are bfloat16.
     like = like.new_empty(0, dtype=wide_type(like.dtype))
+    projects = options["projects"]
+    # In the order of the groups, as the inner products [G] are.
+    combine = _combine(list(chosen.values()), projects != "update", options["restoration"])
     return Parts(
         penalty=_penalty(context.anchor, options["scope"], options["weighting"], like),
-        combine=_combine(
-            list(chosen.values()), options["projects"] != "update", options["restoration"]
-        ),
+        combine=combine,
         refresh=options["refresh"],
         fraction=options["fraction"],
         keeps_idle=options["idle"] == "kept",
-        constrain=None if options["projects"] == "gradient" else _constrain(context, chosen),
+        constrain=None if projects == "gradient" else _constrain(context, chosen),
     )
 
 
@@ -99,13 +100,13 @@ class _Target:
     def cost(self, seen: Pass) -> tuple[Tensor, Tensor]:
         """The transport cost of a pass, with its graph, and W2^2 of each layer [L]."""
         self._follow(seen.hidden[0].device)
-        inside = {"all": torch.ones_like(seen.image), "image": seen.image, "text": ~seen.image}
+        everything = torch.ones_like(seen.image)  # [T] or [B, T], as `image` is
+        inside = {"all": everything, "image": seen.image, "text": ~seen.image}
         # In a user's own model the layers may be on several GPUs; the Gaussians are on one.
         at = self.anchor[0].mean.device
-        found = [
-            (mean.to(at), variance.to(at))
-            for mean, variance in _moments(seen, seen.mask & inside[self.scope])
-        ]
+        found = []
+        for mean, variance in _moments(seen, seen.mask & inside[self.scope]):
+            found.append((mean.to(at), variance.to(at)))
         return transport_penalty(found, self.anchor, self.weights)
 
     def _follow(self, device: torch.device) -> None:
@@ -125,9 +126,12 @@ def _penalty(
     Raises:
         AegisError: an anchor that saw no tokens in scope.
     """
-    measured = {"image": anchor.image, "text": anchor.text}
+    measured: dict[str, Sequence[Moments]] = {"image": anchor.image, "text": anchor.text}
     # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
-    measured["all"] = [merge(*both) for both in zip(anchor.image, anchor.text, strict=True)]
+    merged = []
+    for of_image, of_text in zip(anchor.image, anchor.text, strict=True):
+        merged.append(merge(of_image, of_text))
+    measured["all"] = merged
     scopes = ("image", "text") if scope == "each" else (scope,)
     for name in scopes:
         if not measured[name][0].count:
@@ -168,10 +172,11 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
     counts = torch.tensor(chosen, device="cpu")
 
     def combine(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
-        nonlocal counts
+        nonlocal counts  # moved to the gradients' device once, at the first step
         task, anchor = rule(tt, ta, aa)
         counts = devices.send(counts, anchor.device)
-        # A group that is not chosen keeps its task gradient, bit for bit.
+        # lambda comes on top of the projection's own weight. A group that is not chosen keeps its
+        # task gradient, bit for bit.
         return task, (anchor + restoration) * counts
 
     return combine
@@ -203,11 +208,15 @@ def project_update(
         owners: the processes that have some rows of each parameter.
     """
     here = [rows_here(p) for p in group]
-    moved = [p - rows_here(update.before[name]) for p, name in zip(here, names, strict=True)]
+    moved = []
+    for parameter, name in zip(here, names, strict=True):
+        moved.append(parameter - rows_here(update.before[name]))
     given = [update.anchor_gradient.get(name) for name in names]
     anchor = [None if a is None else rows_here(a) for a in given]
     # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
-    _, along, aa = owners.total(torch.stack(projection.inner(moved, anchor)))
+    products = torch.stack(projection.inner(moved, anchor))
+    _, along, aa = owners.total(products)  # rows add up, as parameters do
+    # D <- D - relu(<D, a>) / <a, a> a, which leaves <D, a> = 0 in a conflict.
     excess: float | Tensor = ratio(torch.relu(along), aa)
     if not devices.reading_stalls(aa.device):
         excess = float(excess)

@@ -47,8 +47,10 @@ def second_backward_of_rows(
             graph does not know the rows that FSDP cuts a gradient to.
     """
     parameters = [p for group in groups for p in group]
+    # By id, because a parameter may come once more as a leaf of the graph.
     reached = {id(p): p for p in (*parameters, *others, *_leaves(penalty))}
     task = {key: p.grad for key, p in reached.items()}
+    # Emptied, since a backward pass adds to what is there.
     for parameter in reached.values():
         parameter.grad = None
     penalty.backward()
@@ -60,6 +62,7 @@ def second_backward_of_rows(
 
 def _nodes(result: Tensor) -> Iterator[Node]:
     """The nodes of the graph that leads to `result`, each once."""
+    # A loop, because a deep model's graph is deeper than Python lets a function recurse.
     waiting, seen = [result.grad_fn], set()
     while waiting:
         node = waiting.pop()
@@ -124,7 +127,8 @@ def combine_gradients(
     """
     pairs = []
     for group in groups:
-        pairs.append(([p.grad for p in group], [anchor[id(p)] for p in group]))
+        of_group = [p.grad for p in group], [anchor[id(p)] for p in group]
+        pairs.append(of_group)
     gram = projection.gram(pairs) if total is None else _gram_of_rows(pairs, total)
     of_task: Weights
     of_anchor: Weights

@@ -30,12 +30,12 @@ def start(context: MethodContext[Backbone]) -> Parts:
     if weight == 0:  # naive, and no copy to pay for
         return Parts()
     backbone = context.backbone  # not the context, which would keep the whole anchor in memory
-    frozen = _teacher(backbone)
+    frozen = _teacher(backbone)  # now, while the weights are still the pre-trained ones
 
     def auxiliary(seen: Pass) -> Tensor:
         _round_alike(frozen, backbone)
         with torch.no_grad():
-            taught = frozen.encode(seen.inputs).hidden
+            taught = frozen.encode(seen.inputs).hidden  # L tensors [B, T, D]
         return weight * relative_distance(seen.hidden, taught, seen.mask, seen.total)
 
     return Parts(auxiliary=auxiliary)
@@ -80,7 +80,7 @@ def relative_distance(
         for h, h0 in zip(hidden, taught, strict=True):
             layers.append(_relative_padded(widened(h), widened(h0), mask[..., None], total))
         return torch.stack(layers).mean()
-    index = mask.flatten().nonzero().squeeze(1)
+    index = mask.flatten().nonzero().squeeze(1)  # numbers of the valid tokens in [B*T], [n]
     for h, h0 in zip(hidden, taught, strict=True):
         layers.append(_relative(_rows(h, index), _rows(h0, index), total))
     return torch.stack(layers).mean()
@@ -91,7 +91,9 @@ def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor
     off = (student - teacher).square().sum()
     if total is None:
         return off / (teacher - teacher.mean(0)).square().sum()
-    mean = total(teacher.sum(0)) / total(teacher.new_tensor(len(teacher)))
+    # The distance stays this share's; over the whole batch's variance, the shares add up.
+    count = total(teacher.new_tensor(len(teacher)))
+    mean = total(teacher.sum(0)) / count
     return off / total((teacher - mean).square().sum())
 
 
@@ -102,8 +104,11 @@ def _relative_padded(
     add_up = total or (lambda x: x)
     off = (student - teacher).masked_fill(~valid, 0).square().sum()
     shown = teacher.masked_fill(~valid, 0)
-    mean = add_up(shown.sum((0, 1))) / add_up(valid.sum().to(shown.dtype))
-    return off / add_up((shown - mean).masked_fill(~valid, 0).square().sum())
+    count = add_up(valid.sum().to(shown.dtype))
+    mean = add_up(shown.sum((0, 1))) / count  # [D]
+    # Masked again: padding is 0 by now, and 0 - mean would count.
+    deviations = (shown - mean).masked_fill(~valid, 0)
+    return off / add_up(deviations.square().sum())
 
 
 def _rows(h: Tensor, index: Tensor) -> Tensor:

@@ -43,6 +43,7 @@ def start(context: MethodContext) -> Parts:
     learning, reference = context.learning(), context.reference()
     importance = relative_fisher(context.anchor.fisher, learning)
     if context.owners.several:
+        # Cloned, because a slice would keep the other processes' rows in memory.
         for name, parameter in learning.items():
             rows = context.owners.rows(len(parameter))
             importance[name] = importance[name][rows].clone()
@@ -91,6 +92,7 @@ def _constrain(held: Sequence[_Held], weight: float) -> Callable[[Update], None]
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
+        # Where nothing has moved, `steps` is 0, and so nothing is taken back.
         strength = bounded(weight * update.steps)
         for one in held:
             share = taken(strength * one.importance)
@@ -116,15 +118,20 @@ def relative_fisher(
             "that of every parameter that learns",
             "measure the anchor again with 'fisher' among its parts",
         )
+    # In float64: millions of small squares are added up.
     total = sum(fisher[name].sum(dtype=torch.float64) for name in learning)
-    mean = total / sum(parameter.numel() for parameter in learning.values())
+    count = sum(parameter.numel() for parameter in learning.values())
+    mean = total / count
     if not mean > 0:  # a NaN is refused too
         raise AegisError(
             f"a mean Fisher information of {float(mean):g}",
             "one above 0",
             "measure the anchor on more Fisher samples",
         )
-    return {name: (fisher[name] / mean).to(parameter.dtype) for name, parameter in learning.items()}
+    found = {}
+    for name, parameter in learning.items():
+        found[name] = (fisher[name] / mean).to(parameter.dtype)
+    return found
 
 
 METHOD = Method(

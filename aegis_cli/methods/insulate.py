@@ -67,9 +67,11 @@ def start(context: MethodContext[Backbone]) -> Parts:
         terms.append(lambda seen: vqa_weight * vqa_loss(seen))
     if not terms:
         return Parts()
-    return Parts(
-        auxiliary=lambda seen: torch.stack([term(seen) for term in terms]).sum(), prepare=write
-    )
+
+    def auxiliary(seen: Pass) -> Tensor:
+        return torch.stack([term(seen) for term in terms]).sum()
+
+    return Parts(auxiliary=auxiliary, prepare=write)
 
 
 def _action_loss(
@@ -81,12 +83,13 @@ def _action_loss(
     def loss(seen: Pass) -> Tensor:
         frames = seen.frames
         assert frames is not None
-        written = seen.prepared or write(frames)
+        written = seen.prepared or write(frames)  # None where nothing is prepared ahead
         said = backbone.answer_log_likelihood(
             frames.images, written.asked, written.texts, written.answered
         )
         count = written.numbers
         if seen.total is not None:
+            # Over the numbers of all processes, so that their contributions add up to the mean.
             count = seen.total(count.to(said.device))
         return -said.sum() / count
 
@@ -99,13 +102,15 @@ def _writing(context: MethodContext[Backbone]) -> Callable[[RobotBatch], _Writte
     limit, horizon, prompt = (context.options[name] for name in ("limit", "horizon", "prompt"))
     assert targets is not None
     numbers = _numbers(context)
-    _check_room(context, " ".join(numbers[-1:] * (horizon * context.actions)))
+    # The last number has as many digits as any, so that no text of actions has more.
+    longest = " ".join(numbers[-1:] * (horizon * context.actions))
+    _check_room(context, longest)
 
     def write(frames: RobotBatch) -> _Written:
         chosen = spread(frames.actions.shape[1], horizon)
-        bins = binned(targets(frames)[:, chosen], limit, len(numbers))
+        bins = binned(targets(frames)[:, chosen], limit, len(numbers))  # [B, S, A]
         # The actions past an episode's end were never shown.
-        shown = ~frames.is_pad[:, chosen]
+        shown = ~frames.is_pad[:, chosen]  # [B, S]
         texts = as_texts(bins, shown, numbers)
         asked = [prompt.replace("{}", text) for text in frames.instructions]
         answered = backbone.prepare_answers(frames.images, asked, texts)
@@ -124,7 +129,7 @@ def spread(chunk: int, horizon: int) -> Tensor:
 
 def binned(actions: Tensor, limit: float, count: int) -> Tensor:
     """The bin of each normalised action, int64 from 0 to `count` - 1; the outer ones are open."""
-    share = (actions + limit) / (2 * limit)
+    share = (actions + limit) / (2 * limit)  # 0 at -limit, 1 at limit
     return (share * count).floor().clamp(0, count - 1).long()
 
 
@@ -138,7 +143,8 @@ def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
     """
     texts = []
     for steps, valid in zip(bins, shown, strict=True):
-        texts.append(" ".join(numbers[i] for i in steps[valid].flatten().tolist()))
+        chosen = steps[valid].flatten().tolist()  # step after step, A numbers each
+        texts.append(" ".join(numbers[i] for i in chosen))
     return texts
 
 

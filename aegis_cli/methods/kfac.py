@@ -63,6 +63,7 @@ def start(context: MethodContext) -> Parts:
     options, owners = context.options, context.owners
     weight, balance = options["weight"], options["balance"]
     pairs = {site: weights(context.backbone, site) for site in context.sites}
+    # `adapt` has frozen the other sites: normalisations, tables and lone rows.
     maps = {site: pair for site, pair in pairs.items() if pair[0].requires_grad}
     slowed = (lambda: shares(maps, balance, owners)) if balance > 0 else None
     if weight == 0:
@@ -100,9 +101,11 @@ def _constrain(groups: Sequence[_Group], weight: float, growth: float) -> Callab
         # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
+            # weight (peak / rate)^growth, with `rate_left` the rate over its peak.
             strength = strength / _shrunk(update.rate_left, growth)
         for group in groups:
-            stacking.subtract(group.here(), group.curvature.excess(*group.moved(), strength))
+            excess = group.curvature.excess(*group.moved(), strength)
+            stacking.subtract(group.here(), excess)
 
     return constrain
 
@@ -114,7 +117,8 @@ def _pull(groups: Sequence[_Group], weight: float) -> Callable[[], None]:
     def pull() -> None:
         for group in groups:
             added = group.curvature.gradient(*group.moved(), weight)
-            for now, parts in zip(group.maps, stacking.apart(added, group.here()), strict=True):
+            of_each = stacking.apart(added, group.here())
+            for now, parts in zip(group.maps, of_each, strict=True):
                 for tensor, by in zip(now, parts, strict=True):
                     # Without a gradient it has not moved.
                     if tensor is not None and tensor.grad is not None and by is not None:
@@ -158,11 +162,16 @@ def _grouped(
     maps: Mapping[str, Pair], found: Mapping[str, Curvature], owners: Ranks
 ) -> list[_Group]:
     """The maps in groups, each with what it began with and its curvature."""
+
+    def directions(site: str) -> int:
+        return found[site].inputs.shape[-1]
+
     groups = []
-    for names in stackable(maps, owners, lambda site: found[site].inputs.shape[-1]):
+    for names in stackable(maps, owners, directions):
         own = [maps[name] for name in names]
         now = stacking.stacked([pair_here(pair) for pair in own])
         curved = curvature.stacked([found[name] for name in names])
+        # `stacked` leaves a single map its own tensors, which training changes in place.
         groups.append(_Group(own, copied_small(now), curved))
     return groups
 
@@ -183,10 +192,11 @@ def shares(
         return _unread_shares(learning, found_squares, entries, balance)
     # One transfer for all maps.
     squares = found_squares.tolist()
-    whole = math.sqrt(sum(squares) / sum(entries))
+    whole = math.sqrt(sum(squares) / sum(entries))  # R: every entry counts alike, not every map
     found: dict[Tensor, float | Tensor] = {}
     for tensors, square, count in zip(learning, squares, entries, strict=True):
-        rms = math.sqrt(square / count)
+        rms = math.sqrt(square / count)  # r
+        # If no map has a gradient, R is 0 too: 0 / 0 is left out.
         share = rms / (rms + balance * whole) if rms else 0.0
         found |= dict.fromkeys(tensors, share)
     return found
@@ -196,7 +206,8 @@ def _unread_shares(
     learning: Sequence[Sequence[Tensor]], squares: Tensor, entries: Sequence[int], balance: float
 ) -> dict[Tensor, float | Tensor]:
     """What `shares` returns, as tensors []: nothing is read, which would force a GPU sync."""
-    counts = devices.send(torch.tensor(entries, dtype=torch.float64, device="cpu"), squares.device)
+    counts = torch.tensor(entries, dtype=torch.float64, device="cpu")
+    counts = devices.send(counts, squares.device)
     rms = (squares / counts).sqrt()
     whole = (squares.sum() / sum(entries)).sqrt()
     # If no map has a gradient, every share is 0.
@@ -210,6 +221,8 @@ def _unread_shares(
 def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
     """Sum of the squared gradients of each map's tensors, two at most, [maps] float64."""
     like = maps[0][0]
+    # Map i has the places 2 i and 2 i + 1, of its weight and of its bias; they are 0 where there is
+    # no gradient.
     places, gradients = [], []
     for number, tensors in enumerate(maps):
         for part, tensor in enumerate(tensors):
@@ -222,9 +235,10 @@ def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
     for place, norm in zip(places, found, strict=True):
         # In a user's own loop, the layers may be on several GPUs.
         norms[place] = norm.to(like.device)
+    # `to` launches nothing where a norm has the type already, as nearly always; `double` would.
     widest = reduce(torch.promote_types, (norm.dtype for norm in norms))
     both = torch.stack([norm.to(widest) for norm in norms]).double()
-    return both.view(-1, 2).square().sum(1)
+    return both.view(-1, 2).square().sum(1)  # [maps, 2] -> [maps]
 
 
 METHOD = Method(

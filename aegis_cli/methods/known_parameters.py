@@ -77,7 +77,7 @@ class KnownParameters:
             if id(module) in seen:
                 continue
             seen.add(id(module))
-            if isinstance(module, sharding):
+            if isinstance(module, sharding):  # () has no instances
                 return False
             for parameter in module._parameters.values():
                 if parameter is None or not parameter.requires_grad:

@@ -32,6 +32,7 @@ class LowRankLinear(nn.Module):
         self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
 
     def forward(self, x: Tensor) -> Tensor:
+        # Two thin products; B A x with the product B A would cost as much as W x again.
         code = nn.functional.linear(x, self.a.to(x.dtype))  # [..., rank]
         low = nn.functional.linear(code, self.b.to(x.dtype))
         return self.base(x) + self.scale * low
@@ -63,7 +64,8 @@ def inject(
     """
     backbone.requires_grad_(False)
     for name, linear in maps.items():
-        _replace(backbone, name, LowRankLinear(linear, int(options["rank"]), options["alpha"]))
+        term = LowRankLinear(linear, int(options["rank"]), options["alpha"])
+        _replace(backbone, name, term)
 
 
 def merge(backbone: nn.Module) -> None:

@@ -51,7 +51,8 @@ def start(context: MethodContext[Backbone]) -> Parts:
                 chosen.append((parameter, gradient, update.before[name], reference[name]))
         if not chosen:
             return
-        products = owners.total(torch.stack([_products(*four) for four in chosen]))
+        products = torch.stack([_products(*four) for four in chosen])  # [chosen, 3]
+        products = owners.total(products)  # one message for all parameters
         for (parameter, _, _, origin), found in zip(chosen, products, strict=True):
             _project(parameter, origin, found, strengths[id(parameter)])
 
@@ -64,7 +65,11 @@ def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
     A single group has `weight`.
     """
     ordered = sorted(groups, key=_depth)
-    return {group: weight * (1 - k / max(1, len(ordered) - 1)) for k, group in enumerate(ordered)}
+    last = max(1, len(ordered) - 1)  # K - 1; a single group would divide by 0
+    strengths = {}
+    for k, group in enumerate(ordered):
+        strengths[group] = weight * (1 - k / last)
+    return strengths
 
 
 def _depth(group: str) -> tuple[int, int]:
@@ -86,8 +91,9 @@ def _products(parameter: nn.Parameter, gradient: Tensor, before: Tensor, origin:
 def _project(parameter: nn.Parameter, origin: Tensor, products: Tensor, strength: float) -> None:
     """Take SPD's share of a parameter's displacement back, by its `_products`."""
     now = rows_here(parameter) - rows_here(origin)
-    far, near = products[:2].sqrt()
+    far, near = products[:2].sqrt()  # |theta - theta0|, |theta_before - theta0|
     uphill = products[2]  # -c
+    # r; a parameter that has not left theta0 has nothing to take back.
     grown = ratio(torch.relu(far - near), far)
     # Above 1 it would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)

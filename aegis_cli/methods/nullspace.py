@@ -37,8 +37,10 @@ def start(context: MethodContext) -> Parts:
     hard = options["energy"]
     if hard == 0:
         return Parts()
+    # Either a share of the energy is held wholly, or every direction softly.
     strength = Strength(soft=options["soft"]) if hard is None else Strength(hard)
     assert context.anchor is not None
+    # The others learn unprotected, as under `naive`.
     chosen = [site for site, kind in context.sites.items() if kind in options["protect"]]
     likes = {site: weights(context.backbone, site)[0] for site in chosen}
     here = {site: rows_here(like) for site, like in likes.items()}
@@ -61,12 +63,13 @@ def start(context: MethodContext) -> Parts:
 
 def _by_coordinates(groups: Sequence[_Group], every: int) -> Parts:
     """The method with coordinates of the weights before, in place of copies."""
-    before: dict[str, Remembered] = {}
+    before: dict[str, Remembered] = {}  # by each group's first site
 
     @torch.no_grad()
     def begin() -> None:
         for group in groups:
-            before[group.sites[0]] = group.protection.remember(*stacking.stacked(group.here()))
+            now = stacking.stacked(group.here())
+            before[group.sites[0]] = group.protection.remember(*now)
 
     @torch.no_grad()
     def constrain(_: Update) -> None:
@@ -99,10 +102,9 @@ class _Group:
 
     def project(self, update: Update) -> None:
         """Take the protected part of an update out of the weights."""
-        before = [
-            pair_here(_before(site, pair, update))
-            for site, pair in zip(self.sites, self.pairs(), strict=True)
-        ]
+        before = []
+        for site, pair in zip(self.sites, self.pairs(), strict=True):
+            before.append(pair_here(_before(site, pair, update)))
         if len(self.sites) == 1:
             _project(self.here()[0], before[0], self.protection)
             return
@@ -155,6 +157,8 @@ def _before(site: str, now: Pair, update: Update) -> Pair:
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:
     (weight, bias), (old_weight, old_bias) = now, before
+    # What is allowed is added to the old values, so that a row that may not change keeps its bits:
+    # to subtract the rest from the new values would round.
     moved, shifted = nullspace.allowed(protection, minus(now, before))
     torch.add(old_weight, moved, out=weight.data)
     if bias is not None:

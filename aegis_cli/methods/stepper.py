@@ -40,7 +40,8 @@ class Stepper:
         self._parts = parts
         self._learning = structure.learning(model)
         # A model of which nothing learns has a device all the same.
-        self._device = next(iter((*self._learning.values(), *model.parameters()))).device.type
+        parameters = (*self._learning.values(), *model.parameters())
+        self._device = next(iter(parameters)).device.type
         self._before: dict[str, Tensor] = {}
         self._anchor: Mapping[str, Tensor] = {}
         self._rate_left: float | Tensor = 1.0
@@ -83,6 +84,7 @@ class Stepper:
     ) -> None:
         """Prepare for a step that somebody else takes; `end` follows it, and both are as `step`."""
         self.known.check()
+        # Only at the first of the steps that one constraint covers, which is what it compares with.
         if not self.pending and self._parts.copies:
             self._before = self._copies()
         if not self.pending and self._parts.begin is not None:
@@ -92,6 +94,7 @@ class Stepper:
             self._moved, self._rate_left = self._moved + 1, rate_left
         else:
             self._moved = self._moved + moves
+            # A choice by arithmetic, because to branch on `moves` would be to read it.
             self._rate_left = moves * rate_left + (1 - moves) * self._rate_left
         self.pending += 1
 
@@ -110,6 +113,7 @@ class Stepper:
     def settle(self) -> None:
         """Let the method constrain the pending steps now; without one, nothing happens."""
         begun, update = self.pending, self._update()
+        # Emptied first, so that the step is over even if the method raises.
         self._before, self._anchor, self._moved, self.pending = {}, {}, 0, 0
         if begun and self._parts.constrain is not None:
             # A loop may step inside an autocast of its own.
@@ -127,6 +131,7 @@ class Stepper:
 
     def _copies(self) -> dict[str, Tensor]:
         """The parameters' values by all their names, each copied once."""
+        # By id: tied weights have several names, and so one copy.
         own = {id(p): p for p in self._learning.values()}
         copies = {one: torch.empty_like(p, requires_grad=False) for one, p in own.items()}
         structure.copy_all(list(copies.values()), [p.detach() for p in own.values()])
