@@ -48,6 +48,7 @@ class Displacement:
             map has moved.
         """
         if strength == 0:
+            # Copied, since the base plus the whole displacement would be rounded.
             self._backbone.load_state_dict(self._tuned.state_dict())
             return 1.0
         share = self._move(self._maps(), strength)
@@ -62,14 +63,17 @@ class Displacement:
     def _maps(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
         """Each map's site, and its weights of now, of before the fine-tuning and of after it."""
         for site in self._sites:
-            now, origin, tuned = (
-                weights(model, site) for model in (self._backbone, self._base, self._tuned)
-            )
+            now = weights(self._backbone, site)
+            origin = weights(self._base, site)
+            tuned = weights(self._tuned, site)
             yield site, now, origin, tuned
 
     def _others(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
         """The same of each parameter that is of no map, by its name."""
-        in_maps = {id(tensor) for _, now, _, _ in self._maps() for tensor in now}
+        in_maps = set[int]()
+        for _, now, _, _ in self._maps():
+            in_maps.update(id(tensor) for tensor in present(now))
+        # The three models have the same parameters in the same order (`sources._check_alike`).
         named = zip(
             self._backbone.named_parameters(),
             self._base.parameters(),
@@ -88,12 +92,12 @@ class Displacement:
         """
         along, squared = 0.0, 0.0
         for site, now, origin, tuned in parts:
-            moved = minus(tuned, origin)
-            left = self._keep(site, moved, strength)
+            moved = minus(tuned, origin)  # D
+            left = self._keep(site, moved, strength)  # X
             four = map(present, (now, origin, moved, left))
             for parameter, start, way, part in zip(*four, strict=True):
-                parameter.copy_(start + part)
-                along += float(dot(part, way))
-                squared += float(dot(way, way))
+                parameter.copy_(start + part)  # in float32 or wider, rounded to its type once
+                along += float(dot(part, way))  # <X, D>
+                squared += float(dot(way, way))  # <D, D>
         # In bases that are not orthogonal, rounding can lead past either end.
         return min(max(along / squared, 0.0), 1.0) if squared else None

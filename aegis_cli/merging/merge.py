@@ -108,10 +108,10 @@ def run(
     if out is not None:
         sources.check_out(out)
     with contextlib.nullcontext() if out is None else locks.alone(out):
-        return _run(target, settings, out, strength, sweep, max_drop, on_event, judged, gate)
+        return _merge(target, settings, out, strength, sweep, max_drop, on_event, judged, gate)
 
 
-def _run(
+def _merge(
     target: str,
     settings: MergeSettings,
     out: Path | None,
@@ -123,31 +123,20 @@ def _run(
     gate: str,
 ) -> MergeReport:
     strengths = (strength,) if strength is not None else tuple(sweep) or GRIDS[settings.method]
-    for each in strengths:
+    for each in strengths:  # a bad one is refused before any model is loaded
         check_strength(settings.method, each)
     source = sources.find(target, settings, on_event)
     sources.check_moved(source)
-    displacement = Displacement(
-        source.backbone, source.base, rules.keep(source, settings, on_event)
-    )
+    # Before any weight is changed: the task's factors are those of the fine-tuned weights.
+    keep = rules.keep(source, settings, on_event)
+    displacement = Displacement(source.backbone, source.base, keep)
     tried, chosen = _Sweep(), strength
     if strength is None:
-        judge = _Judge(source, settings, on_event)
-        if max_drop is not None:
-            probe.warn_of_little_knowledge(judge.baseline, source.base_name, "merge", on_event)
-        tried = _try(displacement, judge, sorted({0.0, *strengths}), on_event)
-        chosen = _weakest(tried.points, max_drop, gate)
-        # The one that passes, or the strongest, which comes nearest to it.
-        judged_by = next((p for p in tried.points if p.strength == chosen), tried.points[-1])
-        probe.warn_of_few_questions(
-            tried.questions, judged_by.drop_interval, max_drop, "merge", on_event
-        )
-        if chosen == 0:
-            said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
-            on_event(Warned("merge", said))
+        tried = _try(displacement, source, settings, strengths, max_drop, on_event)
+        chosen = _chosen(tried, target, max_drop, gate, on_event)
     kept = loss = None
     if chosen is not None and out is not None:
-        kept = displacement.keep(chosen)
+        kept = displacement.keep(chosen)  # a sweep has left the weights of its strongest
         loss = tried.loss_at(chosen)
         if judged:
             loss = _performance(source, chosen).get("validation_loss")
@@ -222,8 +211,11 @@ def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, A
         found["frames"] = settings.frames
     if settings.anchor is not None:
         return found | {"anchor": files.sha256_file(settings.anchor)}
-    found |= {name: getattr(settings, name) for name in ("vqa", "ask", "samples", "temperature")}
-    return found | {"skip_bad": True} if settings.skip_bad else found
+    for name in ("vqa", "ask", "samples", "temperature"):
+        found[name] = getattr(settings, name)
+    if settings.skip_bad:
+        found["skip_bad"] = True
+    return found
 
 
 class _Judge:
@@ -259,16 +251,44 @@ class _Judge:
 
 
 def _try(
-    displacement: Displacement, judge: _Judge, strengths: Sequence[float], on_event: OnEvent
+    displacement: Displacement,
+    source: sources.Source,
+    settings: MergeSettings,
+    strengths: Sequence[float],
+    max_drop: float | None,
+    on_event: OnEvent,
 ) -> _Sweep:
-    """Judge each of the strengths in turn."""
+    """Judge each of the strengths in turn, the weakest first, and the fine-tuned model before."""
+    judge = _Judge(source, settings, on_event)
+    if max_drop is not None:
+        probe.warn_of_little_knowledge(judge.baseline, source.base_name, "merge", on_event)
+    rising = sorted({0.0, *strengths})  # 0 is the fine-tuned model itself
     points: list[MergePoint] = []
-    on_event(Progress("merge", 0, len(strengths), "strengths"))
-    for number, strength in enumerate(strengths, 1):
+    on_event(Progress("merge", 0, len(rising), "strengths"))
+    for number, strength in enumerate(rising, 1):
         points.append(judge.point(strength, displacement.keep(strength)))
         shown = {"accuracy": points[-1].accuracy}
-        on_event(Progress("merge", number, len(strengths), "strengths", shown))
+        on_event(Progress("merge", number, len(rising), "strengths", shown))
     return _Sweep(tuple(points), judge.baseline.accuracy, judge.questions)
+
+
+def _chosen(
+    tried: _Sweep, target: str, max_drop: float | None, gate: str, on_event: OnEvent
+) -> float | None:
+    """The strength of a sweep that is written, if one is; says where the figures decide little."""
+    chosen = _weakest(tried.points, max_drop, gate)
+    # The one that passes, or the strongest, which comes nearest to it.
+    judged_by = tried.points[-1]
+    for point in tried.points:
+        if point.strength == chosen:
+            judged_by = point
+    probe.warn_of_few_questions(
+        tried.questions, judged_by.drop_interval, max_drop, "merge", on_event
+    )
+    if chosen == 0:
+        said = f"'{target}' itself loses no more than {max_drop:g} points: nothing is moved"
+        on_event(Warned("merge", said))
+    return chosen
 
 
 def _weakest(points: Sequence[MergePoint], max_drop: float | None, gate: str) -> float | None:

@@ -39,6 +39,7 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
     if settings.method == "linear":
         return lambda _, moved, strength: _scaled(moved, 1 - strength)
     part = MERGE_NEEDS[settings.method]
+    # What the user has frozen has no displacement, and the anchor need not have measured it.
     sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
     if not sites:
         raise AegisError(
@@ -58,8 +59,9 @@ def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
 
 
 def _moved(source: Source, site: str) -> bool:
-    both = (present(weights(model, site)) for model in (source.backbone, source.base))
-    return any(has_moved(source, now, before) for now, before in zip(*both, strict=True))
+    now = present(weights(source.backbone, site))
+    before = present(weights(source.base, site))
+    return any(has_moved(source, *pair) for pair in zip(now, before, strict=True))
 
 
 def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:
@@ -117,10 +119,13 @@ def _scaled(moved: Pair, share: float) -> Pair:
 
 def _shrink(source: Source, anchor: Anchor, sites: list[str], damping: float) -> Keep:
     """The proximal step of the method `kfac`, once, from the fine-tuned weights."""
-    found = curvatures(anchor, {s: weights(source.base, s)[0] for s in sites}, damping)
+    likes = {site: weights(source.base, site)[0] for site in sites}
+    found = curvatures(anchor, likes, damping)
 
     def kept(site: str, moved: Pair, strength: float) -> Pair:
-        return minus(moved, found[site].excess(*moved, strength)) if site in found else moved
+        if site not in found:  # it has not moved
+            return moved
+        return minus(moved, found[site].excess(*moved, strength))
 
     return kept
 
@@ -142,30 +147,40 @@ def _two_sided(
         sites: the maps that have moved.
         sides: names of both factors; None: inputs alone, by the map's own name.
     """
-    names = {site: [f"{site}.{side}" for side in sides] if sides else [site] for site in sites}
-    if missing := sorted(name for own in names.values() for name in own if name not in questions):
+    names = {}  # of each map's spectra: one, or that of either side
+    for site in sites:
+        names[site] = [f"{site}.{side}" for side in sides] if sides else [site]
+    wanted = {name for own in names.values() for name in own}
+    missing = sorted(wanted - questions.keys())
+    if missing:
         raise AegisError(
             f"an anchor without {', '.join(missing)}",
             "that of every map that has moved",
             "measure it again with aegis anchor, or leave --anchor out",
         )
     bases: dict[str, TwoSided] = {}
-    with devices.single_threaded():
+    with devices.single_threaded():  # the eigensolver waits for its own threads
         for site, own in names.items():
-            if all(name in task for name in own):  # else the task does not depend on the map
-                pairs = [(task.pop(name), questions[name]) for name in own]
-                if not any(_directions(spectrum) for spectrum in pairs[-1]):
-                    pairs = pairs[:1]  # only the outputs' traces are known: all are alike
-                found = [basis(damped(a, damping), damped(b, damping)) for a, b in pairs]
-                bases[site] = TwoSided(*found)
+            if not all(name in task for name in own):
+                continue  # the task does not depend on the map
+            pairs = [(task.pop(name), questions[name]) for name in own]
+            if not any(_directions(spectrum) for spectrum in pairs[-1]):
+                pairs = pairs[:1]  # only the outputs' traces are known: all are alike
+            found = []
+            for of_task, of_questions in pairs:
+                found.append(basis(damped(of_task, damping), damped(of_questions, damping)))
+            bases[site] = TwoSided(*found)
     moving = frozenset(sites)
 
     def kept(site: str, moved: Pair, strength: float) -> Pair:
         if site not in moving:
             return moved
-        if site not in bases:
+        if site not in bases:  # the task needs nothing of it: back to the pre-trained weights
             return _scaled(moved, 0)
-        return _on(moved[0].device, bases[site].kept(_on(_CPU, moved), strength))
+        # The bases are on the CPU, where they were found.
+        weight, _ = moved
+        kept_there = bases[site].kept(_sent(moved, _CPU), strength)
+        return _sent(kept_there, weight.device)
 
     return kept
 
@@ -174,6 +189,6 @@ def _directions(spectrum: Spectrum) -> int:
     return 0 if spectrum.vectors is None else spectrum.vectors.shape[1]
 
 
-def _on(device: torch.device, pair: Pair) -> Pair:
+def _sent(pair: Pair, device: torch.device) -> Pair:
     weight, bias = pair
     return weight.to(device), None if bias is None else bias.to(device)

@@ -108,7 +108,7 @@ class PolicyRun:
         self._header = artifacts.read_header(self._checkpoint / checkpoint.EXPERT)
         self.base_name = settings.base or self._recipe.backbone
         self.base = backbones.load(self.base_name).to(devices.pick())
-        self._check_base()
+        self._check_base()  # before the policy is loaded, which is as large again
         policy, self._meta = checkpoint.load_policy(self._checkpoint)
         self._policy = policy.to(devices.pick())
         self.backbone = self._policy.backbone
@@ -132,6 +132,7 @@ class PolicyRun:
 
         def fill(folder: Path) -> None:
             self._copy_records(folder, out, step)
+            # The same place as in the run, so that whatever reads a run reads the merge too.
             target = folder / "checkpoints" / f"{step:06d}"
             target.mkdir(parents=True)
             checkpoint.write_policy(
@@ -160,6 +161,7 @@ class PolicyRun:
                 shutil.copyfile(self._run / name, folder / name)
         if (kept := places.of(self._run)) is not None:
             places.keep(folder, kept, out)
+        # A checkpoint before the last one knows nothing of the steps after it.
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header
@@ -184,6 +186,7 @@ class PolicyRun:
         wanted = self._header.inputs["demos"]
         paths = self._settings.demos or self._find_demos(wanted)
         found = loading.load_demonstrations(self._recipe, self.base, paths, self._on_event)
+        # Of other demonstrations, others are held out, and the policy may have learned from these.
         if found.sha256 != wanted:
             raise AegisError(
                 f"other demonstrations in {mixture.said(paths)} than those of the run "
@@ -214,7 +217,9 @@ class PolicyRun:
         before = self._checkpoint / checkpoint.BACKBONE / "README.md"
         if not before.is_file():
             return ""
-        return before.read_text(encoding="utf-8") + "\n" + _card(merged).replace("# ", "## ", 1)
+        said = before.read_text(encoding="utf-8")
+        # One heading level below the card's own.
+        return said + "\n" + _card(merged).replace("# ", "## ", 1)
 
 
 def _run_of(path: Path) -> Path:
@@ -327,6 +332,7 @@ def _check_alike(tuned: Backbone, base: Backbone) -> None:
         for name in sorted(shapes.keys() | wanted.keys())
         if shapes.get(name) != wanted.get(name)
     ]
+    # The order counts too: `Displacement` walks through both models side by side.
     if differing or list(shapes) != list(wanted):
         shown = ", ".join(differing[:3]) or "another order of the parameters"
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""

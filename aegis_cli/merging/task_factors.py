@@ -32,6 +32,7 @@ def inputs(
 ) -> dict[str, Spectrum]:
     """The second moment of each map's inputs on training frames, by site."""
     recorder = InputRecorder(policy.backbone, _maps(policy.backbone), follow_uses=False)
+    # None: no row is padded (`_passes`), so that every token counts.
     with recorder.watch(None), torch.no_grad():
         for rows in _passes(demos, frames, "task inputs", on_event):
             instructions = [demos.instructions[i] for i in demos.instruction_of[rows].tolist()]
@@ -66,7 +67,9 @@ def curvature(
 
 
 def _maps(backbone: Backbone) -> Maps:
-    return Maps(kinds=dict.fromkeys(dense_sites(backbone), "maps"), twins={}, heads={}, unknown={})
+    # Only linear maps and convolutions have factors in a merge, no tables and no tied heads.
+    kinds = dict.fromkeys(dense_sites(backbone), "maps")
+    return Maps(kinds=kinds, twins={}, heads={}, unknown={})
 
 
 def _passes(demos: Demonstrations, frames: int, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
