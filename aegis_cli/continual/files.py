@@ -37,7 +37,7 @@ def write(run: AnyStreamRun, report: StreamReport) -> None:
     """Every file of a finished run; stream.json comes last and says that it is finished."""
     if run.learner.trains == "experts":
         write_tensors(run, report)
-    run.save_model()
+    run.save_model()  # after the experts, whose digest a robot's action expert notes
     write_matrix(run.out, report)
     files.save_json(run.out / PARAMETERS, _parameters(report))
     kept = {key: value for key, value in report.to_json().items() if key not in _NOT_KEPT}
@@ -102,7 +102,9 @@ def attach(run: AnyStreamRun) -> None:
 
 def write_tensors(run: AnyStreamRun, report: StreamReport) -> None:
     """Experts, and routers with what they were measured to do."""
-    parameters = {name: p.detach().cpu() for name, p in routing.named_parameters(run.sites).items()}
+    parameters = {}
+    for name, parameter in routing.named_parameters(run.sites).items():
+        parameters[name] = parameter.detach().cpu()
     experts = {name: t for name, t in parameters.items() if ".experts." in name}
     routers = {name: t for name, t in parameters.items() if ".routers." in name}
     common: dict[str, Any] = {
@@ -132,7 +134,9 @@ def _figures(run: AnyStreamRun, report: StreamReport) -> dict[str, Tensor]:
     """
     tensors = {}
     for task, record in enumerate(report.records):
-        for site in (s for s in record.sites if s.experts):
+        for site in record.sites:
+            if not site.experts:
+                continue
             prefix = f"{site.site}.routers.{run.learner.router(task)}"
             tensors[f"{prefix}.experts"] = torch.tensor(site.experts)
             tensors[f"{prefix}.mass"] = torch.tensor(site.mass, dtype=torch.float64)

@@ -94,9 +94,13 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
         """
         task = self.current.task
         if self.learner.compares:
+            # A resumed run begins with the first: prototypes are not in its state, but the bare
+            # encoder gives the same ones again.
             for i in range(len(self.prototypes), task + 1):
-                features = self.evaluator.bare(self.tasks[i].train)
-                self.prototypes.append(features.double().mean(0).float().cpu())
+                features = self.evaluator.bare(self.tasks[i].train)  # [N, D]
+                mean = features.double().mean(0)
+                self.prototypes.append(mean.float().cpu())
+        # A task that goes on has its Gaussian in the state.
         if not self.learner.shared and len(self.gaussians) == task:
             settings = self.recipe.inference
             looks = self.evaluator.looks(self.tasks[task].train)
@@ -116,6 +120,7 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
         assert isinstance(before, ImageStreamReport)
         count = len(self.tasks)
         oracle, inferred = list(before.oracle), list(before.inferred)
+        # Unless what serves a learned task is frozen, the weights after earlier tasks are gone.
         rows = range(count) if self.learner.frozen else [count - 1]
         for done, t in enumerate(rows, 1):
             told, guessed = self.evaluator.row(t, self.gaussians[: t + 1])
@@ -167,7 +172,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
     found = tasks(recipe, model.image_size, on_event)
     if recipe.split == VALIDATION:  # for choices, which must not see the test parts
         found = on_validation(found)
-    fingerprint = model.fingerprint()
+    fingerprint = model.fingerprint()  # of the bare encoder, before anything stands beside its maps
     model.requires_grad_(False)
     for task in found:  # a name that cannot be read is refused before anything is written
         _check_words(model, task, recipe.path)
@@ -269,6 +274,7 @@ def image_set(recipe: StreamRecipe) -> str:
 
 
 def _folder_tasks(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
+    # Only a published stream's tasks have templates of their own; others could bear their names.
     known = mtil.STREAMS.get(recipe.stream, ())
     for name in _folder_names(recipe):
         template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
@@ -323,6 +329,7 @@ class ClassificationLoss:
         return self._loss(batch, self._class_features)
 
     def calibration_loss(self) -> Tensor:
+        # Without the kept features: the text tower's routers are measured on this pass too.
         return self._loss(self._calibration, self._class_weights)
 
     def trainable_changed(self) -> None:
@@ -330,8 +337,8 @@ class ClassificationLoss:
 
     def _loss(self, batch: tuple[Tensor, Tensor], texts: Callable[[], Tensor]) -> Tensor:
         images, labels = batch
-        features = self._encoder.image_features(self._encoder.pixels(images))
-        logits = self._encoder.scale() * features @ texts().T
+        features = self._encoder.image_features(self._encoder.pixels(images))  # [B, D]
+        logits = self._encoder.scale() * features @ texts().T  # [B, C]
         return nn.functional.cross_entropy(
             logits.float(), labels.to(logits.device), label_smoothing=self._smoothing
         )
@@ -340,6 +347,7 @@ class ClassificationLoss:
         if self._texts is not None:
             return self._texts
         found = self._class_weights()
+        # Where gradients are off, nothing would ask for one, whatever learns.
         if not found.requires_grad and torch.is_grad_enabled():
             self._texts = found
         return found
@@ -382,10 +390,11 @@ class ImageEvaluator:
         for i, task in enumerate(self.tasks):
             labels = task.test.labels
             state = self._state(i, done)
-            answers = self._answers(i, state)
+            answers = self._answers(i, state)  # [N]
             told.append(_accuracy(answers, labels))
             if not self.learner.shared:
-                answers = self._inferred(i, state, answers, infer(self._test_looks(i), gaussians))
+                chosen = infer(self._test_looks(i), gaussians)  # [N]; NONE: the bare encoder
+                answers = self._inferred(i, state, answers, chosen)
             inferred.append(_accuracy(answers, labels))
         return told, inferred
 
@@ -427,6 +436,7 @@ class ImageEvaluator:
         else:
             features = self._features(self.tasks[i].test, router, None)
         answers = self._classify(i, router, features)
+        # Kept only where nothing that is learned later can change them.
         if self.learner.frozen or (router is None and self.learner.trains != "model"):
             self._known[i, router] = answers
         return answers
@@ -437,7 +447,7 @@ class ImageEvaluator:
         for task in chosen.unique().tolist():
             rows = (chosen == task).nonzero().flatten()
             router = None if task == NONE else self.learner.router(task)
-            if router == own:
+            if router == own:  # what the answers came from already
                 mixed[rows] = answers[rows]
             elif router is None:
                 mixed[rows] = self._answers(i, None)[rows]
@@ -457,11 +467,14 @@ class ImageEvaluator:
     ) -> Tensor:
         activate(self.sites, router)
         self.encoder.eval()
-        chunks = rows.split(EVALUATION_BATCH)
-        return torch.cat([tower(self.encoder.pixels(part.images(chunk))) for chunk in chunks])
+        found = []
+        for chunk in rows.split(EVALUATION_BATCH):
+            pixels = self.encoder.pixels(part.images(chunk))
+            found.append(tower(pixels))
+        return torch.cat(found)
 
     def _classify(self, i: int, router: int | None, features: Tensor) -> Tensor:
-        activate(self.sites, router)
+        activate(self.sites, router)  # the text tower has routers too
         weights = class_weights(self.encoder, self.tasks[i].classes, self.tasks[i].templates)
         return (features @ weights.T).argmax(1).cpu()
 

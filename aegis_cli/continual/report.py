@@ -97,11 +97,13 @@ def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> 
     """
     grown = {s.site for record in before for s in record.sites if s.experts}
     task = len(before)
-    return [
-        sum(m for m, owner in zip(s.mass, s.owners, strict=True) if owner < task)
-        for s in sites
-        if s.experts and s.site in grown
-    ]
+    masses = []
+    for site in sites:
+        if not site.experts or site.site not in grown:
+            continue
+        of_each = zip(site.mass, site.owners, strict=True)
+        masses.append(sum(mass for mass, owner in of_each if owner < task))
+    return masses
 
 
 def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
@@ -318,7 +320,9 @@ def report_from(kind: type[StreamReport], raw: Mapping[str, Any], out: Path) -> 
 def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
     """What all records together say of parameters and reuse, by a report's names."""
     first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
-    masses = [history_mass(r.sites, records[:task]) for task, r in enumerate(records)]
+    masses = []
+    for task, record in enumerate(records):
+        masses.append(history_mass(record.sites, before=records[:task]))
     return {
         "parameters": sum(r.added for r in records),
         "trained_phase1": sum(first) / len(first) if first else None,

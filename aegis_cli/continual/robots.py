@@ -26,7 +26,7 @@ from aegis_cli.common.palette import COLORS
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.report import RobotStreamReport, StreamReport, as_rows, vqa_scores
-from aegis_cli.continual.state import StreamRun
+from aegis_cli.continual.state import StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.core.routing import Routed
@@ -55,6 +55,7 @@ ATTENTION_INPUTS = {"qkv", "qkv_proj", "q_proj", "k_proj", "v_proj"}
 # purposes of a step's noise, each with a generator of its own
 TRAINING_NOISE, VALIDATION_NOISE, CALIBRATION_NOISE = 1, 2, 3
 ACTION_EXPERT, BACKBONE = "expert.safetensors", "backbone"
+QUESTION_FILE = "vqa/"  # the name of a question file among a run's inputs begins so
 
 Scales = tuple[Normalizer, Normalizer]  # of positions and of actions
 Questions = sets.Scenes | sets.Listed
@@ -130,9 +131,10 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     @property
     def inputs(self) -> dict[str, str]:
-        digests = {
-            f"demos of {task}": d.sha256 for task, d in zip(self.names, self.demos, strict=False)
-        }
+        digests = {}
+        # Not strict, because a run that only acts has no demonstrations.
+        for task, demos in zip(self.names, self.demos, strict=False):
+            digests[f"demos of {task}"] = demos.sha256
         return {**super().inputs, "backbone": self.fingerprint, **digests, **self.question_files}
 
     def activate(self, task: int | None) -> None:
@@ -159,7 +161,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     def after_task(self) -> dict[str, float]:
         current = self.current
-        self.demos[current.task].check_files()
+        self.demos[current.task].check_files()  # that nobody has written to them meanwhile
+        # Each measurement activates what it measures; none relies on what the last one left.
         current.oracle.append(self.measuring.row(current.task))
         current.vqa.append(self.measuring.vqa())
         loss = self._validation_loss()
@@ -187,9 +190,11 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             now.append(self.measuring.success(task))
             on_event(Progress("probe", task + 1, count, "tasks"))
         known = self.measuring.vqa()
+        # Without frozen experts, only the last row's weights are left.
         first = 0 if self.learner.frozen else count - 1
         rows = tuple(tuple(now[: t + 1]) for t in range(first, count))
         success = (*before.success[:first], *rows)
+        # VQA has a score more than there are rows: the one before the first task.
         told = [(then.accuracy, then.cross_entropy) for then in before.vqa]
         vqa = vqa_scores([*told[: first + 1], *[known] * (count - first)])
         found = dataclasses.replace(before, success=success, scores=seen_scores(success), vqa=vqa)
@@ -251,10 +256,13 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     _check_freeze(recipe, backbone, on_event)
     for task in recipe.tasks:
         _check_words(backbone, task)
+    # Only now, when all else has been found to fit: recording takes long.
     demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
     scales = [d.scales(recipe.train.normalization) for d in demos]
-    widest = (max(len(both[k].mean) for both in scales) for k in (0, 1))
-    shape = assemble.expert_shape(backbone, recipe, *widest)
+    # One action expert serves all robots: it reads and moves as many joints as any has.
+    proprio = max(len(positions.mean) for positions, _ in scales)
+    actions = max(len(of_actions.mean) for _, of_actions in scales)
+    shape = assemble.expert_shape(backbone, recipe, proprio, actions)
     run = _assemble(recipe, backbone, shape, scales, out, demos)
     run.measure_with(source, on_event)
     return run
@@ -274,10 +282,10 @@ def load(
     """
     run = load_to_act(path)
     source = questions(recipe, on_event)
-    if any(before.inputs.get(name) != now for name, now in source.sha256.items()):
-        names = ", ".join(source.sha256)
+    asked = {name: sha for name, sha in before.inputs.items() if name.startswith(QUESTION_FILE)}
+    if changed := changed_inputs(asked, source.sha256):
         raise AegisError(
-            f"other questions than the run in '{path}' was measured with: {names}",
+            f"other questions than the run in '{path}' was measured with: {', '.join(changed)}",
             "the same files",
             "bring them back, or train the stream again in another --out",
         )
@@ -444,7 +452,7 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
     else:
         grown = grown_maps(backbone)
         left = list(still.without(grown))
-        if len(left) == len(grown):
+        if len(left) == len(grown):  # no map that would get experts is frozen
             raise AegisError(
                 f"{with_learner}, which trains none of it anyway",
                 "parts with maps beside which experts would stand: the MLPs and attention outputs "
@@ -512,6 +520,7 @@ def share(
     backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
 ) -> tuple[Policy, ...]:
     """One policy per task, with one action expert that follows from the seed."""
+    # Forked, so that the caller's random numbers go on as they were.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         expert = ActionExpert(shape)
@@ -530,7 +539,8 @@ def grown_maps(backbone: Backbone) -> dict[str, nn.Linear]:
     last = {id(parameter) for parameter in last_layer}
     maps = {}
     for name, linear in backbone.language_maps().items():
-        if name.rpartition(".")[2] not in ATTENTION_INPUTS and id(linear.weight) not in last:
+        leaf = name.rpartition(".")[2]
+        if leaf not in ATTENTION_INPUTS and id(linear.weight) not in last:
             maps[name] = linear
     return maps
 
@@ -557,11 +567,12 @@ def is_added(name: str) -> bool:
 
 def own_parameters(expert: ActionExpert) -> dict[str, nn.Parameter]:
     """The action expert's parameters but those beside its maps, named as if nothing stood there."""
-    return {
-        name.replace(".base.", "."): p
-        for name, p in expert.named_parameters()
-        if not is_added(name)
-    }
+    own = {}
+    for name, parameter in expert.named_parameters():
+        if not is_added(name):
+            # A map beside which experts stand is the `base` of a `RoutedLinear`.
+            own[name.replace(".base.", ".")] = parameter
+    return own
 
 
 # --- what a task is learned by --------------------------------------------------------------------
@@ -586,6 +597,7 @@ class FlowMatchingLoss:
         return self._loss(batch, generator(self._seed, self._first_step + step, TRAINING_NOISE))
 
     def calibration_loss(self) -> Tensor:
+        # The same noise at each check, so that routers that stand still are seen to.
         draws = generator(self._seed, self._first_step, CALIBRATION_NOISE)
         return self._loss(self._calibration, draws)
 
@@ -606,6 +618,8 @@ def generator(seed: int, index: int, purpose: int) -> torch.Generator:
 
 
 def _seed(seed: int, index: int, purpose: int) -> int:
+    # Purposes are below 4, so those of one step share no generator; nor do two seeds, in streams of
+    # up to a million steps.
     return (seed * 1_000_003 + index) * 4 + purpose
 
 
@@ -634,6 +648,7 @@ class RobotEvaluator:
         """Share of successes of the task of that number, or of the highest return."""
         run, settings = self._run, self._run.recipe.rollout
         run.activate(task)
+        # The policies share backbone and action expert, and differ in their task's scales.
         name, policy = run.names[task], run.policies[task].eval()
         split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
         found = rollout.play(
@@ -646,6 +661,7 @@ class RobotEvaluator:
             on_event=self._named(name),
             seed=settings.seed,
         )
+        # A task of dm_control's suite has no success, but a return.
         share = found.return_share if found.success is None else found.success
         assert share is not None
         return share

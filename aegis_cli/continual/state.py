@@ -208,7 +208,9 @@ class StreamRun(ABC, Generic[S]):
         if self.learner.trains == "model":
             return f"{own}.lr"
         if ".routers." in name:
-            return f"{own if 'router_lr' in self.options else 'train'}.router_lr"
+            # A learner may have a rate of its own for them.
+            section = own if "router_lr" in self.options else "train"
+            return f"{section}.router_lr"
         return "train.lr"
 
     def rate(self, name: str) -> float:
@@ -311,7 +313,9 @@ def optimizer(
         groups.setdefault((routes, run.rate(name)), []).append(parameter)
     settings = []
     for routes, rate in sorted(groups):
+        # A router whose logits decay would drift towards equal weights, and scales towards 0.
         decay = 0.0 if routes else run.recipe.train.weight_decay
+        # The loop sets `lr` from `peak` at every step.
         group = {"params": groups[routes, rate], "lr": rate, "peak": rate, "weight_decay": decay}
         settings.append(group)
     made = torch.optim.AdamW(settings, fused=True)
@@ -358,9 +362,9 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     path = run.out / STATE
     saved = artifacts.load(path, "training-state")
     if saved.header.inputs != run.inputs:
-        changed = sorted(k for k in run.inputs if saved.header.inputs.get(k) != run.inputs[k])
+        different = changed_inputs(saved.header.inputs, run.inputs)
         raise AegisError(
-            f"another {', '.join(changed)} than the run in '{run.out}' began with",
+            f"another {', '.join(different)} than the run in '{run.out}' began with",
             "the same inputs",
             "give what the run began with, or start anew in another --out",
         )
@@ -370,16 +374,25 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
         run.current = TaskInProgress(**meta["place"])
         run.current.check(len(run.names), run.recipe.train.steps)
         run.gaussians = gaussians_from(saved.tensors)
+        # The structure first: the parameters are those of the experts and routers that it makes.
         rebuild(run.sites, meta["structure"], weights)
         parameters = run.parameters()
         run.model.requires_grad_(False)
         for name in meta["learning"]:
             parameters[name].requires_grad_(True)
         bare = optimizer_state.said_stateless(meta)
+    # At step 0 the task has not begun, and nothing of it learns yet.
     made = optimizer(run) if run.current.step else None
+    # All but the Gaussians, which are no parameters.
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
+
+
+def changed_inputs(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Names of the inputs whose digests differ, those that only one of both has included."""
+    names = sorted(then.keys() | now.keys())
+    return [name for name in names if then.get(name) != now.get(name)]
 
 
 def rebuild(sites: Routed, structure: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -403,11 +416,13 @@ def rebuild(sites: Routed, structure: Mapping[str, Any], tensors: Mapping[str, T
 def _check_structure(site: str, said: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Raise what is wrong with the structure of one map."""
     for number, expert in said["experts"].items():
+        # Compared with the tensor, since a damaged number could ask for any amount of memory.
         rank = tensors[f"{site}.experts.{int(number)}.a"].shape[0]
         if expert["rank"] != rank or type(expert["frozen"]) is not bool:
             raise ValueError(f"expert {number} of '{site}' is {expert}")
         if type(expert["owner"]) is not int:
             raise ValueError(f"expert {number} of '{site}' belongs to {expert['owner']!r}")
+    # `born` counts deleted experts too, so that no number is given twice.
     newest = max(map(int, said["experts"]), default=-1)
     if type(said["born"]) is not int or said["born"] <= newest:
         raise ValueError(f"{said['born']!r} experts were born in '{site}'")
@@ -425,13 +440,19 @@ def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
 
     There are none for no tasks.
     """
-    names = _GAUSSIAN if gaussians else ()
-    return {f"tasks.{name}": torch.stack([getattr(g, name) for g in gaussians]) for name in names}
+    tensors = {}
+    for name in _GAUSSIAN if gaussians else ():
+        tensors[f"tasks.{name}"] = torch.stack([getattr(g, name) for g in gaussians])
+    return tensors
 
 
 def gaussians_from(tensors: Mapping[str, Tensor]) -> list[Gaussian]:
     """What `gaussian_tensors` wrote."""
     if "tasks.mean" not in tensors:
         return []
-    parts = [tensors[f"tasks.{name}"] for name in _GAUSSIAN]
-    return [Gaussian(*(t.clone() for t in one)) for one in zip(*parts, strict=True)]
+    parts = [tensors[f"tasks.{name}"] for name in _GAUSSIAN]  # of all tasks, [T, ...] each
+    found = []
+    for one in zip(*parts, strict=True):
+        # Clones, because a view of one task would keep those of all in memory.
+        found.append(Gaussian(*(t.clone() for t in one)))
+    return found

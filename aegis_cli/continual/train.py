@@ -76,12 +76,14 @@ def _run(
     if (out / state.STATE).exists():
         optimizer = state.restore(built)
         _truncate_metrics(built)
-    else:
+    else:  # also a run that was interrupted before its first state
+        # Written only now, when all that the recipe names has been found to fit.
         folder.begin(out, recipe)
         built.before_stream()
     _learn(built, optimizer, on_event)
     report = built.report()
     files.write(built, report)
+    # Last: a run that is interrupted while it writes goes on from its state.
     (out / state.STATE).unlink(missing_ok=True)
     return report
 
@@ -144,36 +146,39 @@ def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:
     return robots
 
 
-def _learn(run: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+def _learn(
+    stream: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent
+) -> None:
     """Learn the tasks that are left, and measure after each.
 
     Args:
         optimizer: of the current task, if it has begun.
     """
-    count = len(run.names)
-    while run.current.task < count:
-        learned = run.current
-        prototypes = run.before_task()
-        record = loop.learn(run, prototypes, optimizer, on_event)
+    count = len(stream.names)
+    while stream.current.task < count:
+        learned = stream.current
+        prototypes = stream.before_task()
+        record = loop.learn(stream, prototypes, optimizer, on_event)
         started = time.perf_counter()
         # through JSON, so that a run that goes on holds the same values as one read from disk
         learned.records.append(json.loads(canonical(dataclasses.asdict(record))))
-        figures = run.after_task()
-        line = {"task": learned.task, "step": run.recipe.train.steps, **figures}
-        folder.append_metrics(run.out, line | {"seconds": time.perf_counter() - started})
-        run.current, optimizer = learned.next_task(), None
-        if run.current.task < count:
-            if run.learner.trains != "nothing":
-                state.save(run, None)
-            if run.partial_matrix:
-                files.write_matrix(run.out, run.report())
-        shown = {run.score_name: learned.oracle[-1][learned.task]}
-        on_event(Progress("stream", run.current.task, count, "tasks", shown))
+        figures = stream.after_task()
+        line = {"task": learned.task, "step": stream.recipe.train.steps, **figures}
+        folder.append_metrics(stream.out, line | {"seconds": time.perf_counter() - started})
+        # The next task begins with an optimizer of its own: the state says so by step 0.
+        stream.current, optimizer = learned.next_task(), None
+        if stream.current.task < count:
+            if stream.learner.trains != "nothing":
+                state.save(stream, None)
+            if stream.partial_matrix:
+                files.write_matrix(stream.out, stream.report())
+        shown = {stream.score_name: learned.oracle[-1][learned.task]}
+        on_event(Progress("stream", stream.current.task, count, "tasks", shown))
 
 
-def _truncate_metrics(run: AnyStreamRun) -> None:
+def _truncate_metrics(stream: AnyStreamRun) -> None:
     """Forget what was logged after the state was written: a resumed run repeats those steps."""
-    at = (run.current.task, run.current.step)
-    lines = folder.read_metrics(run.out, "task", "step")
-    kept = [line for line in lines if (line["task"], line["step"]) <= at]
-    write_text(run.out / folder.METRICS, "".join(json.dumps(line) + "\n" for line in kept))
+    at = (stream.current.task, stream.current.step)
+    lines = folder.read_metrics(stream.out, "task", "step")
+    kept = [json.dumps(line) for line in lines if (line["task"], line["step"]) <= at]
+    write_text(stream.out / folder.METRICS, "".join(f"{line}\n" for line in kept))

@@ -10,13 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import datasets
 import pytest
 import torch
 from samples.interrupted import at_each, stop
 from samples.robots import STEPS, Make
 from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, snapshot
 from samples.training_runs import contents
-from samples.vqa_files import write_jsonl
+from samples.vqa_files import hub_rows, write_jsonl
 
 from aegis_cli import inspection
 from aegis_cli.common import artifacts
@@ -427,6 +428,25 @@ def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
     with pytest.raises(AegisError, match="another vqa/set.jsonl than the run"):
         train.run(asking, tmp_path / "cut", resume=True)
     assert contents(tmp_path / "done") == before
+
+
+def test_a_question_file_that_is_gone_is_named(make: Make, tmp_path: Path) -> None:
+    """A data set of several files can lose one, and is another set then."""
+    rows = datasets.Dataset.from_dict(hub_rows(60))
+    asked = tmp_path / "asked"
+    asked.mkdir()
+    for number, half in enumerate((range(60), range(60, 120))):
+        rows.select(half).to_parquet(str(asked / f"train-0000{number}-of-00002.parquet"))
+    asking = make("sequential", steps=1, probe=Probe(vqa=str(asked), questions=7))
+    train.run(asking, tmp_path / "done")
+    with pytest.raises(KeyboardInterrupt):
+        train.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
+    (asked / "train-00001-of-00002.parquet").unlink()
+    gone = "vqa/train-00001-of-00002.parquet"
+    with pytest.raises(AegisError, match=f"other questions than the run .*: {gone}"):
+        probe.run(tmp_path / "done")
+    with pytest.raises(AegisError, match=f"another {gone} than the run"):
+        train.run(asking, tmp_path / "cut", resume=True)
 
 
 @pytest.mark.parametrize("method", ["igsp", "sequential"])

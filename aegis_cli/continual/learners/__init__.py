@@ -37,7 +37,8 @@ def get(name: str) -> Learner:
 
 
 def _load(name: str) -> Learner:
-    module = import_module(f"{__name__}.{name.replace('-', '_')}")
+    file = name.replace("-", "_")  # a module's name has no hyphen
+    module = import_module(f"{__name__}.{file}")
     learner: Learner = module.LEARNER
     if learner.name != name:
         raise ValueError(f"{module.__name__} calls itself '{learner.name}', recipes '{name}'")

@@ -71,7 +71,10 @@ def start(router: Router, old: int, new: int, share: float) -> None:
     """
     if old:
         assert router.bias is not None
+        # A softmax over `old` logits of b and `new` ones of 0 gives history the share
+        # old e^b / (old e^b + new).
         router.bias[:old] = math.log(share / (1 - share) * new / old)
+    # 1 / p_c, with the weight p_c = (1 - share) / new of each new expert.
     router.scale.fill_(new / (1 - share) if old else new)
 
 
@@ -85,8 +88,9 @@ def penalty(context: TaskContext, traces: Traces) -> Tensor:
             sizes[name] = _numbers(context.sites[name], new)
     for name, size in sizes.items():
         history, new = used[name]
-        columns = range(len(history), len(history) + len(new))
+        columns = range(len(history), len(history) + len(new))  # new experts come last in a router
         price = context.options["reuse"] * size / sum(sizes.values())
+        # A map that is passed several times in a step pays as much as one that is passed once.
         for passed in traces[name]:
             charge(passed, columns, price / len(traces[name]))
     norms = []
@@ -119,7 +123,7 @@ def constrain(context: TaskContext) -> Constraint | None:
         if old:
             columns = basis(old)
             held += [(expert.b, columns) for expert in experts if expert.owner == context.task]
-    before = [b.detach().clone() for b, _ in held]
+    before = [b.detach().clone() for b, _ in held]  # room for the values before each step
 
     @torch.no_grad()
     def gradient() -> None:
@@ -131,6 +135,7 @@ def constrain(context: TaskContext) -> Constraint | None:
     @torch.no_grad()
     def update() -> None:
         for (b, columns), kept in zip(held, before, strict=True):
+            # Only what was added is projected: what phase 1 has left in the span stays.
             b.copy_(kept + without_span(b - kept, columns))
 
     return Constraint(gradient, update)
@@ -143,9 +148,10 @@ def _used(site: RoutedLinear, task: int) -> tuple[list[int], list[int]]:
     """
     router = site.router(task)
     assert router is not None
-    used = router.experts
-    new = [n for n, expert in zip(used, site.of(used), strict=True) if expert.owner == task]
-    return [number for number in used if number not in new], new
+    history, new = list[int](), list[int]()
+    for number, expert in zip(router.experts, site.of(router.experts), strict=True):
+        (new if expert.owner == task else history).append(number)
+    return history, new
 
 
 def _numbers(site: RoutedLinear, experts: list[int]) -> int:

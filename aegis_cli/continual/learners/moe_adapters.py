@@ -25,6 +25,7 @@ def begin(context: TaskContext) -> None:
     for name, site in context.sites.items():
         if context.task == 0:
             for _ in range(pool):
+                # Tasks count from 0, so that their number is the owner of what no task owns.
                 site.add_expert(options["rank"], context.tasks, context.generator)
         constant = context.model.in_text(name)
         numbers, top = site.numbers, options["top"]
@@ -35,7 +36,9 @@ def finish(context: TaskContext, flows: Flows) -> None:
     """Freeze the `top` experts that the task has used most; the others learn with the next task."""
     for name, site in context.sites.items():
         mass = flows[name].mass
-        most = mass.topk(min(context.options["top"], len(mass))).indices.tolist()
+        count = min(context.options["top"], len(mass))
+        most = mass.topk(count).indices.tolist()
+        # A task's router has the whole pool in the order of its numbers, as its columns are.
         for expert in site.of([site.numbers[i] for i in most]):
             if not expert.frozen:
                 expert.owner, expert.frozen = context.task, True

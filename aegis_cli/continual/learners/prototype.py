@@ -18,7 +18,7 @@ def begin(context: TaskContext) -> None:
     partner = nearest(context.prototypes, context.options["similarity"])
     for site in context.sites.values():
         known = None if partner is None else site.router(partner)
-        if known is None:
+        if known is None:  # also a map that the partner has no router at
             own = site.add_expert(context.options["rank"], context.task, context.generator)
             route_task(site, context.task, [own], context)
             continue

@@ -13,6 +13,7 @@ def begin(context: TaskContext) -> None:
         if context.task == 0:
             own = site.add_expert(context.options["rank"], _ONLY, context.generator)
             route_task(site, _ONLY, [own], context)
+        # After each task everything is frozen, the only expert too.
         site.experts.requires_grad_(True)
         site.routers.requires_grad_(True)
 
