@@ -262,7 +262,7 @@ def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> s
 
 
 def _acting(found: InspectReport) -> Iterator[str]:
-    """Success, or the share of the expert's return, in simulated episodes, and open-loop errors."""
+    """Success, or the mean return, in simulated episodes, and open-loop errors."""
     if not found.rollouts and not found.open_loops:
         yield "Not measured. `aegis rollout RUN` does it for simulated tasks, in open loop"
         yield "`aegis evaluate RUN --demos DEMONSTRATIONS` for any."
@@ -309,9 +309,11 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
 def _success(figures: Mapping[str, Any]) -> str:
     if figures.get("success") is not None:
         return _share(figures["success"], figures["interval"])
-    said = f"mean return {figures['mean_return']:.4g}"
+    said, interval = f"mean return {figures['mean_return']:.4g}", figures.get("return_interval")
+    if interval is not None:  # of a single episode there is none
+        said += f" ({interval[0]:.4g} to {interval[1]:.4g})"
     share = figures.get("return_share")
-    return said if share is None else f"{said}, {_percent(share)} of the demonstrations'"
+    return said if share is None else f"{said}, {_percent(share)} of the highest there is"
 
 
 def _share(share: float, interval: tuple[float, float]) -> str:

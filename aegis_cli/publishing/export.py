@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands
@@ -24,9 +25,12 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.publishing import card
+from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
 from aegis_cli.training import folder as run_folder
+from aegis_cli.training.card import without_places
 
+RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 SOURCE = "source"  # the type that the backbone was stored in before it was trained
 
 
@@ -70,7 +74,8 @@ def run(
 ) -> ExportReport:
     """Write a run's policy, or that of a checkpoint, as a folder for others.
 
-    Its model card is written too, except for a checkpoint that has been taken out of its run.
+    Its model card is written too, and in our own layout the recipe, except for a checkpoint that
+    has been taken out of its run.
 
     Args:
         out: a new folder; nothing is left of it where the export fails.
@@ -251,10 +256,22 @@ def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
 def _write_card(
     folder: Path, run: Path, form: str, repo: str, stored: card.Stored, cameras: Sequence[str]
 ) -> None:
-    """Write the model card of a run's policy; a policy without a run has nothing to say."""
+    """Write the model card of a run's policy; a policy without a run has nothing to say.
+
+    In our own layout the card names the recipe, which is written beside it.
+    """
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
     home = checkpoint.run_of(at)
-    if home is not None:
-        write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))
+    if home is None:
+        return
+    write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))
+    if form == card.AEGIS:
+        write_text(folder / RECIPE, _recipe(home))
+
+
+def _recipe(home: Path) -> str:
+    """The recipe of the training, without the folders in which models and data lie here."""
+    kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
+    return dump(without_places(kept))
