@@ -239,6 +239,19 @@ def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: P
     assert len(part) > 1 and before <= after
 
 
+@pytest.mark.parametrize("place", [".thumbnails/00.png", "close/.cache/00.png", ".00.png"])
+def test_hidden_files_and_folders_hold_no_images(place: str, dataset: Path, tmp_path: Path) -> None:
+    """They are some program's own, such as small copies of the images."""
+    root = shutil.copytree(dataset, tmp_path / "copy")
+    kept = root / "animals" / "test" / "zebra"
+    (kept / place).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(kept / "00.png", kept / place)
+    assert len(folders.load(root, "animals", SIZE).test) == 12
+    (kept / "close").mkdir(exist_ok=True)
+    shutil.copy(kept / "00.png", kept / "close" / "00.png")  # a plain folder's are read
+    assert len(folders.load(root, "animals", SIZE).test) == 13
+
+
 def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
     root = shutil.copytree(dataset, tmp_path / "copy")
     (root / "animals" / folders.CLASSES).write_text(json.dumps({"zebra": "striped horse"}))

@@ -162,9 +162,7 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     for label, name in enumerate(classes):
         inside = (part / name).rglob("*") if name in folders else ()
         # Sorted, because a folder's own order differs between file systems.
-        images = sorted(
-            p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")
-        )
+        images = sorted(p for p in inside if _is_image(p.relative_to(part)))
         files += images
         labels += [label] * len(images)
     if not files:
@@ -174,6 +172,15 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
             "check the path",
         )
     return Listing(tuple(files), tuple(labels))
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a path is an image's by its name, and neither it nor a folder in it is hidden.
+
+    What is hidden is some program's, such as the thumbnails of the images themselves.
+    """
+    hidden = any(name.startswith(".") for name in path.parts)
+    return path.suffix.lower() in _SUFFIXES and not hidden
 
 
 def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
