@@ -14,11 +14,12 @@ from typing import Any
 import torch
 import yaml
 
-from aegis_cli import recipes
+from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
+from aegis_cli.data.lerobot import layout
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
@@ -105,6 +106,8 @@ def run(
     warn_of_a_merge(run_path, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
+    if camera is not None:
+        meta = _renamed(meta, camera)
     make_folder(out.parent)
     with checkpoint.writing(out), folder_aside(out) as aside:
         if form == card.LEROBOT:
@@ -193,6 +196,25 @@ def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
             "e.g. --camera front",
         )
     return [camera]
+
+
+def _renamed(meta: PolicyMeta, camera: str) -> PolicyMeta:
+    """What a user has to know of a policy of one camera that is called otherwise from now on.
+
+    A simulated task, and the demonstrations, call it as they did.
+    """
+    task = meta["task"]
+    named = meta.get("cameras") or ([] if task is None else sim.cameras(task))
+    if not named:  # nobody has called it anything
+        return meta
+    now = layout.short(named[0])
+    known = meta.get("rename", {})
+    others = {own: new for own, new in known.items() if layout.short(new) != now}
+    # Of a camera that was renamed already, the name that it had at first.
+    first = next((layout.short(own) for own in known if own not in others), now)
+    found = meta.copy()
+    found["rename"] = {**others, first: layout.short(camera)}
+    return found
 
 
 def refuse_stream(run: Path) -> None:
