@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
-from aegis_cli.models import download, lerobot_folder
+from aegis_cli.models import backbones, download, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
@@ -189,6 +189,7 @@ def run(
     learned = source.selection(meta, data, rename)
     _check_robot(policy, meta, data, learned, on_event)
     chosen = source.choose(learned, data, episodes)
+    _warn_of_earlier_learning(source, data, rename, chosen.episodes, on_event)
     shown = _shown(policy, meta, data, learned, chosen, on_event)
     at = _spread(shown, chosen.episodes, frames)
     policy = policy.to(devices.pick())
@@ -359,6 +360,48 @@ class _Source:
         chosen = _existing(asked, count, data)
         trained_on = set(own.tolist()) - set(held_out)
         return _Chosen(CHOSEN, chosen, [e for e in chosen if e in trained_on])
+
+
+def _warn_of_earlier_learning(
+    source: _Source, data: Path, rename: Renaming, episodes: Sequence[int], on_event: OnEvent
+) -> None:
+    """Warn where a run that the policy began with was trained on some of these episodes."""
+    for run in [] if source.recipe is None else _began_with(source.recipe):
+        try:
+            earlier = _Source.find(run)
+            meta = artifacts.read_header(earlier.checkpoint / checkpoint.EXPERT).meta
+            learned = earlier.selection(cast(PolicyMeta, meta), data, rename)
+            known = earlier.choose(learned, data, episodes).trained_on
+        except AegisError:
+            # It is no longer whole, or these lack the cameras and features that it learned from.
+            continue
+        if known:
+            text = (
+                f"{len(known)} of these {len(episodes)} episodes were trained on by '{run}', with "
+                f"which '{source.name}' began: the policy has learned from them already"
+            )
+            on_event(Warned("evaluate", text))
+
+
+def _began_with(recipe: recipes.Recipe) -> list[Path]:
+    """The runs whose backbone or expert a training began with, and theirs, as far as still here."""
+    found, waiting = list[Path](), [recipe]
+    while waiting:
+        own = waiting.pop()
+        for name in (own.expert.start, backbones.divided(own.backbone)[0]):
+            run = None if name is None else _run_here(Path(name))
+            if run is not None and run not in found:
+                found.append(run)
+                waiting.append(recipes.load(run / "recipe.yaml"))
+    return found
+
+
+def _run_here(path: Path) -> Path | None:
+    """The run of a policy that a folder is, or a checkpoint of; None of anything else."""
+    if not path.is_dir() or recipes.is_stream_run(path):
+        return None
+    run = path if (path / "recipe.yaml").is_file() else checkpoint.run_of(path)
+    return run if run is not None and checkpoint.whole(run) else None
 
 
 def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: Path) -> None:

@@ -17,6 +17,7 @@ from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
+from aegis_cli.common.pictures import fit
 from aegis_cli.core import ensemble as temporal
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
@@ -131,6 +132,10 @@ class _Pace:
     guided: bool = False
 
 
+# (height, width) of the pictures that each camera showed in training; empty where nobody knows.
+Sizes = tuple[tuple[int, int], ...]
+
+
 class Acting(NamedTuple):
     """A policy ready to act in a task; `replan` actions of each predicted chunk are executed.
 
@@ -142,6 +147,7 @@ class Acting(NamedTuple):
     replan: int
     cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
     ensemble: float | None = None
+    sizes: Sizes = ()
 
 
 Load = Callable[[Path, str | None], Acting]
@@ -156,7 +162,8 @@ def load_run(run: Path, task: str | None) -> Acting:
     policy, meta = checkpoint.load_policy(run)
     cameras = checkpoint.cameras_of(meta, meta["task"] or task)
     acts_in = _task(policy, meta["task"], task)
-    return Acting(policy, acts_in, meta["replan"], cameras, meta.get("ensemble"))
+    sizes = checkpoint.sizes_of(meta)
+    return Acting(policy, acts_in, meta["replan"], cameras, meta.get("ensemble"), sizes)
 
 
 def run(
@@ -202,7 +209,7 @@ def run(
         media.check_video(video_out)
     gl.check()
     asked = task
-    policy, task, planned, cameras, own = (load or load_run)(Path(run_path), asked)
+    policy, task, planned, cameras, own, sizes = (load or load_run)(Path(run_path), asked)
     decay = own if ensemble is None and replan is None else ensemble
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
@@ -224,6 +231,7 @@ def run(
         ensemble=decay,
         delay=delay,
         guided=guided,
+        sizes=sizes,
     )
     if keep:
         name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
@@ -266,10 +274,14 @@ def play(
     ensemble: float | None = None,
     delay: int | None = None,
     guided: bool = False,
+    sizes: Sizes = (),
 ) -> RolloutReport:
     """Let a loaded policy act, as `run` does.
 
     With the decay of a temporal `ensemble` it predicts at every step, whatever `replan` is.
+
+    Args:
+        sizes: which the task's pictures are fitted to, wherever training showed others.
     """
     pace = _Pace(replan, delay, guided)
     started = time.perf_counter()
@@ -282,7 +294,7 @@ def play(
         group = [
             _begin(task, seed, stream, i, colored, i < clips, cameras, ensemble) for i in numbers
         ]
-        for _ in _play(policy, group, pace, first, seed):
+        for _ in _play(policy, group, pace, first, seed, sizes):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
             in_group = sum(longest if e.done else e.steps for e in group)
@@ -407,14 +419,14 @@ def _begin(
 
 
 def _play(
-    policy: Policy, group: list[_PlayedEpisode], pace: _Pace, first: int, seed: int
+    policy: Policy, group: list[_PlayedEpisode], pace: _Pace, first: int, seed: int, sizes: Sizes
 ) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     # Seeded by the group, so that the noise does not depend on how the groups before it ended.
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         continued = _continued(active, pace)
-        chunks = _decide(policy, [e.observation for e in active], generator, continued)
+        chunks = _decide(policy, [e.observation for e in active], generator, continued, sizes)
         for episode, chunk in zip(active, chunks, strict=True):
             _execute(episode, _to_execute(episode, chunk, pace))
         yield
@@ -443,19 +455,28 @@ def _decide(
     observations: list[Observation],
     generator: torch.Generator,
     continued: Continued | None,
+    sizes: Sizes,
 ) -> np.ndarray:
     """Action chunks [B, H, A] in the task's units."""
-    images = _images(observations)
+    images = _images(observations, sizes)
     proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))  # [B, P]
     instructions = [o.instruction for o in observations]
     return policy.act(images, instructions, proprio, generator, continued).cpu().numpy()
 
 
-def _images(observations: list[Observation]) -> Images:
+def _images(observations: list[Observation], sizes: Sizes) -> Images:
     """[B, H, W, 3], or of several cameras B tuples of [H, W, 3]."""
+    rows = [_fitted((o.image, *o.more), sizes) for o in observations]
     if not observations[0].more:
-        return torch.from_numpy(np.stack([o.image for o in observations]))
-    return [tuple(map(torch.from_numpy, (o.image, *o.more))) for o in observations]
+        return torch.from_numpy(np.stack([image for (image,) in rows]))
+    return [tuple(map(torch.from_numpy, row)) for row in rows]
+
+
+def _fitted(pictures: Sequence[np.ndarray], sizes: Sizes) -> Sequence[np.ndarray]:
+    """One picture of each camera, in the sizes of the training where these are known."""
+    if not sizes:
+        return pictures
+    return [fit(picture, *size) for picture, size in zip(pictures, sizes, strict=True)]
 
 
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:

@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
@@ -25,6 +25,7 @@ from aegis_cli.evaluation.results import (
 )
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, freezing
 from aegis_cli.training.card import without_folders, without_places
@@ -145,7 +146,7 @@ def text(
         merged=_merged(merge),
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
-        use=_use(form, repo, recipe, facts["task"], cameras),
+        use=_use(form, repo, recipe, facts["task"], cameras, _looks_by(at, facts["task"])),
     )
 
 
@@ -156,8 +157,23 @@ def _merged(merge: Mapping[str, Any] | None) -> str:
     return f" Merged afterwards: `{json.dumps(without_places(merge), sort_keys=True)}`."
 
 
+def _looks_by(at: Path, task: str | None) -> Sequence[str]:
+    """The cameras of its simulated task that a checkpoint's policy looks by, by the task's names.
+
+    They are empty for the task's own, where there is none, and where the policy has several.
+    """
+    meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
+    several = len(meta.get("cameras", ())) > 1
+    return () if task is None or several else checkpoint.cameras_of(meta, task)
+
+
 def _use(
-    form: str, repo: str, recipe: recipes.Recipe, task: str | None, cameras: Sequence[str] = ()
+    form: str,
+    repo: str,
+    recipe: recipes.Recipe,
+    task: str | None,
+    cameras: Sequence[str] = (),
+    looks_by: Sequence[str] = (),
 ) -> str:
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
     act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
@@ -167,7 +183,7 @@ def _use(
         probe=_probe_command(repo, recipe),
         act=act,
         plugins=" and ".join(f"`{name}`" for name in plugins),
-        lerobot=_lerobot_command(repo, task, cameras),
+        lerobot=_lerobot_command(repo, task, cameras, looks_by),
     )
 
 
@@ -183,7 +199,9 @@ def _probe_command(repo: str, recipe: Recipe) -> str:
     return shlex.join(["aegis", "probe", repo, "--baseline", *words])
 
 
-def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str:
+def _lerobot_command(
+    repo: str, task: str | None, cameras: Sequence[str], looks_by: Sequence[str]
+) -> str:
     """LeRobot's command that lets the policy act, in our simulation or on a robot."""
     if task is None:
         return (
@@ -195,6 +213,9 @@ def _lerobot_command(repo: str, task: str | None, cameras: Sequence[str]) -> str
     command = f"lerobot-eval --policy.path={repo} --env.type=aegis --env.task={task}"
     own = sim.cameras(task)[0]
     named = [name.removeprefix(lerobot_folder.IMAGES) for name in cameras] or [own]
+    if looks_by and named != [*looks_by]:  # another name would be what the own camera is called
+        names = {lerobot_folder.picture_key(looks_by[0]): lerobot_folder.picture_key(named[0])}
+        return f"{command} --env.camera={looks_by[0]} --rename_map={shlex.quote(json.dumps(names))}"
     return command if named == [own] else f"{command} --env.camera={shlex.quote(named[0])}"
 
 
@@ -262,7 +283,7 @@ def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> s
 
 
 def _acting(found: InspectReport) -> Iterator[str]:
-    """Success, or the share of the expert's return, in simulated episodes, and open-loop errors."""
+    """Success, or the mean return, in simulated episodes, and open-loop errors."""
     if not found.rollouts and not found.open_loops:
         yield "Not measured. `aegis rollout RUN` does it for simulated tasks, in open loop"
         yield "`aegis evaluate RUN --demos DEMONSTRATIONS` for any."
@@ -309,9 +330,11 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
 def _success(figures: Mapping[str, Any]) -> str:
     if figures.get("success") is not None:
         return _share(figures["success"], figures["interval"])
-    said = f"mean return {figures['mean_return']:.4g}"
+    said, interval = f"mean return {figures['mean_return']:.4g}", figures.get("return_interval")
+    if interval is not None:  # of a single episode there is none
+        said += f" ({interval[0]:.4g} to {interval[1]:.4g})"
     share = figures.get("return_share")
-    return said if share is None else f"{said}, {_percent(share)} of the demonstrations'"
+    return said if share is None else f"{said}, {_percent(share)} of the highest there is"
 
 
 def _share(share: float, interval: tuple[float, float]) -> str:

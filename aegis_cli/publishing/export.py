@@ -12,21 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
-from aegis_cli import recipes
+from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
+from aegis_cli.data.lerobot import layout
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.publishing import card
+from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
 from aegis_cli.training import folder as run_folder
+from aegis_cli.training.card import without_places
 
+RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 SOURCE = "source"  # the type that the backbone was stored in before it was trained
 
 
@@ -70,7 +75,8 @@ def run(
 ) -> ExportReport:
     """Write a run's policy, or that of a checkpoint, as a folder for others.
 
-    Its model card is written too, except for a checkpoint that has been taken out of its run.
+    Its model card is written too, and in our own layout the recipe, except for a checkpoint that
+    has been taken out of its run.
 
     Args:
         out: a new folder; nothing is left of it where the export fails.
@@ -100,6 +106,8 @@ def run(
     warn_of_a_merge(run_path, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     cameras = _cameras(camera, meta)
+    if camera is not None:
+        meta = _renamed(meta, camera)
     make_folder(out.parent)
     with checkpoint.writing(out), folder_aside(out) as aside:
         if form == card.LEROBOT:
@@ -190,6 +198,25 @@ def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
     return [camera]
 
 
+def _renamed(meta: PolicyMeta, camera: str) -> PolicyMeta:
+    """What a user has to know of a policy of one camera that is called otherwise from now on.
+
+    A simulated task, and the demonstrations, call it as they did.
+    """
+    task = meta["task"]
+    named = meta.get("cameras") or ([] if task is None else sim.cameras(task))
+    if not named:  # nobody has called it anything
+        return meta
+    now = layout.short(named[0])
+    known = meta.get("rename", {})
+    others = {own: new for own, new in known.items() if layout.short(new) != now}
+    # Of a camera that was renamed already, the name that it had at first.
+    first = next((layout.short(own) for own in known if own not in others), now)
+    found = meta.copy()
+    found["rename"] = {**others, first: layout.short(camera)}
+    return found
+
+
 def refuse_stream(run: Path) -> None:
     """Raise AegisError for the run of a stream of robot tasks."""
     if recipes.is_robot_stream_run(run):
@@ -251,10 +278,22 @@ def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
 def _write_card(
     folder: Path, run: Path, form: str, repo: str, stored: card.Stored, cameras: Sequence[str]
 ) -> None:
-    """Write the model card of a run's policy; a policy without a run has nothing to say."""
+    """Write the model card of a run's policy; a policy without a run has nothing to say.
+
+    In our own layout the card names the recipe, which is written beside it.
+    """
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
     home = checkpoint.run_of(at)
-    if home is not None:
-        write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))
+    if home is None:
+        return
+    write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))
+    if form == card.AEGIS:
+        write_text(folder / RECIPE, _recipe(home))
+
+
+def _recipe(home: Path) -> str:
+    """The recipe of the training, without the folders in which models and data lie here."""
+    kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
+    return dump(without_places(kept))

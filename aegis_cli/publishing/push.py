@@ -11,22 +11,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
-from aegis_cli.common.files import write_text
 from aegis_cli.common.version import __version__
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import card, export
-from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
-from aegis_cli.training.card import without_places
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
 _REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
 # What lies in `backbone/` after a push: the model's files and its card, and what transformers calls
 # the files of a processor. One of another backbone would be loaded together with the new one.
@@ -116,8 +110,7 @@ def run(
     _check_name(repo)
     export.refuse_stream(run_path)
     at = checkpoint.chosen(run_path)
-    home = checkpoint.run_of(at)
-    if home is None:
+    if checkpoint.run_of(at) is None:
         raise AegisError(
             f"'{run_path}', a checkpoint outside of its run",
             "a run, whose recipe and results make the model card",
@@ -130,9 +123,6 @@ def run(
         folder = Path(aside) / "policy"
         exported = export.run(at, folder, form, repo=repo, dtype=dtype)
         contents = _files(folder)
-        if form == card.AEGIS:
-            contents[RECIPE] = Path(aside) / RECIPE
-            write_text(contents[RECIPE], _recipe(home))
         url, removed = (None, ()) if api is None else _send(api, repo, contents, private)
         size = sum(path.stat().st_size for path in contents.values())
         dtype, files = exported.dtype, tuple(sorted(contents))
@@ -147,12 +137,6 @@ def _check_name(repo: str) -> None:
             "ORG/NAME of letters, digits, '-', '_' and '.', without '--' and '..'",
             "e.g. aegis push runs/x your-name/reach-aegis",
         )
-
-
-def _recipe(home: Path) -> str:
-    """The recipe of the training, without the folders in which models and data lie here."""
-    kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
-    return dump(without_places(kept))
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -220,7 +204,7 @@ def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> 
             left |= {lerobot_folder.CONFIG, lerobot_folder.MODEL}
             left |= {lerobot_folder.PREPROCESSOR, lerobot_folder.POSTPROCESSOR}
     if checkpoint.EXPERT in there:
-        left |= {checkpoint.EXPERT, RECIPE}
+        left |= {checkpoint.EXPERT, export.RECIPE}
     if left:
         left |= {path for path in there if _is_of_a_backbone(path)}
     return tuple(sorted((left & there) - set(contents)))

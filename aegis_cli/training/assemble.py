@@ -237,7 +237,7 @@ def build(
     device, shards = devices.pick(), parallel.shards(recipe.train, ranks)
     loaded = loading.load(recipe, method, demos, anchor, on_event, ranks)
     backbone, measured = loaded.backbone, loaded.measured
-    policy = _begun_policy(recipe, loaded)
+    policy = _begun_policy(recipe, loaded, on_event)
     source = loading.questions(method, recipes.options(recipe), on_event)
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
@@ -273,12 +273,12 @@ def build(
     )
 
 
-def _begun_policy(recipe: Recipe, loaded: loading.Loaded) -> Policy:
+def _begun_policy(recipe: Recipe, loaded: loading.Loaded, on_event: OnEvent) -> Policy:
     """The policy as it begins, its backbone in the type that the recipe asks for."""
     # After the fingerprint: the anchor is of the weights before they are rounded.
     _fit(loaded.backbone, recipe)
     torch.manual_seed(recipe.seed)  # the expert begins alike under every method
-    return _policy(recipe, loaded.backbone, loaded.demos)
+    return _policy(recipe, loaded.backbone, loaded.demos, on_event)
 
 
 def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
@@ -425,7 +425,12 @@ def _vqa_loss(
     return loss
 
 
-def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrations) -> Policy:
+def _policy(
+    recipe: Recipe,
+    backbone: Backbone,
+    demos: demonstrations.Demonstrations,
+    on_event: OnEvent,
+) -> Policy:
     train = recipe.train
     relative = demos.relative_places(train.relative_exclude or ()) if train.relative_actions else ()
     proprio, action = demos.scales(train.normalization, train.chunk, relative)
@@ -433,7 +438,7 @@ def _policy(recipe: Recipe, backbone: Backbone, demos: demonstrations.Demonstrat
     expert = ActionExpert(shape)
     expert.recomputes = train.gradient_checkpointing
     if recipe.expert.start is not None:
-        begun = loading.begun_expert(recipe.expert.start, shape, relative, demos.recorded)
+        begun = loading.begun_expert(recipe, shape, relative, demos.recorded, on_event)
         expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
 

@@ -453,11 +453,14 @@ def sizes_of(meta: PolicyMeta) -> tuple[tuple[int, int], ...]:
 def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     """The cameras of a simulated task that a policy looks by; empty for the task's own.
 
+    One that was renamed for the policy is known by the name that it had before.
+
     Raises:
         AegisError: it was trained on others.
     """
     named = meta.get("cameras", ())
-    found = tuple(layout.short(name) for name in named)
+    before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
+    found = tuple(before.get(layout.short(name), layout.short(name)) for name in named)
     known = () if task is None else sim.cameras(task)
     if len(found) == 1 and found[0] not in known[1:]:
         return ()  # whatever the only camera is called

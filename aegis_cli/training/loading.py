@@ -25,6 +25,7 @@ from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import checkpoint, parallel
 
@@ -302,13 +303,22 @@ def digests(recipe: Recipe, loaded: Loaded, source: Questions | None) -> dict[st
 
 
 def begun_expert(
-    start: str, shape: ExpertShape, relative: Places, recorded: Mapping[str, Any]
+    recipe: Recipe,
+    shape: ExpertShape,
+    relative: Places,
+    recorded: Mapping[str, Any],
+    on_event: OnEvent,
 ) -> ActionExpert:
     """The expert of another run, which has to be of the shape that this one needs.
 
     Args:
         recorded: what the demonstrations say of the robot, as in `Demonstrations.recorded`.
+
+    Raises:
+        AegisError: another shape, joints in another order, or actions relative to other positions.
     """
+    start = recipe.expert.start
+    assert start is not None
     found, meta = checkpoint.load_expert(start)
     for other in joints.differences(meta, recorded):
         if other.moved is not None:
@@ -339,7 +349,36 @@ def begun_expert(
             "set train.chunk, expert.width and expert.mlp_ratio to those of that run, give it as "
             "--set backbone=… too, or delete expert.start",
         )
+    _warn_of_other_units(start, meta, recipe.train.normalization, recorded, on_event)
     return found
+
+
+def _warn_of_other_units(
+    start: str,
+    meta: PolicyMeta,
+    normalization: str,
+    recorded: Mapping[str, Any],
+    on_event: OnEvent,
+) -> None:
+    """Warn of an expert whose numbers mean something else here: on another scale, or per step.
+
+    It learns the new units, but what it knew is no good beginning.
+    """
+    known = meta.get("normalization", normalization)
+    if known != normalization:
+        text = (
+            f"the expert of '{start}' was trained with train.normalization: {known}, and this "
+            f"training has {normalization}: what it predicts is on another scale here; --set "
+            f"train.normalization={known}"
+        )
+        on_event(Warned("train", text))
+    before, now = meta.get("fps"), recorded.get("fps")
+    if before is not None and now is not None and before != now:
+        text = (
+            f"the expert of '{start}' was trained on {before:g} frames a second, and these "
+            f"demonstrations have {now:g}: its actions are meant for steps of another length"
+        )
+        on_event(Warned("train", text))
 
 
 def _told(relative: Places) -> str:

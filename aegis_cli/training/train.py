@@ -132,6 +132,8 @@ def run(
             restored = _restore(training, places)
             if restored[0] >= recipe.train.steps:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
+            else:
+                _warn_of_another_precision(training, on_event)
             if ranks.first:
                 if _says_otherwise(out, recipe, places):
                     folder.write_recipe(out, recipe)
@@ -152,6 +154,24 @@ def _machine(run: TrainingRun) -> dict[str, str | int]:
     device = run.policy.backbone.device
     taken = devices.precision_taken(device, run.recipe.train.precision)
     return machine.describe() | {"precision": taken}
+
+
+def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
+    """Warn where a run goes on with matrix products in another precision than it began with.
+
+    So it does with `train.precision: auto` on other hardware. The weights are not those of either.
+    """
+    path = run.out / machine.NAME
+    said = files.load_json(path) if path.is_file() else None
+    begun = said.get("precision") if isinstance(said, dict) else None
+    now = devices.precision_taken(run.policy.backbone.device, run.recipe.train.precision)
+    if begun not in (None, now):
+        text = (
+            f"'{run.out}' began with matrix products in {begun} ({machine.NAME}), and goes on in "
+            f"{now}, which train.precision: {run.recipe.train.precision} is on this machine: its "
+            "weights will be those of neither"
+        )
+        on_event(Warned("train", text))
 
 
 def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event: OnEvent) -> None:

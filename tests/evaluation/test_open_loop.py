@@ -262,6 +262,31 @@ def test_of_other_data_all_episodes_are_taken(naive_run: Path, tmp_path: Path) -
     assert found.relative_interval is None  # one episode says nothing of others
 
 
+def test_episodes_that_an_earlier_run_has_learned_from_are_told(
+    naive_run: Path, demos_file: Path, recipe: Recipe, tmp_path: Path
+) -> None:
+    """Of a run that began with another's policy, and of one that began with that."""
+    other, last = tmp_path / "other.safetensors", naive_run
+    record.run("reach", 3, 7, other, workers=1)
+    for name in ("second", "third"):
+        expert = dataclasses.replace(recipe.expert, start=str(last))
+        begun = dataclasses.replace(recipe, backbone=str(last), expert=expert)
+        last = tmp_path / name
+        train.run(begun, "naive", other, None, last)
+    held_out = open_loop.run(naive_run, demos_file).episodes
+    for chosen, told in ((None, True), (held_out, False), ([*held_out, 1], True)):
+        events: list[Event] = []
+        found = open_loop.run(last, demos_file, chosen, frames=8, on_event=events.append)
+        known = [event.text for event in events if isinstance(event, Warned)]
+        learned = len({*range(8), *held_out} if chosen is None else chosen) - len(held_out)
+        assert found.trained_on == [] and len(known) == told
+        assert not told or f"{learned} of these" in known[0] and str(naive_run) in known[0]
+    # On the data of all three the first has nothing to say.
+    events = []
+    open_loop.run(last, other, on_event=events.append)
+    assert not any("trained on by" in e.text for e in events if isinstance(e, Warned))
+
+
 def test_of_the_runs_own_data_that_has_grown_the_new_episodes_have_to_be_chosen(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:

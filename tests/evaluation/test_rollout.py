@@ -23,6 +23,7 @@ from aegis_cli import sim
 from aegis_cli.common import artifacts, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import HELD_OUT, RGB, SEEN
+from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import rollout
@@ -267,6 +268,26 @@ def test_a_replan_that_is_asked_for_executes_chunks_as_they_are(
     assert policy.calls == 2
     with pytest.raises(AegisError, match="decay inf"):
         rollout.run(Path("any"), None, 2, "seen", ensemble=float("inf"))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_pictures_are_shown_in_the_sizes_of_training(
+    known: bool, puppet: Callable[..., Puppet], envs: list[Seen], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `load_policy` and `aegis evaluate` show them; as the task draws them if none is known."""
+    policy, shown = puppet(rest, chunk=40), list[np.ndarray]()
+
+    def act(images: torch.Tensor, *_: Any) -> torch.Tensor:
+        shown.extend(images.numpy())
+        return torch.zeros(len(images), 40, 2)
+
+    monkeypatch.setattr(policy, "act", act)
+    meta = {"task": "point", "replan": 40} | ({"pictures": [[40, 60]]} if known else {})
+    monkeypatch.setattr(checkpoint, "load_policy", lambda _: (policy, meta))
+    rollout.run(Path("any"), None, 2, "seen")
+    first = [env.shown[0].image for env in envs]
+    expected = [fit(picture, 40, 60) for picture in first] if known else first
+    np.testing.assert_array_equal(np.stack(shown), np.stack(expected))
 
 
 @pytest.mark.parametrize("guided", [True, False])

@@ -239,6 +239,52 @@ def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: P
     assert len(part) > 1 and before <= after
 
 
+def shortened(dataset: Path, out: Path, images: dict[str, int]) -> Path:
+    """A copy of which so many training images of these classes are left."""
+    root = shutil.copytree(dataset, out)
+    for name, count in images.items():
+        for path in sorted((root / "animals" / "train" / name).iterdir())[count:]:
+            path.unlink()
+    return root
+
+
+@pytest.mark.parametrize("first", range(10))
+def test_something_of_every_class_is_left_to_learn_from(
+    first: int, dataset: Path, tmp_path: Path
+) -> None:
+    """Whichever image a class has, and also where all others have one, too."""
+    root = shortened(dataset, tmp_path / "copy", {"red_fox": 1, "tabby_cat": 1})
+    for name in ("red_fox", "tabby_cat"):
+        (only,) = (root / "animals" / "train" / name).iterdir()
+        only.rename(only.with_name(f"other{first}.png"))
+    task = folders.load(root, "animals", SIZE)
+    assert set(task.train.labels.tolist()) == {0, 1, 2} and set(
+        task.validation.labels.tolist()
+    ) == {2}
+    assert len(task.train) + len(task.validation) == 12
+
+
+def test_one_image_of_each_class_leaves_none_to_validate_on(dataset: Path, tmp_path: Path) -> None:
+    root = shortened(dataset, tmp_path / "copy", {"red_fox": 1, "tabby_cat": 1, "zebra": 1})
+    with pytest.raises(AegisError, match="one image of each class"):
+        folders.load(root, "animals", SIZE)
+    shutil.copytree(root / "animals" / "train", root / "animals" / "validation")
+    assert len(folders.load(root, "animals", SIZE).train) == 3
+
+
+@pytest.mark.parametrize("place", [".thumbnails/00.png", "close/.cache/00.png", ".00.png"])
+def test_hidden_files_and_folders_hold_no_images(place: str, dataset: Path, tmp_path: Path) -> None:
+    """They are some program's own, such as small copies of the images."""
+    root = shutil.copytree(dataset, tmp_path / "copy")
+    kept = root / "animals" / "test" / "zebra"
+    (kept / place).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(kept / "00.png", kept / place)
+    assert len(folders.load(root, "animals", SIZE).test) == 12
+    (kept / "close").mkdir(exist_ok=True)
+    shutil.copy(kept / "00.png", kept / "close" / "00.png")  # a plain folder's are read
+    assert len(folders.load(root, "animals", SIZE).test) == 13
+
+
 def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
     root = shutil.copytree(dataset, tmp_path / "copy")
     (root / "animals" / folders.CLASSES).write_text(json.dumps({"zebra": "striped horse"}))

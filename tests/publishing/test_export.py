@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -16,12 +17,12 @@ from safetensors.torch import load_file
 from samples.command import refused
 from samples.training import images, make_policy, policy_over
 
-from aegis_cli import load_policy
+from aegis_cli import load_policy, recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.policy import Policy
-from aegis_cli.publishing import export
+from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint
 
 META = {"method": "naive", "task": None, "replan": 2, "normalization": "mean_std"}
@@ -170,6 +171,18 @@ def test_the_card_names_a_picture_that_is_not_the_tasks_own(
     export.run(run_folder, tmp_path / "x", camera="wrist")
     assert "--env.task=reach --env.camera=wrist\n" in (tmp_path / "x" / "README.md").read_text()
     assert "--env.task=reach\n" in (exported / "README.md").read_text()
+
+
+def test_a_checkpoints_layout_has_the_recipe_that_its_card_names(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    """As a push has it, and under no name by which the folder would be taken for a run."""
+    export.run(run_folder, tmp_path / "x", form=card.AEGIS)
+    assert f"`{export.RECIPE}`" in (tmp_path / "x" / "README.md").read_text()
+    learned = recipes.load(run_folder / "recipe.yaml")
+    told = recipes.load(tmp_path / "x" / export.RECIPE)
+    assert told == dataclasses.replace(learned, backbone=Path(learned.backbone).name)
+    assert checkpoint.load_policy(tmp_path / "x")[1]["task"] == "reach"
 
 
 def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None:

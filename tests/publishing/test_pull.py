@@ -59,7 +59,7 @@ def test_only_what_a_policy_is_made_of_is_downloaded(pushed: Hub) -> None:
     names = {*pushed.downloaded}
     assert {"backbone/model.safetensors", "model.safetensors"} & names
     others = {name for name in pushed.committed if name not in names}
-    assert card.NAME in others and push.RECIPE not in names
+    assert card.NAME in others and export.RECIPE not in names
     assert not any(name.endswith(".md") or "processor" in name for name in names)
 
 

@@ -155,7 +155,7 @@ def test_a_checkpoints_files_are_those_of_its_user_and_the_recipe(
 ) -> None:
     push.run(run_folder, REPO)
     assert not any("training_state" in name for name in hub.committed)
-    saved = download(hub, tmp_path) / push.RECIPE
+    saved = download(hub, tmp_path) / export.RECIPE
     learned, told = recipes.load(run_folder / "recipe.yaml"), recipes.load(saved)
     assert told == dataclasses.replace(learned, backbone=Path(learned.backbone).name)
 
@@ -173,7 +173,7 @@ def test_the_recipe_tells_nobody_where_models_and_data_lie(
     own = shutil.copytree(run_folder, tmp_path / "own", symlinks=True)
     files.write_text(own / "recipe.yaml", recipes.to_yaml(learned))
     push.run(own, REPO)
-    told = recipes.load(download(hub, tmp_path) / push.RECIPE)
+    told = recipes.load(download(hub, tmp_path) / export.RECIPE)
     assert told.demos.path == ("arm", "org/arm") and told.anchor.vqa == "asked.jsonl"
     assert told.probe.vqa == ("scenes", "asked.jsonl") and told.probe.ask == "/say {}"
 
@@ -287,6 +287,27 @@ def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_wher
     # A Markdown table ends with an empty line.
     assert both[both.index(lines[0]) - 1] == "" and lines[lines.index(line) + 1] == ""
     assert any("Hold is" in each for each in lines)
+
+
+@pytest.mark.parametrize(
+    ("interval", "said"), [((200.0, 300.0), "250 (200 to 300)"), (None, "250")]
+)
+def test_a_card_has_the_return_of_a_suite_task_as_a_share_of_the_highest(
+    interval: tuple[float, float] | None, said: str
+) -> None:
+    """As `aegis rollout` reports it, and not as a share of what the demonstrations reached."""
+    report = rollout.RolloutReport(
+        task="suite/cartpole-swingup",
+        mean_return=250.0,
+        return_interval=interval,
+        return_share=0.25,
+        episodes=4,
+        episodes_per_s=1.0,
+    )
+    played = PlayedResult("rollout-seen", report.to_json(), {}, Played(0, 4, None))
+    rows = [*card._acting(card.inspection.InspectReport("run", "x", {}, rollouts=(played,)))]
+    task = "| suite/cartpole-swingup |  | 4 |"
+    assert f"{task} mean return {said}, 25.0 % of the highest there is |" in rows
 
 
 @pytest.mark.parametrize(("method", "reads"), [("naive", False), ("nullspace", True)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,16 +21,19 @@ if MISSING:
 
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.palette import SEEN
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import lerobot_folder
 from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos
+from aegis_cli.sim.contract import EVALUATION, episode_rng
 from aegis_cli.training import checkpoint, train
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
+ROOT = Path(__file__).parents[2]
 TASK = "metaworld/button-press"
 BOTH = ("gripperPOV", "corner2")
 FULL = tuple(f"observation.images.{name}" for name in BOTH)
@@ -42,9 +46,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def trained(backbone: Path, dataset: Path, out: Path, camera: Any) -> Path:
+def trained(backbone: Path, dataset: Path, out: Path, camera: Any, **demos: Any) -> Path:
     made = recipe(backbone, steps=1, validation_share=0.5, chunk=4)
-    made = replace(made, task=TASK, demos=Demos(camera=camera))
+    made = replace(made, task=TASK, demos=Demos(camera=camera, **demos))
     train.run(made, "naive", dataset, None, out)
     return out
 
@@ -116,6 +120,49 @@ def test_another_single_camera_than_the_usual_is_remembered(
     assert rollout.load_run(one, None).cameras == ("gripperPOV",)
     assert rollout.load_run(usual, None).cameras == ()
     assert checkpoint.load_policy(usual)[1]["cameras"] == ["observation.images.corner2"]
+
+
+def test_a_camera_that_is_called_otherwise_is_looked_by_all_the_same(
+    dataset: Path, tmp_path: Path
+) -> None:
+    """Renamed for the training, for LeRobot, or for both."""
+    known = wide(tmp_path)
+    plain = trained(known, dataset, tmp_path / "plain", "gripperPOV")
+    rename = {"gripperPOV": "front"}
+    renamed = trained(known, dataset, tmp_path / "renamed", "front", rename=rename)
+    assert checkpoint.load_policy(renamed)[1]["cameras"] == ["observation.images.front"]
+    assert rollout.load_run(renamed, None).cameras == ("gripperPOV",)
+    for number, run in enumerate((plain, renamed)):
+        exported, again = (tmp_path / f"{name} {number}" for name in ("exported", "again"))
+        export.run(run, exported, camera="eye")
+        said = (exported / "README.md").read_text()
+        names = '{"observation.images.gripperPOV": "observation.images.eye"}'
+        assert f"--env.camera=gripperPOV --rename_map='{names}'\n" in said
+        export.run(exported, again, camera="lens")
+        for folder, name in ((exported, "eye"), (again, "lens")):
+            assert checkpoint.load_policy(folder)[1]["cameras"] == [name]
+            assert rollout.load_run(folder, None).cameras == ("gripperPOV",)
+    usual = trained(known, dataset, tmp_path / "usual", "corner2")
+    export.run(usual, tmp_path / "eye", camera="eye")
+    assert f"--env.task={TASK} --env.camera=eye\n" in (tmp_path / "eye" / "README.md").read_text()
+    export.run(plain, tmp_path / "own")
+    said = (tmp_path / "own" / "README.md").read_text()
+    assert f"--env.task={TASK} --env.camera=gripperPOV\n" in said
+    assert rollout.load_run(tmp_path / "eye", None).cameras == ()
+
+
+@pytest.mark.parametrize("camera", ["gripperPOV", "corner2", "eye"])
+def test_lerobots_environment_shows_the_camera_that_was_asked_for(camera: str) -> None:
+    """Any other name is what the usual one's picture is called."""
+    path = ROOT / "plugins/lerobot_env_aegis/src/lerobot_env_aegis/task_env.py"
+    found = importlib.util.spec_from_file_location("task_env", path)
+    assert found is not None and found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    seen, _ = module.AegisTask(TASK, rollout.DEFAULT, camera).reset(seed=0)
+    own = sim.make(TASK, seen_by=(camera,) if camera in BOTH else ())
+    wanted = own.reset(episode_rng(rollout.EVALUATION_SEED, EVALUATION, 0), SEEN)
+    assert np.array_equal(seen["pixels"][camera], wanted.image)
 
 
 def wide(folder: Path) -> Path:

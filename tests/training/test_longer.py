@@ -187,3 +187,29 @@ def test_a_job_looks_for_the_expert_before_it_records_anything(
     code, _, err = aegis("run", settings, *given)
     assert code == 2 and f"no checkpoint in '{tmp_path / 'none'}'" in err
     assert not list((tmp_path / "runs").rglob("*.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("known", "told"),
+    [
+        ({}, []),
+        ({"normalization": "quantiles"}, ["on another scale here; --set train.normalization="]),
+        ({"fps": 30.0}, ["trained on 30 frames a second, and these demonstrations have 10"]),
+    ],
+)
+def test_an_expert_of_other_units_is_told(
+    known: dict[str, object],
+    told: list[str],
+    recipe: Recipe,
+    start: Start,
+    naive_run: Path,
+    tmp_path: Path,
+) -> None:
+    policy, meta = checkpoint.load_policy(naive_run)
+    (tmp_path / "other").mkdir()
+    lerobot_folder.write(tmp_path / "other", policy, {**meta, **known})
+    begun = replace(recipe, expert=replace(recipe.expert, start=str(tmp_path / "other")))
+    events: list[Event] = []
+    start("naive", tmp_path / "new", recipe=of(begun, steps=1), on_event=events.append)
+    said = [event.text for event in events if isinstance(event, Warned)]
+    assert len(said) == len(told) and all(map(str.__contains__, said, told))

@@ -30,7 +30,7 @@ from samples.vqa_files import write_jsonl
 from torch import nn
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, devices
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 from aegis_cli.data.record import run as record
@@ -93,6 +93,29 @@ def test_a_run_interrupted_before_its_first_checkpoint_begins_again(
         start("naive", tmp_path, on_event=stop_at(1, KeyboardInterrupt()))
     start("naive", tmp_path, resume=True)
     assert_same_run(tmp_path, naive_run)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_run_that_goes_on_in_another_precision_says_so(
+    same: bool,
+    start: Start,
+    recipe: Recipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As on hardware on which `auto` is another; machine.json tells of the beginning alone."""
+    automatic = replace(recipe, train=replace(recipe.train, precision="auto"))
+    monkeypatch.setattr(devices, "multiplies_bf16", lambda _: True)
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(3, KeyboardInterrupt())
+        start("naive", tmp_path, recipe=automatic, anchor=None, on_event=stop)
+    monkeypatch.setattr(devices, "multiplies_bf16", lambda _: same)
+    told: list[Event] = []
+    for _ in range(2):  # of what has ended there is nothing to say
+        start("naive", tmp_path, recipe=automatic, anchor=None, resume=True, on_event=told.append)
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert len(said) == (not same)
+    assert same or "products in bf16" in said[0] and "goes on in float32" in said[0]
 
 
 def test_resuming_a_finished_run_changes_nothing(start: Start, tmp_path: Path) -> None:

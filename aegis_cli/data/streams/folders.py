@@ -53,7 +53,8 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     path, is for validation.
 
     Raises:
-        AegisError: folders that are missing or empty, or classes that differ between parts.
+        AegisError: folders that are missing or empty, classes that differ between parts, or no
+            image that can be held out.
     """
     folder = Path(root) / name
     classes, listed = _parts(folder)
@@ -162,9 +163,7 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     for label, name in enumerate(classes):
         inside = (part / name).rglob("*") if name in folders else ()
         # Sorted, because a folder's own order differs between file systems.
-        images = sorted(
-            p for p in inside if p.suffix.lower() in _SUFFIXES and not p.name.startswith(".")
-        )
+        images = sorted(p for p in inside if _is_image(p.relative_to(part)))
         files += images
         labels += [label] * len(images)
     if not files:
@@ -176,18 +175,44 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     return Listing(tuple(files), tuple(labels))
 
 
+def _is_image(path: Path) -> bool:
+    """Whether a path is an image's by its name, and neither it nor a folder in it is hidden.
+
+    What is hidden is some program's, such as the thumbnails of the images themselves.
+    """
+    hidden = any(name.startswith(".") for name in path.parts)
+    return path.suffix.lower() in _SUFFIXES and not hidden
+
+
 def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
     """Training and validation images.
 
-    A path's hash decides, so that adding images moves no other image.
+    A path's hash decides, so that adding images moves no other image, but for a class of which
+    nothing would be left to learn from: that keeps one.
+
+    Raises:
+        AegisError: one image of each class, of which none can be spared.
     """
     names = [file.relative_to(folder).as_posix() for file in train.files]
     hashed = [hashlib.sha256(name.encode()).digest() for name in names]
-    held = [int.from_bytes(h[:8], "big") % VALIDATION == 0 for h in hashed]
-    # At least one image is held out, also in a small task.
-    smallest = min(range(len(hashed)), key=hashed.__getitem__)
-    held[smallest] = True
-    return train.where([not out for out in held]), train.where(held)
+    rising = sorted(range(len(hashed)), key=hashed.__getitem__)
+    last = {train.labels[i]: i for i in rising}  # of each class
+    held = {i for i in rising if int.from_bytes(hashed[i][:8], "big") % VALIDATION == 0}
+    held.add(rising[0])  # at least one image is held out, also in a small task
+    learned = {label for i, label in enumerate(train.labels) if i not in held}
+    held -= {i for label, i in last.items() if label not in learned}
+    if not held:
+        spare = [i for i in rising if i not in last.values()]
+        if not spare:
+            raise AegisError(
+                f"one image of each class in '{folder / 'train'}', and no folder 'validation'",
+                "an image to validate on, and one of each class to learn from",
+                f"put some into {folder}/validation/CLASS",
+            )
+        held.add(spare[0])
+    return train.where([i not in held for i in range(len(names))]), train.where(
+        [i in held for i in range(len(names))]
+    )
 
 
 def _sentences(path: Path) -> list[str]:

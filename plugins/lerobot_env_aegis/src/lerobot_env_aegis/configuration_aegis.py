@@ -26,7 +26,8 @@ class AegisEnvConfig(EnvConfig):
         task: reach, point, suite/DOMAIN-TASK or metaworld/TASK.
         fps: of the control steps; a new value changes nothing, the task says it.
         colors: of the targets: seen, held-out or all; of tasks that have some.
-        camera: what the picture is called; None: as the task's own camera.
+        camera: which of the task's cameras takes the picture; another name is what that of its own
+            is called; None: as the task's own camera.
         episode_length: control steps; None: as many as the task has.
     """
 

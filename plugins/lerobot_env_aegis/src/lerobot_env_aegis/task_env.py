@@ -27,7 +27,9 @@ class AegisTask(gym.Env):
     """
 
     def __init__(self, task: str, colors: str, camera: str, max_steps: int | None = None) -> None:
-        self._env = sim.make(task)
+        """Make the task, seen by its camera of that name, else by its own under that name."""
+        seen_by = (camera,) if camera in sim.cameras(task) else ()
+        self._env = sim.make(task, seen_by=seen_by)
         spec = self._env.spec
         self.task, self.task_description = task, spec.templates[0]
         self._colors, self._camera = TARGET_COLORS[colors], camera
