@@ -6,6 +6,7 @@ stages.py says which stage that is, exits.py with which code a command ends.
 from __future__ import annotations
 
 import faulthandler
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -1482,3 +1483,7 @@ def main() -> None:
         app(prog_name="aegis")
     except OSError as error:  # of a shell's completion, which begins no command
         sys.exit(ended_by(error))
+    finally:
+        # Else Python looks through all that torch and a model consist of, again and again, before
+        # it lets the process end: seconds, and many of them on a busy machine.
+        gc.freeze()
