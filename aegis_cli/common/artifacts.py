@@ -19,6 +19,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
+from aegis_cli.common.devices import single_threaded
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import (
     canonical,
@@ -205,10 +206,11 @@ def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:
-    for name, tensor in tensors.items():
-        if not is_finite(tensor):
-            bad = int((~tensor.isfinite()).sum())
-            yield f"'{name}' has {bad} NaN or infinite of {tensor.numel()} values"
+    with single_threaded():
+        wrong = {name: tensor for name, tensor in tensors.items() if not is_finite(tensor)}
+    for name, tensor in wrong.items():
+        bad = int((~tensor.isfinite()).sum())
+        yield f"'{name}' has {bad} NaN or infinite of {tensor.numel()} values"
 
 
 def _write_safetensors(

@@ -530,8 +530,10 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
             knob can do; the last checkpoint stays.
     """
     parameters = dict(run.policy.named_parameters())
-    wrong = run.ranks.any(*(not is_finite(rows_here(p)) for p in parameters.values()))
-    bad = [name for name, found in zip(parameters, wrong, strict=True) if found]
+    with devices.single_threaded():
+        found = [not is_finite(rows_here(p)) for p in parameters.values()]
+    wrong = run.ranks.any(*found)
+    bad = [name for name, is_wrong in zip(parameters, wrong, strict=True) if is_wrong]
     if bad:
         good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
         kept = f"the {good} steps of {run.out}/checkpoints/last are good"
