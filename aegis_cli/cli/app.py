@@ -1232,6 +1232,15 @@ def run(
         ),
     ] = 1,
     overwrite: Overwrite = False,
+    dry_run: Annotated[
+        bool,
+        Option(
+            "--dry-run",
+            help="List the stages, or a study's cells, that would run, and why; of trainings whose "
+            "demonstrations and anchor are there also memory, disk and hours; write nothing; exit "
+            "1 if memory or disk does not suffice.",
+        ),
+    ] = False,
     device: Device = None,
     wide: Wide = False,
     as_json: Json = False,
@@ -1239,10 +1248,12 @@ def run(
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
     What is up to date is skipped, so the same command also resumes; with --overwrite every stage
-    runs again. Exits 1 if a method drops by more than probe.max_drop.
+    runs again. --dry-run says which stages these are. Exits 1 if a method drops by more than
+    probe.max_drop.
 
     \b
     Example: aegis run recipes/quickstart.yaml
+    Example: aegis run recipes/quickstart.yaml --dry-run
     Example: aegis run recipes/igsp-compare.yaml
     """
     resolved = load_run(recipe, overrides or [])
@@ -1252,6 +1263,14 @@ def run(
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
     advice.of_run(resolved, overrides or [])
+    if dry_run:
+        plan = stages.PLAN.run(
+            resolved, out, overwrite=overwrite, device=device, wide=wide, as_json=as_json
+        )
+        failed = stages.PLAN.module.shortage(plan) if one_run else None
+        _say_gate(failed)
+        _end_at_gate(failed)
+        return
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
     with stages.joined(device) if stage.shared else nullcontext():
