@@ -10,9 +10,10 @@ import fnmatch
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -122,7 +123,8 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
-    fields = asdict(header)
+    # As `asdict` has it, which would copy thousands of shapes one number at a time.
+    fields = vars(header) | {"tensors": {name: vars(spec) for name, spec in table.items()}}
     # To hash takes as long as a fast disk. So a thread does it while the same values are written.
     with ThreadPoolExecutor(1, "digest") as pool:
         hashed = pool.submit(_digest, fields, plain)
@@ -277,15 +279,19 @@ class _OnCpu(Mapping[str, Tensor]):
 
 
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
-    known = [
-        (re.compile(fnmatch.translate(pattern)).match, unit) for pattern, unit in units.items()
-    ]
+    known = [(_matcher(pattern), unit) for pattern, unit in units.items()]
 
     def spec(name: str, tensor: Tensor) -> TensorSpec:
         unit = next((unit for matches, unit in known if matches(name)), "1")
         return TensorSpec(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), unit)
 
     return {name: spec(name, tensor) for name, tensor in tensors.items()}
+
+
+@cache
+def _matcher(pattern: str) -> Callable[[str], object]:
+    """What tells whether a name matches; kinds have few patterns, and each save asks for them."""
+    return re.compile(fnmatch.translate(pattern)).match
 
 
 def _short(fingerprint: str | None) -> str:
