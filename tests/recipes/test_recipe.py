@@ -193,6 +193,8 @@ def test_an_optional_key_takes_null(tmp_path):
         ("train.steps=1" + "0" * 400, "a whole number, above 0, at most 1,000,000,000,000"),
         ("train.batch_size=1000000000001", "above 0, at most 1,000,000,000,000"),
         ("train.extended_from=[1000000000001]", "at most 1,000,000,000,000"),
+        ("ewc.weight=1e300", "a number, 0 or more, at most 1,000,000,000,000"),
+        ("demos.weights=[1.0, 1e13]", "at most 1,000,000,000,000"),
         ("train.steps=true", "a whole number"),
         ("train.steps=many", "a whole number"),
         ("train.steps=", "a whole number"),
