@@ -6,6 +6,7 @@ stages.py says which stage that is, exits.py with which code a command ends.
 from __future__ import annotations
 
 import faulthandler
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -1231,6 +1232,15 @@ def run(
         ),
     ] = 1,
     overwrite: Overwrite = False,
+    dry_run: Annotated[
+        bool,
+        Option(
+            "--dry-run",
+            help="List the stages, or a study's cells, that would run, and why; of trainings whose "
+            "demonstrations and anchor are there also memory, disk and hours; write nothing; exit "
+            "1 if memory or disk does not suffice.",
+        ),
+    ] = False,
     device: Device = None,
     wide: Wide = False,
     as_json: Json = False,
@@ -1238,10 +1248,12 @@ def run(
     """Run all stages for all methods of a recipe, or a study of several seeds, and compare.
 
     What is up to date is skipped, so the same command also resumes; with --overwrite every stage
-    runs again. Exits 1 if a method drops by more than probe.max_drop.
+    runs again. --dry-run says which stages these are. Exits 1 if a method drops by more than
+    probe.max_drop.
 
     \b
     Example: aegis run recipes/quickstart.yaml
+    Example: aegis run recipes/quickstart.yaml --dry-run
     Example: aegis run recipes/igsp-compare.yaml
     """
     resolved = load_run(recipe, overrides or [])
@@ -1251,6 +1263,14 @@ def run(
         found = f"--workers {workers} with the recipe '{recipe}'"
         raise AegisError(found, "a study of several seeds", fix)
     advice.of_run(resolved, overrides or [])
+    if dry_run:
+        plan = stages.PLAN.run(
+            resolved, out, overwrite=overwrite, device=device, wide=wide, as_json=as_json
+        )
+        failed = stages.PLAN.module.shortage(plan) if one_run else None
+        _say_gate(failed)
+        _end_at_gate(failed)
+        return
     stage = stages.RUN[type(resolved)]
     options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
     with stages.joined(device) if stage.shared else nullcontext():
@@ -1482,3 +1502,7 @@ def main() -> None:
         app(prog_name="aegis")
     except OSError as error:  # of a shell's completion, which begins no command
         sys.exit(ended_by(error))
+    finally:
+        # Else Python looks through all that torch and a model consist of, again and again, before
+        # it lets the process end: seconds, and many of them on a busy machine.
+        gc.freeze()

@@ -103,6 +103,7 @@ def _joined(device: str | None) -> Generator[None]:
 
 DEMOS = Stage("data.record", render.measured)
 ANCHOR = Stage("anchors.measure", render.facts, shared=True)
+PLAN = Stage("studies.plan", render.plan)
 DRY_RUN = Stage("training.dry_run", render.facts, shared=True)
 MERGE = Stage("merging.merge", render.merge)
 PROBE = Stage("evaluation.probe", render.probe, shared=True)

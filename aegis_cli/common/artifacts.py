@@ -10,18 +10,22 @@ import fnmatch
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
+from aegis_cli.common.devices import single_threaded
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import (
     canonical,
     load_json,
+    pour,
     save_json,
     sha256_file,
     write_atomically,
@@ -37,7 +41,7 @@ from aegis_cli.common.headers import (
     rewrite,
     schema,
 )
-from aegis_cli.common.kinds import KINDS, Tensors, layout_problems
+from aegis_cli.common.kinds import KINDS, Tensors, is_finite, layout_problems
 from aegis_cli.common.version import __version__
 
 
@@ -77,6 +81,7 @@ _FORMAT = {
     torch.int8: "I8",
     torch.uint8: "U8",
 }
+_NO_DIGEST = "0" * 64  # stands where a file's digest is to be
 
 
 def save(
@@ -118,11 +123,13 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
-    fields = asdict(header)
-    digest = _digest(fields, plain)
-    text = canonical(fields | {"digest": digest})
-    write_atomically(Path(path), lambda file: _write_safetensors(file, plain, text))
-    return replace(header, digest=digest)
+    # As `asdict` has it, which would copy thousands of shapes one number at a time.
+    fields = vars(header) | {"tensors": {name: vars(spec) for name, spec in table.items()}}
+    # To hash takes as long as a fast disk. So a thread does it while the same values are written.
+    with ThreadPoolExecutor(1, "digest") as pool:
+        hashed = pool.submit(_digest, fields, plain)
+        write_atomically(Path(path), lambda file: _write_safetensors(file, plain, fields, hashed))
+    return replace(header, digest=hashed.result())
 
 
 def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None = None) -> Artifact:
@@ -201,33 +208,44 @@ def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:
-    for name, tensor in tensors.items():
-        # One value that is not finite makes the sum such a one, which is the faster to find.
-        if not tensor.is_floating_point() or tensor.sum().isfinite():
-            continue
-        if bad := int((~tensor.isfinite()).sum()):  # else the sum alone went past what there is
-            yield f"'{name}' has {bad} NaN or infinite of {tensor.numel()} values"
+    with single_threaded():
+        wrong = {name: tensor for name, tensor in tensors.items() if not is_finite(tensor)}
+    for name, tensor in wrong.items():
+        bad = int((~tensor.isfinite()).sum())
+        yield f"'{name}' has {bad} NaN or infinite of {tensor.numel()} values"
 
 
-def _write_safetensors(file: BinaryIO, tensors: Tensors, text: str) -> None:
+def _write_safetensors(
+    file: BinaryIO, tensors: Tensors, fields: Mapping[str, Any], digest: Future[str]
+) -> None:
     """The safetensors format (length, JSON header, data), streamed.
 
     Not safetensors.torch.save_file: that one writes mode 0600, hides the errno of a full disk,
     refuses tensors that share memory, and its bytes may change with its version.
+
+    Args:
+        fields: of the header, without the digest, which is put in its place when it is known.
     """
     # With the widest types first, every tensor is aligned.
     names = sorted(tensors, key=lambda name: (-tensors[name].element_size(), name))
-    table: dict[str, Any] = {"__metadata__": {"aegis": text}}
+    table: dict[str, Any] = {}
     end = 0
     for name in names:
         start, end = end, end + tensors[name].nbytes
         dtype, shape = _FORMAT[tensors[name].dtype], list(tensors[name].shape)
         table[name] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
-    raw = canonical(table).encode()
+    file.write(_head(table, fields, _NO_DIGEST))
+    pour(file, (_bytes(tensors[name]) for name in names))
+    file.seek(0)
+    file.write(_head(table, fields, digest.result()))
+
+
+def _head(table: Mapping[str, Any], fields: Mapping[str, Any], digest: str) -> bytes:
+    """What a file begins with; it is as long with any digest."""
+    metadata = {"aegis": canonical({**fields, "digest": digest})}
+    raw = canonical({**table, "__metadata__": metadata}).encode()
     raw += b" " * (-len(raw) % 8)
-    file.write(len(raw).to_bytes(8, "little") + raw)
-    for name in names:
-        file.write(_bytes(tensors[name]))
+    return len(raw).to_bytes(8, "little") + raw
 
 
 def _digest(fields: Mapping[str, Any], tensors: Tensors) -> str:
@@ -261,15 +279,19 @@ class _OnCpu(Mapping[str, Tensor]):
 
 
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
-    known = [
-        (re.compile(fnmatch.translate(pattern)).match, unit) for pattern, unit in units.items()
-    ]
+    known = [(_matcher(pattern), unit) for pattern, unit in units.items()]
 
     def spec(name: str, tensor: Tensor) -> TensorSpec:
         unit = next((unit for matches, unit in known if matches(name)), "1")
         return TensorSpec(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), unit)
 
     return {name: spec(name, tensor) for name, tensor in tensors.items()}
+
+
+@cache
+def _matcher(pattern: str) -> Callable[[str], object]:
+    """What tells whether a name matches; kinds have few patterns, and each save asks for them."""
+    return re.compile(fnmatch.translate(pattern)).match
 
 
 def _short(fingerprint: str | None) -> str:

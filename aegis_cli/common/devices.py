@@ -11,6 +11,7 @@ from torch import Tensor
 
 from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned
 
 # Which device is wanted. Processes that this one starts inherit it with the environment.
 VARIABLE = "AEGIS_DEVICE"
@@ -158,12 +159,34 @@ def multiplies_bf16(device: torch.device) -> bool:
     return device.type != "cpu" or bool(asked().get("amx_bf16", False))
 
 
+# What torch calls a processor's instructions for products in bfloat16.
+_BF16_INSTRUCTIONS = ("amx_bf16", "avx512_bf16")
+
+
+def warn_of_slow_bf16(device: torch.device, precision: str, on_event: OnEvent) -> None:
+    """Warn where bf16 is asked for by name, and the processor is known to have nothing for it.
+
+    One whose list has no such entries, as ARM's, may have instructions of other names.
+    """
+    if device.type != "cpu" or precision != "bf16":
+        return
+    listed = getattr(torch.cpu, "get_capabilities", dict)()
+    known = [listed[name] for name in _BF16_INSTRUCTIONS if name in listed]
+    if known and not any(known):
+        text = (
+            "train.precision: bf16 on a processor without instructions for it (AMX or AVX-512 "
+            "BF16): a step may take many times as long as in float32; --set train.precision=auto "
+            "takes bf16 only where it is faster"
+        )
+        on_event(Warned("train", text))
+
+
 @contextlib.contextmanager
 def single_threaded() -> Generator[None]:
     """Use one CPU thread inside the block.
 
     LAPACK's eigensolver waits at thousands of small barriers. On two cores that other work shares,
-    two threads took from 3 to 280 times as long as one.
+    two threads took from 3 to 280 times as long as one. So it is with sums of thousands of tensors.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

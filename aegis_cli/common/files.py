@@ -26,6 +26,7 @@ _NUMBER = r"\.\d+\.tmp"  # how such a name ends
 _LEFT = re.compile(r"\.(.+)" + _NUMBER)  # with the name of what it was to become
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
 _ATTEMPTS = 100  # at a folder above which others come and go
+_AT_ONCE = 2**26  # bytes after which the disk begins to write them
 
 
 def canonical(obj: Any) -> str:
@@ -96,6 +97,53 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         raise AegisError(problem, "an output that can be written", fix) from error
 
 
+def pour(file: BinaryIO, parts: Iterable[memoryview]) -> None:
+    """Write parts one after the other, while the disk is at work on those before.
+
+    Else the system keeps gigabytes in memory until the end asks for all of them at once.
+    """
+    begun = file.tell()
+    for part in parts:
+        for first in range(0, len(part), _AT_ONCE):
+            file.write(part[first : first + _AT_ONCE])
+            if file.tell() - begun >= _AT_ONCE:
+                file.flush()
+                _begin_to_write(file.fileno(), begun)
+                begun = file.tell()
+        del part  # before the next one is made, for a GPU's is a copy
+
+
+def _begin_to_write(descriptor: int, start: int = 0) -> None:
+    """Let the disk begin with what has been written to a file from some byte on; wait for nothing.
+
+    Linux does so where it is told that memory need not hold a file. What is not on the disk yet
+    stays in memory, which is all that there is here.
+    """
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(descriptor, start, 0, os.POSIX_FADV_DONTNEED)
+
+
+def begin_to_write(folder: Path) -> None:
+    """Let the disk begin with the files of a folder, which somebody else has written a moment ago.
+
+    `reach_disk` then has less to wait for.
+    """
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with open(path, "rb") as file:
+                _begin_to_write(file.fileno())
+
+
+def reach_disk(folder: Path) -> None:
+    """Wait until all that a folder holds is on the disk, so that no power cut takes it."""
+    for path in (*folder.rglob("*"), folder):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 @contextlib.contextmanager
 def aside(path: Path) -> Generator[tuple[Path, BinaryIO]]:
     """A new file beside `path`, to be filled and renamed; where it is not renamed it is removed.
@@ -131,12 +179,15 @@ def folder_aside(path: Path) -> Generator[Path]:
 
 
 def put(aside: Path, folder: Path) -> None:
-    """Rename a folder that was written aside; there is none yet, or an empty one.
+    """Rename a folder that was written aside, once it is on the disk.
+
+    There is none of that name yet, or an empty one.
 
     Raises:
         AegisError: another process has written it meanwhile.
         OSError: what else a rename meets.
     """
+    reach_disk(aside)
     try:
         os.rename(aside, folder)
     except OSError as error:

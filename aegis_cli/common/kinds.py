@@ -294,6 +294,15 @@ def layout_problems(kind: str, tensors: Tensors) -> Iterator[str]:
             yield f"'{name}' is {is_now} instead of {wanted}"
 
 
+def is_finite(tensor: Tensor) -> bool:
+    """Whether no value of a tensor is NaN or infinite."""
+    if not tensor.is_floating_point():
+        return True
+    # One such value makes the sum such a one, which is the faster to find. Others may have a sum
+    # past the largest number, too.
+    return bool(tensor.sum().isfinite() or tensor.isfinite().all())
+
+
 def quoted(names: Iterable[str]) -> str:
     """The names in alphabetical order: 'a', 'b'."""
     return ", ".join(f"'{name}'" for name in sorted(names))

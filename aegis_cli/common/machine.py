@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -30,10 +31,7 @@ def describe() -> dict[str, str | int]:
 
     if devices.on_gpu():
         found["gpu"] = torch.cuda.get_device_name()
-    for package in _PACKAGES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[package] = metadata.version(package)
-    return found
+    return found | _versions()
 
 
 def name() -> str:
@@ -44,6 +42,16 @@ def name() -> str:
     cores, threads = about["cores"], about["threads"]
     used = cores if threads == cores else f"{threads} of {cores}"
     return f"{about['processor']}, {used} cores"
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """The installed packages' versions; to find one, its whole description is parsed."""
+    found: dict[str, str] = {}
+    for package in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
 
 
 def _processor() -> str:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from aegis_cli.common.errors import AegisError, few
-from aegis_cli.common.kinds import describe, quoted
+from aegis_cli.common.kinds import describe, is_finite, quoted
 
 AS_WRITTEN = "bring back the file as Aegis wrote it, or make it again"
 _NAMED = 3  # problems that an error names
@@ -50,7 +50,7 @@ def check_state(
         if one.shape != other.shape or not alike:
             is_now, should = (describe(t.dtype, t.shape) for t in (one, other))
             problems.append(f"'{name}' is {is_now} instead of {should}")
-        elif one.is_floating_point() and not one.isfinite().all():
+        elif not is_finite(one):
             problems.append(f"'{name}' has NaN or infinite values")
     if problems:
         more = f"; ... {len(problems)} problems in all" if len(problems) > _NAMED else ""

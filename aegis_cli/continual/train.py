@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import launch, locks
+from aegis_cli.common import devices, launch, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
@@ -70,6 +70,7 @@ def _run(
         _check_same_recording(out, recipe)
         return files.read(out)
     built = build(recipe, out, on_event)
+    devices.warn_of_slow_bf16(built.device, recipe.train.precision, on_event)
     if overwrite:
         folder.remove(out)
     optimizer = None

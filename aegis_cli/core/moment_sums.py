@@ -35,6 +35,7 @@ _FEWEST_COLUMNS, _MOST_COLUMNS = 384, 1024  # of a sketch; between them an eight
 _STRIP = 256  # columns of one block of a float32 sum
 _ROWS = 4096  # multiplied in float32 at a time
 _WIDE_ROWS = 512  # of a sketch that are in float64 at a time
+_SHIFTS = 8  # tried, each ten times the last: the largest is a share of the moment itself
 _ROUNDING = torch.finfo(torch.float32).eps
 
 
@@ -91,7 +92,8 @@ def columns(width: int) -> int:
 
 
 def _limit(convolution: bool, whole: int) -> int:
-    return max(whole, WHOLE_CONVOLUTION) if convolution else whole
+    # A sketch of a narrower map would have as many columns as the whole sum.
+    return max(whole, WHOLE_CONVOLUTION if convolution else _FEWEST_COLUMNS)
 
 
 class FullSum(MomentSum):
@@ -182,7 +184,7 @@ class Sketch(MomentSum):
         shift = float(torch.linalg.matrix_norm(self._seen)) / count * _ROUNDING
         if shift == 0:  # nothing but zeros was read: no direction, and no energy elsewhere
             return with_rest(trace.new_zeros(0), self._seen[:, :0].cpu(), trace * 0)
-        root = self._root(count, shift)
+        root, shift = self._root(count, shift)
         gram = sum(half.T @ half for half in self._halves(root, count, shift))  # B^T B, [l, l]
         rising, turn = torch.linalg.eigh(gram)  # B^T B has the values of B B^T
         values, turn = rising.flip(0), turn.flip(1)
@@ -211,11 +213,20 @@ class Sketch(MomentSum):
             wide = part.double()
             yield wide, seen.double() / count + shift * wide
 
-    def _root(self, count: int, shift: float) -> Tensor:
-        """The Cholesky root of O^T (Y + shift O), [l, l]."""
+    def _root(self, count: int, shift: float) -> tuple[Tensor, float]:
+        """The Cholesky root of O^T (Y + shift O), [l, l], and the shift that it needed.
+
+        With nearly as many columns as rows O has directions that it hardly sees. In them the
+        sum's rounding can outweigh the shift, so the shift grows until the core is positive.
+        """
         zero = self._trace.new_zeros(())
-        core = sum((part.T @ seen for part, seen in self._shifted(count, shift)), zero)
-        return torch.linalg.cholesky((core + core.T) / 2)
+        for _ in range(_SHIFTS):
+            core = sum((part.T @ seen for part, seen in self._shifted(count, shift)), zero)
+            root, failed = torch.linalg.cholesky_ex((core + core.T) / 2)
+            if not failed:
+                return root, shift
+            shift *= 10
+        raise AssertionError("a second moment is not finite")
 
     def _halves(self, root: Tensor, count: int, shift: float) -> Iterator[Tensor]:
         """Rows of B, with B B^T = Y (O^T Y)^-1 Y^T, both Y with the shift."""

@@ -148,6 +148,7 @@ class OpenLoopFigures:
     hold_error: Number | None = None
     instructions: list[InstructionFigures] | None = None
     chunk: int | None = None
+    fps: Number | None = None
     seed: int | None = None
     settings: dict[str, Any] | None = None
     step: int | None = None

@@ -119,6 +119,8 @@ class OpenLoopReport:
             the dimensions that varied there; 1 is the error of always predicting their mean.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
         hold_error: the same of repeating the current position, where actions are positions.
+        fps: steps of a chunk per second, which is the control rate of the demonstrations; None
+            where they do not say.
         instructions: the same of each instruction that the frames have, the worst first.
         traces: what a plot shows; empty unless asked for.
     """
@@ -135,6 +137,7 @@ class OpenLoopReport:
     hold_error: float | None
     dimensions: list[DimensionError]
     horizon: list[StepError]
+    fps: float | None = None
     instructions: list[InstructionError] = dataclasses.field(default_factory=list)
     traces: list[Trace] = dataclasses.field(default_factory=list)
 
@@ -643,6 +646,7 @@ def compare(
         hold_error=_mean(held, valid),
         dimensions=_dimensions(shown, recorded, error, hold, valid, training_std),
         horizon=_horizon(relative, held, valid),
+        fps=shown.fps,
         instructions=_instructions(shown, at, relative, held, valid),
     )
 

@@ -102,7 +102,7 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     check = field.metadata.get("check")
     limits = [] if check and check.choices and phrase == "text" else [phrase]
     limits += [check.expected] if check else []
-    if "whole" in phrase and any(map(is_too_large, raw if isinstance(raw, list) else [raw])):
+    if "number" in phrase and any(map(is_too_large, raw if isinstance(raw, list) else [raw])):
         limits.append(f"at most {LARGEST:,}")
     expected = f"{dotted}: " + ", ".join(limits)
     listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")

@@ -27,7 +27,7 @@ from typing import (
 
 from aegis_cli.recipes.strict_yaml import plain
 
-LARGEST = 10**12  # whole number that a key takes; from some size on, arrays and times overflow
+LARGEST = 10**12  # number that a key takes; from some size on, arrays, times and float32 overflow
 _SCALARS = (int, float, bool, str)
 T = TypeVar("T")
 
@@ -202,8 +202,8 @@ class _Value:
 
 
 def is_too_large(value: Any) -> bool:
-    """Whether a whole number is larger than any key takes."""
-    return isinstance(value, int) and value > LARGEST
+    """Whether a number is larger than any key takes."""
+    return isinstance(value, int | float) and value > LARGEST
 
 
 def _as_text(value: Any) -> Any:

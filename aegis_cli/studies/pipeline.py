@@ -68,25 +68,34 @@ def run(
 def _check_and_run(
     recipe: Recipe, root: Path, on_event: OnEvent, overwrite: bool
 ) -> PipelineReport:
-    recipes.check_run(recipe)
-    track.check(recipe)
+    check(recipe)
     folder = Path(root) / recipe.name
-    gl.check()
-    sim.check(recipe.task)
     with locks.alone(folder):
         return _run(recipe, folder, overwrite, on_event)
 
 
+def check(recipe: Recipe) -> None:
+    """Refuse what no stage of a recipe's job could do, before any work.
+
+    Raises:
+        AegisError: keys that do not fit together, a tracker, OpenGL or a task that is not there.
+    """
+    recipes.check_run(recipe)
+    track.check(recipe)
+    gl.check()
+    sim.check(recipe.task)
+
+
 def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
-    _check_inputs(runner, recipe)
+    check_inputs(runner, recipe)
     if overwrite:
         runner.begin_anew()
     rows = []
     for done, method in enumerate(recipe.methods):
         on_event(Progress(recipe.name, done, len(recipe.methods), "methods"))
         on_event(Progress(method, 0, 1, "method"))
-        rows.append(runner.figures(method, _of(recipe, method)))
+        rows.append(runner.figures(method, of_method(recipe, method)))
         on_event(Progress(method, 1, 1, "method", _shown(rows[-1])))
     on_event(Progress(recipe.name, len(rows), len(rows), "methods"))
     rows = _with_ratios(rows)
@@ -199,7 +208,7 @@ def _past(row: PolicyFigures, settings: Probe) -> bool:
     return False
 
 
-def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
+def check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     """Refuse files that the recipe names before anything is written.
 
     Else a fault would show only after the stages before the one that reads them.
@@ -207,7 +216,7 @@ def _check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     _refuse_own_models(runner.folder, recipe)
     runner.backbone_sha256(recipe)
     for method in recipe.methods:
-        runner.vqa_state(_of(recipe, method))
+        runner.vqa_state(of_method(recipe, method))
     runner.check_questions(recipe, "probe")
     loading.check_named(recipe, runner.on_event)
 
@@ -224,7 +233,8 @@ def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
             )
 
 
-def _of(recipe: Recipe, method: str) -> Recipe:
+def of_method(recipe: Recipe, method: str) -> Recipe:
+    """The recipe of one of its methods."""
     return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
 
 

@@ -319,13 +319,22 @@ class PolicyRunner:
     A label is a cell's place below the folder: `naive`, or `nullspace/3`.
     """
 
-    def __init__(self, folder: Path, on_event: OnEvent, plain: Recipe | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        on_event: OnEvent,
+        plain: Recipe | None = None,
+        records: StageRecords | None = None,
+    ) -> None:
         """The demonstrations and the anchor of `plain` get plain names.
 
         The names of others tell their settings apart.
+
+        Args:
+            records: what says which stages are up to date; default: the folder's own.
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
-        self.records = StageRecords(folder, on_event)
+        self.records = StageRecords(folder, on_event) if records is None else records
         self._given: dict[tuple[str | tuple[str, ...], Selection], Given] = {}
         self._sha256: dict[str, str] = {}
         self._sources: dict[tuple[str, bool, str], sets.Scenes | sets.Listed] = {}
@@ -475,10 +484,15 @@ class PolicyRunner:
         episodes that training has held out. No value is chosen by that, so none is measured for
         tuning.
         """
-        trained = self.train(label, recipe)
+        self.train(label, recipe)
+        run_folder.renew_recipe(self.folder / label, recipe)
+        trained = files.load_json(self.folder / label / run_folder.JOBS_REPORT)
         _remove_misplaced(self.folder / label)
         if recipe.merge.method is not None:
-            trained |= self.merge(label, recipe)
+            self.merge(label, recipe)
+            run_folder.renew_recipe(self._policy(label, recipe), recipe)
+            merged = files.load_json(self._policy(label, recipe) / run_folder.MERGE_REPORT)
+            trained["validation_loss"] = merged["validation_loss"]
         asked = {
             settings.only_set: _vqa_figures(self.probe(label, recipe, settings, number, validation))
             for number, settings in enumerate(recipe.probe.of_each_set(), start=1)
@@ -516,20 +530,11 @@ class PolicyRunner:
             others={name: asked[name] for name in further},
         )
 
-    def train(self, label: str, recipe: Recipe) -> dict[str, Any]:
-        """The cell's training report."""
+    def train(self, label: str, recipe: Recipe) -> None:
+        """Train the cell; its report lies in the run."""
         out, method = self.folder / label, recipe.train.method
         recorded, measured = self.demos(recipe), self.anchor(recipe)
-        key = {
-            "recipe": recipes.training_part(recipe),
-            "backbone": self.backbone_sha256(recipe),
-            "demos": recorded.sha256,
-            "anchor": measured.sha256,
-        }
-        if recipe.expert.start is not None:
-            key["expert"] = checkpoint.expert_sha256(recipe.expert.start)
-        for section in _trained_on(recipe):
-            key |= self.source(section).state
+        key = self.training_key(recipe, recorded.sha256, measured.sha256)
         outputs = [
             out / run_folder.JOBS_REPORT,
             *(out / "checkpoints" / "last" / name for name in POLICY),
@@ -550,8 +555,20 @@ class PolicyRunner:
             files.save_json(out / run_folder.JOBS_REPORT, report.to_json())
 
         self.records.fresh(f"{label}/train", key, outputs, make)
-        run_folder.renew_recipe(out, recipe)
-        return files.load_json(out / run_folder.JOBS_REPORT)
+
+    def training_key(self, recipe: Recipe, demos: str, anchor: str) -> dict[str, Any]:
+        """What shapes a training, given the digests of its demonstrations and its anchor."""
+        key = {
+            "recipe": recipes.training_part(recipe),
+            "backbone": self.backbone_sha256(recipe),
+            "demos": demos,
+            "anchor": anchor,
+        }
+        if recipe.expert.start is not None:
+            key["expert"] = checkpoint.expert_sha256(recipe.expert.start)
+        for section in _trained_on(recipe):
+            key |= self.source(section).state
+        return key
 
     def _clear_other_run(self, label: str, key: Mapping[str, Any], on_event: OnEvent) -> None:
         """Let the cell begin anew where its folder holds no run that can be continued.
@@ -562,19 +579,23 @@ class PolicyRunner:
         Args:
             key: what shapes the training.
         """
-        out, train_record, begun_record = self.folder / label, f"{label}/train", f"{label}/{BEGUN}"
-        begun = self.records.key_of(begun_record)
-        finished = self.records.key_of(train_record) == digest(key)
-        if begun == digest(key) and not finished and (out / "recipe.yaml").exists():
+        if self.goes_on(label, key):
             return
-        moved = run_folder.clear(out, ours=begun is not None)
+        begun = f"{label}/{BEGUN}"
+        moved = run_folder.clear(self.folder / label, ours=self.records.key_of(begun) is not None)
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
-        self.records.forget(train_record)
-        self.records.keep(begun_record, key, [])
+        self.records.forget(f"{label}/train")
+        self.records.keep(begun, key, [])
 
-    def merge(self, label: str, recipe: Recipe) -> dict[str, float]:
-        """Merge what the cell has trained; the merged policy's validation loss, by that name."""
+    def goes_on(self, label: str, key: Mapping[str, Any]) -> bool:
+        """Whether the cell's folder holds the beginning of the training of this key."""
+        begun, finished = (self.records.key_of(f"{label}/{name}") for name in (BEGUN, "train"))
+        there = (self.folder / label / "recipe.yaml").exists()
+        return begun == digest(key) != finished and there
+
+    def merge(self, label: str, recipe: Recipe) -> None:
+        """Merge what the cell has trained; the report lies in the merged run."""
         trained, out = self.folder / label, self.folder / label / run_folder.MERGED
         recorded, measured = self.demos(recipe), self.anchor(recipe)
         settings = MergeSettings(
@@ -602,8 +623,6 @@ class PolicyRunner:
 
         outputs = [report, *(out / "checkpoints" / "last" / name for name in POLICY)]
         self.records.fresh(f"{label}/merge", key, outputs, make)
-        run_folder.renew_recipe(out, recipe)
-        return {"validation_loss": files.load_json(report)["validation_loss"]}
 
     def _policy(self, label: str, recipe: Recipe) -> Path:
         """The run whose policy is measured."""
@@ -718,10 +737,10 @@ class PolicyRunner:
         and None where there is no such set. Holding has an error where it has one in all of them.
         """
         given = self.demos(recipe)
-        paths = [given.path] if isinstance(given.path, Path) else list(given.path)
+        paths = mixture.each(given.path)
         errors, holds = [], []
         for number, data in enumerate(paths, start=1):
-            report = self._evaluated(label, recipe, data, given.sha256, number)
+            report = self.evaluated(label, recipe, data, given.sha256, number)
             if report["relative_error"] is not None:
                 errors.append(report["relative_error"])
                 holds.append(report["hold_error"])
@@ -730,7 +749,7 @@ class PolicyRunner:
         hold = None if None in holds else statistics.fmean(holds)
         return statistics.fmean(errors), hold
 
-    def _evaluated(
+    def evaluated(
         self, label: str, recipe: Recipe, data: Path, demos_sha256: str, number: int
     ) -> dict[str, Any]:
         """The open-loop report on one set of demonstrations, of that number from 1."""
@@ -802,4 +821,17 @@ def _playable(meta: PolicyMeta, recipe: Recipe) -> tuple[str, ...]:
     cameras = {layout.short(name) for name in meta.get("cameras", ())}
     if task is None or (len(cameras) > 1 and not cameras <= {*sim.cameras(task)}):
         return ()
+    return _colors(task, recipe)
+
+
+def playable_colors(recipe: Recipe) -> tuple[str, ...]:
+    """As `_playable` says of a policy that is yet to be trained by the recipe."""
+    task: str | None = recipe.task
+    if recipe.demos.path is not None:
+        given, chosen = mixture.at(recipe.demos.path), recipe.demos.selection
+        task = mixture.playable_task(given, chosen.camera, chosen.rename)
+    return () if task is None else _colors(task, recipe)
+
+
+def _colors(task: str, recipe: Recipe) -> tuple[str, ...]:
     return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)

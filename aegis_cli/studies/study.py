@@ -97,6 +97,41 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
     return dataclasses.replace(report, out=str(cells))
 
 
+def planned(
+    study: AnyStudy, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
+) -> Iterator[tuple[str, bool | None]]:
+    """Every cell's label and whether it is finished; nothing is measured, and nothing written.
+
+    None stands for a cell whose value the tuning has yet to choose.
+
+    Args:
+        overwrite: whether what is finished is to be forgotten.
+
+    Raises:
+        AegisError: a cell that is no recipe, or files that cannot be read.
+    """
+    kind = kind_of(study)
+    tried = trials(kind)
+    kind.check([cell.recipe for own in tried.values() for _, cell in own])
+    kept, tuned = Path(root) / study.name / CELLS, _tuned(kind, tried)
+    with tempfile.TemporaryDirectory() as aside:
+        if kept.exists() and not overwrite:
+            shutil.copy(kept, Path(aside) / CELLS)
+        store = CellStore(kind, Path(aside), on_event, known_only=True)
+        for own in tuned.values():
+            for _, cell in own:
+                yield cell.label, store.runner.key(cell) in store.cells
+        chosen = {name: own[0][0] for name, own in tried.items() if name not in tuned}
+        chosen |= _tune(kind, store, tuned).chosen
+        for setting in _settings(kind):
+            name = setting[0]
+            if name in chosen:
+                cell = _cell(kind, *setting, chosen[name])
+                yield cell.label, store.runner.key(cell) in store.cells
+            else:
+                yield _label(*setting), None
+
+
 def kind_of(study: AnyStudy) -> StudyKind[Any]:
     """What a study's cells are, and how they are measured and told."""
     if isinstance(study, StudyRecipe):
@@ -235,11 +270,24 @@ def _points(kind: StudyKind[R], tuned: Trials[R], found: Mapping[str, Any]) -> d
 
 
 def _compared(kind: StudyKind[R], chosen: Mapping[str, Any]) -> Iterator[Cell[R]]:
+    for name, place, seed in _settings(kind):
+        yield _cell(kind, name, place, seed, chosen[name])
+
+
+def _settings(kind: StudyKind[Any]) -> Iterator[tuple[str, str, int]]:
+    """Variant, task or stream, and seed of every compared cell, in the order of measuring."""
     for seed in kind.recipe.seeds:
         for place in kind.places:
             for name in kind.recipe.variants:
-                recipe = kind.cell(name, place, seed, chosen[name])
-                yield Cell(f"{place}/{name}/{seed}", recipe)
+                yield name, place, seed
+
+
+def _label(name: str, place: str, seed: int) -> str:
+    return f"{place}/{name}/{seed}"
+
+
+def _cell(kind: StudyKind[R], name: str, place: str, seed: int, value: Any) -> Cell[R]:
+    return Cell(_label(name, place, seed), kind.cell(name, place, seed, value))
 
 
 def _ordered(

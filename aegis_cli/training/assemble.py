@@ -235,6 +235,7 @@ def build(
     check_masters(recipe.train, ranks)
     eight_bit.check(recipe.train, ranks)
     device, shards = devices.pick(), parallel.shards(recipe.train, ranks)
+    devices.warn_of_slow_bf16(device, recipe.train.precision, on_event)
     loaded = loading.load(recipe, method, demos, anchor, on_event, ranks)
     backbone, measured = loaded.backbone, loaded.measured
     policy = _begun_policy(recipe, loaded, on_event)

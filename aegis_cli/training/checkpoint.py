@@ -137,6 +137,7 @@ def save(
             with averaged():
                 plain = plain_backbone(policy.backbone, method, wide)
                 write_policy(aside, plain, policy, meta, inputs, seed, card)
+            files.begin_to_write(aside)
             artifacts.save(
                 aside / STATE,
                 "training-state",
@@ -145,6 +146,7 @@ def save(
                 inputs=inputs,
                 meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: state.stateless},
             )
+            files.reach_disk(aside)
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
             point_last_at(target)

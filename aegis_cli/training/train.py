@@ -30,6 +30,7 @@ from aegis_cli.common import (
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.headers import rewrite
+from aegis_cli.common.kinds import is_finite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
 from aegis_cli.common.state_dicts import AS_WRITTEN, reading_meta
 from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
@@ -549,8 +550,10 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
             knob can do; the last checkpoint stays.
     """
     parameters = dict(run.policy.named_parameters())
-    wrong = run.ranks.any(*(not rows_here(p).isfinite().all() for p in parameters.values()))
-    bad = [name for name, found in zip(parameters, wrong, strict=True) if found]
+    with devices.single_threaded():
+        found = [not is_finite(rows_here(p)) for p in parameters.values()]
+    wrong = run.ranks.any(*found)
+    bad = [name for name, is_wrong in zip(parameters, wrong, strict=True) if is_wrong]
     if bad:
         good = checkpoint.step_of(checkpoint.last(run.out)) if checkpoint.begun(run.out) else 0
         kept = f"the {good} steps of {run.out}/checkpoints/last are good"

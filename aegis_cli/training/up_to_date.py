@@ -90,13 +90,27 @@ class StageRecords:
         self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
     ) -> None:
         """Call `make` unless the stage ran with an equal key and its outputs are unchanged."""
-        same_key = self.key_of(stage) == digest(key)
-        # The key first, because outputs may be gigabytes to read.
-        if same_key and self._record(stage)["outputs"] == self._hashes(outputs):
+        if self.due(stage, key, outputs) is None:
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
         make(self.named(stage))
         self.keep(stage, key, outputs)
+
+    def due(self, stage: str, key: Any, outputs: list[Path]) -> str | None:
+        """Why a stage has to run, in words; None where it is up to date."""
+        before = self.key_of(stage)
+        if before is None:
+            return "has not run yet"
+        if before != digest(key):
+            return "what it reads has changed: keys of the recipe, files or the version"
+        # The key first, because outputs may be gigabytes to read.
+        kept, found = self._record(stage)["outputs"], self._hashes(outputs)
+        for name in sorted(kept.keys() | found.keys()):
+            if name not in found:
+                return f"{name} is missing"
+            if found[name] != kept.get(name):
+                return f"{name} has changed"
+        return None
 
     def shared(self, name: str, key: Any, make: Callable[[Path, OnEvent], object]) -> Made:
         """A safetensors file that several runs read, made unless it is up to date."""

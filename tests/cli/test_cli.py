@@ -616,6 +616,22 @@ app.main()
     assert "elsewhere" not in done.stderr
 
 
+def test_a_process_ends_without_looking_through_all_that_it_has_made():
+    code = """
+import gc
+from aegis_cli.cli import app
+
+def command(prog_name):
+    assert gc.get_freeze_count() == 0
+
+app.app = command
+app.main()
+print(gc.get_freeze_count())
+"""
+    done = python(code)
+    assert int(done.stdout) > 10_000, done.stderr
+
+
 def test_control_characters_of_metadata_are_shown_and_not_sent(aegis, tmp_path: Path):
     """They could move the cursor, or set the terminal's title."""
     artifacts.save(

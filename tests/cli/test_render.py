@@ -628,6 +628,15 @@ def test_open_loop_errors_by_dimension_and_by_some_of_the_steps() -> None:
     assert "16 of 30 steps ahead" in shown
 
 
+def test_steps_ahead_are_told_in_seconds_where_the_control_rate_is_known() -> None:
+    unknown = text_of(open_loop(open_loop_report()))
+    assert "Seconds" not in unknown and not re.search(r"^fps", unknown, re.M)
+    shown = text_of(open_loop(open_loop_report(fps=15.0)))
+    assert re.search(r"^fps +15 *$", shown, re.M)
+    assert re.search(r"Steps ahead +Seconds +Frames +Relative error +Hold's", shown)
+    assert re.search(r"^ +3 +0\.200 +37 +0\.300 +0\.150 *$", shown, re.M)
+
+
 def instruction_errors(count: int) -> list[InstructionError]:
     return [
         InstructionError(f"put {i}", 2, 30, 1.0 - i / 100, (0.5, 1.5), 0.25) for i in range(count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.kinds import is_finite
 
 # sha256 of the header's other fields as canonical JSON, followed by the bytes of a and b
 DIGEST = b"23b564200209684dce5694bd1ae0cce93416017390b19a6fcbe313bef61714af"
@@ -161,6 +163,32 @@ def test_a_gpus_tensors_come_to_the_cpu_one_at_a_time(
     assert 1 <= most <= 2
     found = artifacts.load(tmp_path / "x.safetensors", "expert").tensors
     assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
+
+
+def test_it_is_hashed_while_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written, pour, digest = threading.Event(), artifacts.pour, artifacts._digest
+
+    def noted(*given: Any) -> None:
+        pour(*given)
+        written.set()
+
+    def late(*given: Any) -> str:
+        assert written.wait(20), "nothing is written before all is hashed"
+        return digest(*given)
+
+    monkeypatch.setattr(artifacts, "pour", noted)
+    monkeypatch.setattr(artifacts, "_digest", late)
+    path = write(tmp_path, "anchor")
+    monkeypatch.undo()
+    assert artifacts.load(path).header == artifacts.read_header(path)
+
+
+def test_finite_numbers_are_so_though_their_sum_is_not() -> None:
+    large = torch.full((4,), 3e38)
+    assert is_finite(large) and not large.sum().isfinite()
+    assert is_finite(torch.empty(0)) and is_finite(torch.tensor([1, 2]))
+    for bad in (float("nan"), float("inf"), -float("inf")):
+        assert not is_finite(torch.tensor([1.0, bad])) and not is_finite(torch.tensor([bad, -bad]))
 
 
 def test_loaded_tensors_are_private(tmp_path: Path) -> None:

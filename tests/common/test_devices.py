@@ -12,6 +12,7 @@ from samples.command import refused
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 
 Aegis = Callable[..., tuple[int, str, str]]
 
@@ -81,6 +82,32 @@ def test_a_gpu_that_is_not_there_is_refused(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(AegisError, match="no GPU"), devices.chosen("cuda"):
         pass
+
+
+@pytest.mark.parametrize(
+    ("listed", "slow"),
+    [
+        ({"amx_bf16": False, "avx512_bf16": False}, True),
+        ({"amx_bf16": True, "avx512_bf16": True}, False),
+        ({"amx_bf16": False, "avx512_bf16": True}, False),
+        ({"sve": True}, False),
+        (None, False),
+    ],
+)
+def test_bf16_is_warned_of_where_a_processor_is_known_to_have_nothing_for_it(
+    listed: dict[str, bool] | None, slow: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if listed is None:  # an older torch
+        monkeypatch.delattr(torch.cpu, "get_capabilities")
+    else:
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed)
+    said: list[Event] = []
+    for device, precision in (("cpu", "float32"), ("cpu", "auto"), ("cuda", "bf16")):
+        devices.warn_of_slow_bf16(torch.device(device), precision, said.append)
+    assert not said
+    devices.warn_of_slow_bf16(torch.device("cpu"), "bf16", said.append)
+    assert len(said) == slow
+    assert all(isinstance(event, Warned) and "float32" in event.text for event in said)
 
 
 def test_several_processes_take_no_numbered_gpu(

@@ -147,6 +147,41 @@ def test_a_folder_that_another_process_fills_stays(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path] and (path / "inside" / "half").is_file()
 
 
+def test_the_disk_begins_with_many_bytes_before_all_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[int] = []
+    monkeypatch.setattr(files, "_AT_ONCE", 100)
+    monkeypatch.setattr(os, "posix_fadvise", lambda _, start, *rest: begun.append(start))
+    parts = [bytes([number]) * size for number, size in enumerate((30, 250, 0, 60, 60))]
+    with open(tmp_path / "x", "wb") as file:
+        file.write(b"head")
+        files.pour(file, map(memoryview, parts))
+    assert (tmp_path / "x").read_bytes() == b"head" + b"".join(parts)
+    assert begun == [4, 134, 234]
+
+
+def test_a_folder_is_renamed_once_all_of_it_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number).st_ino))
+    rename = os.rename
+
+    def renamed(aside: Path, folder: Path) -> None:
+        inside = (aside, aside / "a", aside / "b", aside / "b" / "c")
+        assert {path.stat().st_ino for path in inside} == set(synced)
+        rename(aside, folder)
+
+    monkeypatch.setattr(os, "rename", renamed)
+    with files.folder_aside(tmp_path / "x") as aside:
+        (aside / "b").mkdir()
+        for name in ("a", "b/c"):
+            (aside / name).write_text(name)
+        files.put(aside, tmp_path / "x")
+    assert (tmp_path / "x" / "b" / "c").read_text() == "b/c"
+
+
 @pytest.mark.parametrize("removed", [False, True])
 def test_what_is_swept_before_it_is_locked_is_made_again(
     removed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

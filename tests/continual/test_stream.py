@@ -17,7 +17,7 @@ from samples.streams import STREAMS, TinyDual, recipe, task, write
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.continual import files, images, learners, loop, probe, train
 from aegis_cli.continual.images import ClassificationLoss, ImageEvaluator, ImageStreamRun
 from aegis_cli.continual.report import (
@@ -626,8 +626,11 @@ def test_classes_that_the_text_tower_cannot_read_are_refused_before_anything_is_
     assert not (tmp_path / "a").exists()
 
 
-def test_igsp_learns_in_bf16(tmp_path: Path) -> None:
-    report = train.run(recipe("igsp", precision="bf16"), tmp_path / "run")
+def test_igsp_learns_in_bf16(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": False})
+    said: list[Event] = []
+    report = train.run(recipe("igsp", precision="bf16"), tmp_path / "run", on_event=said.append)
+    assert any(isinstance(event, Warned) and "train.precision=auto" in event.text for event in said)
     assert report.scores.forgetting == 0 and probe.run(tmp_path / "run").largest_difference == 0
 
 

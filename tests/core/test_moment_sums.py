@@ -143,6 +143,23 @@ def test_few_rows_are_found_exactly() -> None:
     assert (moment(found) - wanted).abs().max() < 1e-5 * wanted.abs().max()
 
 
+def test_a_map_as_narrow_as_a_sketch_is_summed_whole() -> None:
+    assert isinstance(make(384, CPU, whole=8), FullSum)
+    assert isinstance(make(385, CPU, whole=8), Sketch)
+    assert size(384, whole=8) == size(384)
+
+
+@pytest.mark.parametrize("rank", [20, 100])
+def test_a_sketch_with_nearly_as_many_columns_as_rows_is_close_to_the_moment(rank: int) -> None:
+    """Such a random matrix hardly sees some directions, where rounding is all there is."""
+    width = 386
+    x = rows(600, rank, DECAYS["slow"]) @ rows(rank, width, 0.0, seed=1)
+    found = summed(make(width, CPU, whole=8), *x.split(6)).spectrum(len(x), 1.0)
+    wanted = second_moment(x) / len(x)
+    assert found.vectors is not None
+    assert (moment(found) - wanted).abs().max() < 1e-3 * wanted.abs().max()
+
+
 def test_rows_of_zeros_have_no_direction() -> None:
     found = summed(make(WIDE, CPU), torch.zeros(5, WIDE)).spectrum(5, 0.99)
     assert found.vectors is not None and found.vectors.shape == (WIDE, 0)

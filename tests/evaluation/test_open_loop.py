@@ -135,6 +135,16 @@ def test_a_step_that_no_episode_is_long_enough_for_is_left_out() -> None:
     assert found.relative_interval is None and found.episodes == [1]
 
 
+def test_the_control_rate_is_that_of_the_demonstrations(own_run: Path, demos_file: Path) -> None:
+    predicted = recorded().chunks(EVERY, CHUNK)[0]
+    for fps in (None, 30.0):
+        shown = dataclasses.replace(recorded(), fps=fps)
+        assert open_loop.compare(shown, EVERY, predicted, SPREAD).fps == fps
+    known = demonstrations.load(demos_file, None, 0).fps
+    assert known is not None
+    assert open_loop.run(own_run, demos_file).to_json()["fps"] == known
+
+
 @pytest.mark.parametrize(
     ("names", "positions", "held"),
     [

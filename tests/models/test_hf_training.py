@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -547,6 +548,24 @@ def test_a_full_disk_is_one_error(hf_folder: Made, demos_file: Path, tmp_path: P
         train.run(settings, "naive", demos_file, None, tmp_path / "run")
     assert "free space" in caught.value.expected
     assert not list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(
+    hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """transformers leaves the weights that it writes in memory, which a power cut takes."""
+    synced, rename, found = set[int](), os.rename, list[str]()
+    monkeypatch.setattr(os, "fsync", lambda number: synced.add(os.fstat(number).st_ino))
+
+    def renamed(aside: Path, target: Path) -> None:
+        files = [aside, *aside.rglob("*")]
+        assert not [path for path in files if path.stat().st_ino not in synced]
+        found.extend(path.name for path in files)
+        rename(aside, target)
+
+    monkeypatch.setattr(os, "rename", renamed)
+    train.run(small(hf_folder("smolvlm")), "naive", demos_file, None, tmp_path / "run")
+    assert {"model.safetensors", "config.json", "state.safetensors"} <= set(found)
 
 
 def test_probe_and_inspect_take_the_run_and_its_folder(

@@ -81,6 +81,21 @@ def test_a_run_says_what_precision_its_automatic_one_was(
         assert planned.precision == taken
 
 
+def test_a_training_and_its_dry_run_warn_of_bf16_that_the_processor_has_nothing_for(
+    recipe: Recipe, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = replace(recipe, train=replace(recipe.train, precision="bf16", steps=1))
+    for has in (True, False):
+        listed = {"amx_bf16": False, "avx512_bf16": has}
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda found=listed: found)
+        for stage in (dry_run, train):
+            said: list[Event] = []
+            given = (wanted, "naive", demos_file, None, tmp_path / f"{stage.__name__} {has}")
+            stage.run(*given, on_event=said.append)
+            warned = [event.text for event in said if isinstance(event, Warned)]
+            assert any("train.precision=auto" in text for text in warned) is not has
+
+
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_no_graph_outlives_its_step(method: str, start: Start, tmp_path: Path) -> None:
     made, kept = outputs_kept(lambda: start(method, tmp_path / "run"))

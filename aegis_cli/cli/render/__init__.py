@@ -16,6 +16,7 @@ from aegis_cli.cli.render.output import (
     text,
     write_any_character,
 )
+from aegis_cli.cli.render.plans import plan
 from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
 from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe
@@ -57,6 +58,7 @@ __all__ = [
     "open_loop",
     "open_loop_plot",
     "pipeline",
+    "plan",
     "pretrain",
     "probe",
     "progress",

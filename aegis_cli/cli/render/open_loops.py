@@ -45,6 +45,8 @@ def open_loop(report: Any) -> RenderableType:
         "chunk": report.chunk,
         "relative_error": error,
     }
+    if report.fps is not None:
+        facts["fps"] = number(report.fps)
     if report.trained_on:
         facts["trained_on"] = report.trained_on
     scale = "relative error: squared error over that of the training's mean action, which has 1"
@@ -77,16 +79,16 @@ def _by_step(report: Any) -> Table:
     count = len(report.horizon)
     rows = min(count, _ROWS)
     picked = sorted({round(i * (count - 1) / max(1, rows - 1)) for i in range(rows)})
-    header = ("Steps ahead", "Frames", "Relative error")
+    shown = {"Steps ahead": lambda step: str(step.step)}
+    if report.fps is not None:
+        shown["Seconds"] = lambda step: fixed(step.step / report.fps, 3)
+    shown["Frames"] = lambda step: f"{step.frames:,}"
+    shown["Relative error"] = lambda step: fixed(step.relative_error, 3)
     if report.hold_error is not None:
-        header = (*header, "Hold's")
-    lines = []
-    for at in picked:
-        step = report.horizon[at]
-        line = (str(step.step), f"{step.frames:,}", fixed(step.relative_error, 3))
-        lines.append(line if report.hold_error is None else (*line, fixed(step.hold_error, 3)))
+        shown["Hold's"] = lambda step: fixed(step.hold_error, 3)
+    lines = [[show(report.horizon[at]) for show in shown.values()] for at in picked]
     title = None if rows == count else f"{rows} of {count} steps ahead; --json has all"
-    return plain_table(header, lines, left=0, title=title)
+    return plain_table(tuple(shown), lines, left=0, title=title)
 
 
 def _by_instruction(report: Any) -> Iterator[RenderableType]:

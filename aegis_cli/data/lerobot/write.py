@@ -100,8 +100,6 @@ def write(
     try:
         with folder_aside(folder) as aside:
             _Writer(aside, spec, limits).write(episodes)
-            for path in aside.rglob("*"):
-                _sync(path)
             put(aside, folder)
     except OSError as error:
         raise AegisError(
@@ -109,15 +107,6 @@ def write(
             "a writable folder with free space",
             cure(folder.parent, error),
         ) from error
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file or folder has reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class _Sink(Protocol):

@@ -1,0 +1,287 @@
+"""`aegis run --dry-run`: which stages a job would run, why, and what its trainings need.
+
+What decides is what decides in the job itself: the same stages ask the same records, which here
+answer and let nothing run. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from aegis_cli import methods
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data import mixture
+from aegis_cli.recipes import AnyStudy, Recipe
+from aegis_cli.studies import pipeline, study
+from aegis_cli.studies.policy_cells import PolicyRunner, playable_colors
+from aegis_cli.training import dry_run
+from aegis_cli.training.dry_run import DryRunReport
+from aegis_cli.training.up_to_date import StageRecords
+
+_AFTER = "follows on "
+_SHARED = ""  # the method of what all methods share
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """A stage of a job.
+
+    Attributes:
+        method: that it is of; "" of what all methods share.
+        command: that does the same alone.
+        due: why it would run; None where it is up to date and skipped.
+    """
+
+    stage: str
+    method: str
+    command: str
+    due: str | None
+
+
+@dataclass(frozen=True)
+class JobPlan:
+    """What `aegis run` would do with a recipe.
+
+    Attributes:
+        trainings: of each method that would train what `aegis train --dry-run` tells; None where
+            that cannot be asked before an earlier stage has run.
+        hours, disk_mb: of these trainings together, as far as they are known.
+        disk_free_mb: where they would be; None where no training could be asked.
+    """
+
+    name: str
+    stages: list[PlannedStage]
+    trainings: dict[str, DryRunReport | None]
+    hours: float | None
+    disk_mb: float
+    disk_free_mb: float | None
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        asked = {
+            method: None if report is None else report.to_json()
+            for method, report in self.trainings.items()
+        }
+        return dataclasses.asdict(self) | {"trainings": asked}
+
+
+class _Due(Exception):
+    """A stage would run."""
+
+    def __init__(self, stage: str) -> None:
+        super().__init__(stage)
+        self.stage = stage
+
+
+class _Asked(StageRecords):
+    """Records of a folder's stages that say what would run, and let nothing run.
+
+    Attributes:
+        reasons: why each stage that was asked would run; None where it is up to date.
+    """
+
+    def __init__(self, folder: Path, on_event: OnEvent, overwrite: bool) -> None:
+        super().__init__(folder, on_event)
+        self._overwrite = overwrite
+        self.reasons: dict[str, str | None] = {}
+
+    def fresh(
+        self, stage: str, key: Any, outputs: list[Path], make: Callable[[OnEvent], object]
+    ) -> None:
+        """Note whether the stage would run.
+
+        Raises:
+            _Due: it would.
+        """
+        self.reasons[stage] = "--overwrite" if self._overwrite else self.due(stage, key, outputs)
+        if self.reasons[stage] is not None:
+            raise _Due(stage)
+
+
+class _Step(NamedTuple):
+    """A stage of a method's: its name, its command, and what asks the records for it.
+
+    Attributes:
+        makes: whether it makes the policy that the stages after it measure.
+    """
+
+    name: str
+    command: str
+    ask: Callable[[], object]
+    makes: bool = False
+
+
+def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool = False) -> JobPlan:
+    """What `aegis run` would do with a recipe now; nothing is written.
+
+    Args:
+        overwrite: as `aegis run` would be asked to run every stage again.
+
+    Raises:
+        AegisError: what `aegis run` would refuse before its first stage, or a training that could
+            not be begun.
+    """
+    pipeline.check(recipe)
+    folder = Path(root) / recipe.name
+    records = _Asked(folder, on_event, overwrite)
+    runner = PolicyRunner(folder, on_event, plain=recipe, records=records)
+    pipeline.check_inputs(runner, recipe)
+    stages = list(_planned(_shared(runner, recipe), _SHARED, records))
+    for method in recipe.methods:
+        stages += _planned(_of_method(runner, method, recipe), method, records)
+    due = {one.method for one in stages if one.command == "aegis train" and one.due is not None}
+    trainings = {}
+    for number, method in enumerate(one for one in recipe.methods if one in due):
+        on_event(Progress(recipe.name, number, len(due), "trainings"))
+        trainings[method] = _asked_training(runner, method, recipe)
+    asked = [report for report in trainings.values() if report is not None]
+    hours = [report.hours for report in asked if report.hours is not None]
+    return JobPlan(
+        name=recipe.name,
+        stages=stages,
+        trainings=trainings,
+        hours=sum(hours) if hours else None,
+        disk_mb=sum(report.disk_mb for report in asked),
+        disk_free_mb=min((report.disk_free_mb for report in asked), default=None),
+        out=str(folder),
+    )
+
+
+def _planned(steps: Iterator[_Step], method: str, records: _Asked) -> Iterator[PlannedStage]:
+    """Each step with the reason for which it would run."""
+    waits_for = None  # what makes the policy, if that would run
+    for step in steps:
+        due = None if waits_for is None else _AFTER + waits_for
+        if waits_for is None:
+            try:
+                step.ask()
+            except _Due as end:
+                its_own = end.stage == step.name
+                due = records.reasons[end.stage] if its_own else _AFTER + end.stage
+        if step.makes and due is not None:
+            waits_for = step.name
+        yield PlannedStage(step.name, method, step.command, due)
+
+
+def _shared(runner: PolicyRunner, recipe: Recipe) -> Iterator[_Step]:
+    """The stages whose files all methods read."""
+    if recipe.demos.path is None:
+        yield _Step("demos", "aegis demos", lambda: runner.demos(recipe))
+    yield _Step("anchor", "aegis anchor", lambda: runner.anchor(recipe))
+
+
+def _of_method(runner: PolicyRunner, method: str, recipe: Recipe) -> Iterator[_Step]:
+    """The stages of one method, in their order."""
+    own = pipeline.of_method(recipe, method)
+    yield _Step(f"{method}/train", "aegis train", lambda: runner.train(method, own), makes=True)
+    if own.merge.method is not None:
+        yield _Step(f"{method}/merge", "aegis merge", lambda: runner.merge(method, own), makes=True)
+    for number, settings in enumerate(own.probe.of_each_set(), start=1):
+        name = "probe" if number == 1 else f"probe-{number}"
+        ask = lambda s=settings, n=number: runner.probe(method, own, s, n)  # noqa: E731
+        yield _Step(f"{method}/{name}", "aegis probe", ask)
+    played = playable_colors(own)
+    for colors in played:
+        ask = lambda c=colors: runner.rollout(method, own, c)  # noqa: E731
+        yield _Step(f"{method}/rollout {colors}", "aegis rollout", ask)
+    if played:
+        return
+    given = runner.demos(own)
+    for number, data in enumerate(mixture.each(given.path), start=1):
+        name = "evaluate" if number == 1 else f"evaluate-{number}"
+        ask = lambda d=data, n=number: runner.evaluated(method, own, d, given.sha256, n)  # noqa: E731
+        yield _Step(f"{method}/{name}", "aegis evaluate", ask)
+
+
+def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRunReport | None:
+    """What a training needs; None where what it reads is still to be made."""
+    own, out = pipeline.of_method(recipe, method), runner.folder / method
+    try:
+        demos = runner.demos(own)
+    except _Due:
+        return None
+    try:
+        anchor = runner.anchor(own)
+    except _Due:
+        if methods.get(method).needs:
+            return None
+        anchor = None
+    resumes = anchor is not None and runner.goes_on(
+        method, runner.training_key(own, demos.sha256, anchor.sha256)
+    )
+    # A run that cannot go on gives way to the new one. Here it stays, and so it must not be met.
+    at = out if resumes else out.with_name(f".{out.name}.planned")
+    path = None if anchor is None else anchor.path
+    report = dry_run.run(own, method, demos.path, path, at, resumes, runner.on_event)
+    return dataclasses.replace(report, out=str(out))
+
+
+def shortage(plan: JobPlan) -> str | None:
+    """What does not fit, on one line; None where everything that is known does."""
+    reports = {method: one for method, one in plan.trainings.items() if one is not None}
+    missing = [
+        f"{method}: {found}"
+        for method, one in reports.items()
+        if (found := dry_run.shortage(one)) is not None
+    ]
+    if not missing and plan.disk_free_mb is not None and plan.disk_mb > plan.disk_free_mb:
+        missing.append(
+            f"the checkpoints of all methods need {plan.disk_mb:,.0f} MB on the disk of "
+            f"'{plan.out}', and {plan.disk_free_mb:,.0f} MB are free: free some, choose another "
+            "--out, or set train.keep_checkpoints"
+        )
+    return "; ".join(missing) or None
+
+
+# --- studies --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PlannedCell:
+    """A cell of a study, by its folder; `due` says why it would be measured, None if it is not."""
+
+    cell: str
+    due: str | None
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """What `aegis run` would do with a study: `finished` of its cells are skipped."""
+
+    name: str
+    finished: int
+    cells: list[PlannedCell]
+    out: str
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+_WHY = {
+    True: None,
+    False: "has not been measured, or not with these keys and files",
+    None: _AFTER + "the tuning, which chooses its value",
+}
+
+
+def of_study(
+    recipe: AnyStudy, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
+) -> StudyPlan:
+    """What `aegis run` would do with a study now; as `job`."""
+    found = study.planned(recipe, root, on_event, overwrite)
+    cells = [PlannedCell(label, _WHY[finished]) for label, finished in found]
+    finished = sum(cell.due is None for cell in cells)
+    return StudyPlan(recipe.name, finished, cells, str(Path(root) / recipe.name))
+
+
+def run(
+    recipe: Recipe | AnyStudy, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
+) -> JobPlan | StudyPlan:
+    """What `aegis run` would do with a recipe or a study."""
+    if isinstance(recipe, Recipe):
+        return job(recipe, root, on_event, overwrite)
+    return of_study(recipe, root, on_event, overwrite)
