@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from aegis_cli.recipes.keys import LARGEST, Check, base_type, is_retired, is_too_large
+from aegis_cli.recipes.keys import LARGEST, LARGEST_FLOAT, Check, base_type, is_retired, is_too_large
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 
 if TYPE_CHECKING:
@@ -103,7 +103,8 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     limits = [] if check and check.choices and phrase == "text" else [phrase]
     limits += [check.expected] if check else []
     if "number" in phrase and any(map(is_too_large, raw if isinstance(raw, list) else [raw])):
-        limits.append(f"at most {LARGEST:,}")
+        most = f"{LARGEST:,}" if "whole" in phrase else f"{LARGEST_FLOAT:g}"
+        limits.append(f"at most {most}")
     expected = f"{dotted}: " + ", ".join(limits)
     listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
     fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check, phrase)

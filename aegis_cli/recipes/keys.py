@@ -27,7 +27,8 @@ from typing import (
 
 from aegis_cli.recipes.strict_yaml import plain
 
-LARGEST = 10**12  # number that a key takes; from some size on, arrays, times and float32 overflow
+LARGEST = 10**12  # whole number that a key takes; from some size on, arrays and times overflow
+LARGEST_FLOAT = 1e30  # float32 overflows at 3e38, and a step multiplies
 _SCALARS = (int, float, bool, str)
 T = TypeVar("T")
 
@@ -197,13 +198,14 @@ class _Value:
         if value is not None and self.check and not all(map(self.check.accepts, items)):
             raise ValueError(self.check.expected)
         if any(map(is_too_large, items)):
-            raise ValueError(f"at most {LARGEST:,}")
+            raise ValueError("a smaller number")
         return plain(value)
 
 
 def is_too_large(value: Any) -> bool:
-    """Whether a number is larger than any key takes."""
-    return isinstance(value, int | float) and value > LARGEST
+    """Whether a number is larger than any key of its type takes."""
+    limit = LARGEST if isinstance(value, int) else LARGEST_FLOAT
+    return isinstance(value, int | float) and value > limit
 
 
 def _as_text(value: Any) -> Any:

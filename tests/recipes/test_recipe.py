@@ -118,7 +118,7 @@ def test_yaml_round_trip_keeps_every_value_and_the_digest(path, tmp_path):
     assert digest(again) == digest(recipe)
 
 
-@pytest.mark.parametrize("value", [1e-4, 1e-5, 3e-10, 1e-22, 1e12, 0.0, 7.0])
+@pytest.mark.parametrize("value", [1e-4, 1e-5, 3e-10, 1e-22, 1e22, 0.0, 7.0])
 def test_round_trip_of_small_and_large_numbers(value, tmp_path):
     recipe = Recipe(name="x")
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, backbone_lr=value))
@@ -193,8 +193,8 @@ def test_an_optional_key_takes_null(tmp_path):
         ("train.steps=1" + "0" * 400, "a whole number, above 0, at most 1,000,000,000,000"),
         ("train.batch_size=1000000000001", "above 0, at most 1,000,000,000,000"),
         ("train.extended_from=[1000000000001]", "at most 1,000,000,000,000"),
-        ("ewc.weight=1e300", "a number, 0 or more, at most 1,000,000,000,000"),
-        ("demos.weights=[1.0, 1e13]", "at most 1,000,000,000,000"),
+        ("ewc.weight=1e300", "a number, 0 or more, at most 1e+30"),
+        ("demos.weights=[1.0, 2e30]", "at most 1e+30"),
         ("train.steps=true", "a whole number"),
         ("train.steps=many", "a whole number"),
         ("train.steps=", "a whole number"),

@@ -68,6 +68,7 @@ def test_processes_find_what_one_finds(small: StudyRecipe, tmp_path: Path) -> No
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_interrupted_processes_stop_and_go_on_later(small: StudyRecipe, tmp_path: Path) -> None:
     def stop(event: Progress) -> None:
         if event.stage.endswith("/train") and event.done == 3:
@@ -83,6 +84,7 @@ def test_interrupted_processes_stop_and_go_on_later(small: StudyRecipe, tmp_path
     )  # and three costs
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_process_that_dies_is_one_error(small: StudyRecipe, tmp_path: Path) -> None:
     def kill(event: Progress) -> None:
         if event.stage.endswith("/train"):
