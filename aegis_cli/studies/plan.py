@@ -19,6 +19,7 @@ from aegis_cli.recipes import AnyStudy, Recipe
 from aegis_cli.studies import pipeline, study
 from aegis_cli.studies.policy_cells import PolicyRunner, playable_colors
 from aegis_cli.training import dry_run
+from aegis_cli.training import folder as run_folder
 from aegis_cli.training.dry_run import DryRunReport
 from aegis_cli.training.up_to_date import StageRecords
 
@@ -198,8 +199,13 @@ def _of_method(runner: PolicyRunner, method: str, recipe: Recipe) -> Iterator[_S
 
 
 def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRunReport | None:
-    """What a training needs; None where what it reads is still to be made."""
+    """What a training needs; None where what it reads is still to be made.
+
+    Raises:
+        AegisError: the training could not be begun.
+    """
     own, out = pipeline.of_method(recipe, method), runner.folder / method
+    run_folder.check_ours(out, ours=runner.has_begun(method))
     try:
         demos = runner.demos(own)
     except _Due:

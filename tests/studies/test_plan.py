@@ -190,6 +190,19 @@ def test_what_a_job_refuses_its_plan_refuses(small: Recipe, tmp_path: Path) -> N
         job(replace(small, backbone="models/typo"), tmp_path / "runs")
 
 
+def test_a_run_that_was_trained_by_hand_is_in_the_way_of_plan_and_job(
+    small: Recipe, root: Path
+) -> None:
+    shutil.copytree(root / "small" / "naive", root / "small" / "lora", symlinks=True)
+    other = replace(small, methods=("lora",))
+    said = []
+    for begin in (pipeline.run, plan.run):
+        with pytest.raises(AegisError, match="did not begin it") as caught:
+            begin(other, root)
+        said.append(caught.value.found)
+    assert said[0] == said[1]
+
+
 def test_through_the_command_line(
     aegis: Aegis, small: Recipe, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
