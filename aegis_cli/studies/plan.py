@@ -48,8 +48,8 @@ class JobPlan:
     """What `aegis run` would do with a recipe.
 
     Attributes:
-        trainings: of each method that would train what `aegis train --dry-run` tells; None where
-            that cannot be asked before an earlier stage has run.
+        trainings: of each method that would train what `aegis train --dry-run` tells, of memory the
+            estimate alone; None where that cannot be asked before an earlier stage has run.
         hours, disk_mb: of these trainings together, as far as they are known.
         disk_free_mb: where they would be; None where no training could be asked.
     """
@@ -139,6 +139,8 @@ def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool 
     for number, method in enumerate(one for one in recipe.methods if one in due):
         on_event(Progress(recipe.name, number, len(due), "trainings"))
         trainings[method] = _asked_training(runner, method, recipe)
+    if due:
+        on_event(Progress(recipe.name, len(due), len(due), "trainings"))
     asked = [report for report in trainings.values() if report is not None]
     hours = [report.hours for report in asked if report.hours is not None]
     return JobPlan(
@@ -223,7 +225,8 @@ def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRun
     at = out if resumes else out.with_name(f".{out.name}.planned")
     path = None if anchor is None else anchor.path
     report = dry_run.run(own, method, demos.path, path, at, resumes, runner.on_event)
-    return dataclasses.replace(report, out=str(out))
+    # What the process has grown by is no measure: a training takes what one before it has left.
+    return dataclasses.replace(report, memory_measured_mb=None, out=str(out))
 
 
 def shortage(plan: JobPlan) -> str | None:

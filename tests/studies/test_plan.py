@@ -155,6 +155,9 @@ def test_a_training_whose_inputs_are_there_says_what_it_needs(small: Recipe, roo
     for method, report in told.items():
         assert (report.method, report.steps) == (method, 9)
         assert report.out == str(root / "small" / method)
+        # One training takes memory that the one before it has left to the process.
+        assert report.memory_measured_mb is None
+        assert report.memory_needed_mb == report.memory_total_mb > 0
         assert report.step_s is not None and report.hours == pytest.approx(report.step_s * 9 / 3600)
     assert found.disk_mb == sum(report.disk_mb for report in told.values()) > 0
     assert found.hours == sum(report.hours or 0 for report in told.values())
