@@ -19,6 +19,7 @@ from aegis_cli.recipes import AnyStudy, Recipe
 from aegis_cli.studies import pipeline, study
 from aegis_cli.studies.policy_cells import PolicyRunner, playable_colors
 from aegis_cli.training import dry_run
+from aegis_cli.training import folder as run_folder
 from aegis_cli.training.dry_run import DryRunReport
 from aegis_cli.training.up_to_date import StageRecords
 
@@ -47,8 +48,8 @@ class JobPlan:
     """What `aegis run` would do with a recipe.
 
     Attributes:
-        trainings: of each method that would train what `aegis train --dry-run` tells; None where
-            that cannot be asked before an earlier stage has run.
+        trainings: of each method that would train what `aegis train --dry-run` tells, of memory the
+            estimate alone; None where that cannot be asked before an earlier stage has run.
         hours, disk_mb: of these trainings together, as far as they are known.
         disk_free_mb: where they would be; None where no training could be asked.
     """
@@ -138,6 +139,8 @@ def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool 
     for number, method in enumerate(one for one in recipe.methods if one in due):
         on_event(Progress(recipe.name, number, len(due), "trainings"))
         trainings[method] = _asked_training(runner, method, recipe)
+    if due:
+        on_event(Progress(recipe.name, len(due), len(due), "trainings"))
     asked = [report for report in trainings.values() if report is not None]
     hours = [report.hours for report in asked if report.hours is not None]
     return JobPlan(
@@ -198,8 +201,13 @@ def _of_method(runner: PolicyRunner, method: str, recipe: Recipe) -> Iterator[_S
 
 
 def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRunReport | None:
-    """What a training needs; None where what it reads is still to be made."""
+    """What a training needs; None where what it reads is still to be made.
+
+    Raises:
+        AegisError: the training could not be begun.
+    """
     own, out = pipeline.of_method(recipe, method), runner.folder / method
+    run_folder.check_ours(out, ours=runner.has_begun(method))
     try:
         demos = runner.demos(own)
     except _Due:
@@ -217,7 +225,8 @@ def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRun
     at = out if resumes else out.with_name(f".{out.name}.planned")
     path = None if anchor is None else anchor.path
     report = dry_run.run(own, method, demos.path, path, at, resumes, runner.on_event)
-    return dataclasses.replace(report, out=str(out))
+    # What the process has grown by is no measure: a training takes what one before it has left.
+    return dataclasses.replace(report, memory_measured_mb=None, out=str(out))
 
 
 def shortage(plan: JobPlan) -> str | None:

@@ -581,12 +581,15 @@ class PolicyRunner:
         """
         if self.goes_on(label, key):
             return
-        begun = f"{label}/{BEGUN}"
-        moved = run_folder.clear(self.folder / label, ours=self.records.key_of(begun) is not None)
+        moved = run_folder.clear(self.folder / label, ours=self.has_begun(label))
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
         self.records.forget(f"{label}/train")
-        self.records.keep(begun, key, [])
+        self.records.keep(f"{label}/{BEGUN}", key, [])
+
+    def has_begun(self, label: str) -> bool:
+        """Whether it is written down that the cell's run was begun here."""
+        return self.records.key_of(f"{label}/{BEGUN}") is not None
 
     def goes_on(self, label: str, key: Mapping[str, Any]) -> bool:
         """Whether the cell's folder holds the beginning of the training of this key."""

@@ -166,7 +166,8 @@ def clear(out: Path, ours: bool) -> Path | None:
         return _clear(out, ours)
 
 
-def _clear(out: Path, ours: bool) -> Path | None:
+def check_ours(out: Path, ours: bool) -> None:
+    """Raise AegisError for what `clear` would not remove: files of somebody else's."""
     if not ours and not files.is_vacant(out):
         fix = (
             f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
@@ -174,6 +175,10 @@ def _clear(out: Path, ours: bool) -> Path | None:
         raise AegisError(
             f"'{out}' is not empty, and `aegis run` did not begin it", "a new or empty folder", fix
         )
+
+
+def _clear(out: Path, ours: bool) -> Path | None:
+    check_ours(out, ours)
     if not any(_is_foreign(path, out) for path in out.rglob("*")):
         shutil.rmtree(out, ignore_errors=True)
         return None

@@ -155,6 +155,9 @@ def test_a_training_whose_inputs_are_there_says_what_it_needs(small: Recipe, roo
     for method, report in told.items():
         assert (report.method, report.steps) == (method, 9)
         assert report.out == str(root / "small" / method)
+        # One training takes memory that the one before it has left to the process.
+        assert report.memory_measured_mb is None
+        assert report.memory_needed_mb == report.memory_total_mb > 0
         assert report.step_s is not None and report.hours == pytest.approx(report.step_s * 9 / 3600)
     assert found.disk_mb == sum(report.disk_mb for report in told.values()) > 0
     assert found.hours == sum(report.hours or 0 for report in told.values())
@@ -188,6 +191,19 @@ def test_what_a_job_refuses_its_plan_refuses(small: Recipe, tmp_path: Path) -> N
     (tmp_path / "runs").mkdir()
     with pytest.raises(AegisError, match="models/typo"):
         job(replace(small, backbone="models/typo"), tmp_path / "runs")
+
+
+def test_a_run_that_was_trained_by_hand_is_in_the_way_of_plan_and_job(
+    small: Recipe, root: Path
+) -> None:
+    shutil.copytree(root / "small" / "naive", root / "small" / "lora", symlinks=True)
+    other = replace(small, methods=("lora",))
+    said = []
+    for begin in (pipeline.run, plan.run):
+        with pytest.raises(AegisError, match="did not begin it") as caught:
+            begin(other, root)
+        said.append(caught.value.found)
+    assert said[0] == said[1]
 
 
 def test_through_the_command_line(

@@ -30,7 +30,7 @@ def _of_job(report: Any) -> Iterator[RenderableType]:
     due = sum(one.due is not None for one in report.stages)
     told = f"{due} of {len(report.stages)} stages would run"
     if report.hours is not None:
-        told += f"; their trainings take about {number(report.hours)} hours"
+        told += f"; their trainings take about {fixed(report.hours, 2)} hours"
     if report.disk_free_mb is not None:
         told += f" and {report.disk_mb:,.0f} MB of the {report.disk_free_mb:,.0f} MB that are free"
     yield Text(f"{told}, in '{report.out}'")
