@@ -162,6 +162,15 @@ def test_a_method_without_anchor_gradient_has_no_energy(tmp_path, capsys):
     assert "no anchor gradient" in shown(capsys, path)
 
 
+def test_a_ledger_says_how_many_steps_it_has(tmp_path, capsys):
+    """Also one without a row, whose method is not to blame for that."""
+    path = save_ledger(tmp_path / "l.safetensors")
+    assert inspection.run(path).facts["steps"] == 2
+    empty = save_ledger(tmp_path / "empty.safetensors", [], [], [])
+    assert inspection.run(empty).facts["steps"] == 0
+    assert "no anchor gradient was taken in any step" in shown(capsys, empty)
+
+
 def test_json_keys(tmp_path, capsys):
     report = json.loads(shown(capsys, save_run(tmp_path / "run"), "--json"))
     assert report["kind"] == "run" and report["energy_shed_mean"] == pytest.approx(4 / 15)

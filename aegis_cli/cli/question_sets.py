@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 
 from aegis_cli.cli import render
@@ -74,6 +75,6 @@ def _of_run(model: str, warn: bool) -> tuple[Probe, ...]:
         return (Probe(),)
     first, *others = named = results.recipe_of(run).probe.of_each_set()
     if warn and others and launch.rank() == 0:
-        left = ", ".join(f"--vqa {other.vqa}" for other in others)
-        render.note(f"asked are the questions of {first.vqa}; the run's recipe also names {left}")
+        left = ", ".join(f"--vqa {shlex.quote(str(other.vqa))}" for other in others)
+        render.note(f"asked are the questions of '{first.vqa}'; the run's recipe also names {left}")
     return named

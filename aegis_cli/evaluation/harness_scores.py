@@ -22,7 +22,7 @@ import numpy as np
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data.vqa.metrics import mean_loss_interval
 from aegis_cli.evaluation import probe, results
 
@@ -39,6 +39,7 @@ _NO_METRIC = frozenset(
 )
 # Where a metric is an object, its key that says how the question was answered.
 _NOTED = ("score", "is_correct", "correct")
+_TOLD_BYTES = 1_000_000  # between two tellings of how much is read
 _WRITTEN = "what lmms-eval or lm-evaluation-harness writes with --log_samples --output_path FOLDER"
 
 
@@ -127,8 +128,10 @@ def run(
     first, second = _tasks(before, on_event), _tasks(after, on_event)
     _warn_of_lone(first.keys() ^ second.keys(), before, after, on_event)
     scores: list[ScoreDrop] = []
-    for task in sorted(first.keys() & second.keys()):
-        logs = _read(first[task]), _read(second[task])
+    tasks = sorted(first.keys() & second.keys())
+    reading = _Reading([path for task in tasks for path in (first[task], second[task])], on_event)
+    for task in tasks:
+        logs = _read(first[task], reading), _read(second[task], reading)
         for metric in _comparable(task, logs, on_event):
             scores.append(_drop(task, metric, logs, max_drop, gate, on_event))
     if not scores:
@@ -150,6 +153,12 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
         if (named := _named(path)) is not None:
             task, date = named
             found.setdefault(task, []).append((date, path))
+    if not found and place.is_file():
+        raise AegisError(
+            f"'{place}', whose name is none that a harness gives to samples",
+            "e.g. 20260131_120000_samples_TASK.jsonl, or samples_TASK_2026-01-31T12-00-00.jsonl",
+            "give it the name again that it was written under: it tells the task",
+        )
     if not found:
         fix = "evaluate again with --log_samples, and give the folder of --output_path"
         raise AegisError(f"no file of samples in '{place}'", _WRITTEN, fix)
@@ -182,17 +191,36 @@ def _warn_of_lone(tasks: set[str], before: Path, after: Path, on_event: OnEvent)
         on_event(Warned("scores", f"not in both '{before}' and '{after}', and left out: {names}"))
 
 
-def _read(path: Path) -> _Log:
+class _Reading:
+    """Tells how much of all files is read; those of a benchmark may have gigabytes."""
+
+    def __init__(self, paths: Sequence[Path], on_event: OnEvent) -> None:
+        self._total = sum(path.stat().st_size for path in paths)
+        self._done, self._told, self._on_event = 0, 0, on_event
+
+    def read(self, size: int) -> None:
+        """So many bytes more."""
+        self._done += size
+        if self._done - self._told >= _TOLD_BYTES or self._done == self._total:
+            self._told = self._done
+            self._on_event(Progress("scores", self._done, self._total, "bytes"))
+
+
+def _read(path: Path, reading: _Reading) -> _Log:
     """A task's lines.
 
     Raises:
-        AegisError: a line that is no question's, or one question twice.
+        AegisError: no line, a line that is no question's, or one question twice.
     """
     log = _Log(path, falling=_falling(path))
     with files.reading(path, "check the path"), open(path, "rb") as file:
         for number, line in enumerate(file, start=1):
             if line.strip():
                 _add(log, number, line)
+            reading.read(len(line))
+    if not log.asked:
+        fix = "evaluate again: the harness has written the file and no line of it"
+        raise AegisError(f"no question in '{path}'", _WRITTEN, fix)
     return log
 
 

@@ -242,7 +242,7 @@ def warn_of_few_questions(
     max_drop: float | None,
     stage: str,
     on_event: OnEvent,
-    fix: str = "Ask more (--questions, probe.questions of a recipe)",
+    fix: str = "Ask more (--questions, probe.questions of a recipe, or a larger set)",
 ) -> None:
     """Warn where the questions tell the drop less finely than its gate asks, and chance decides.
 

@@ -76,8 +76,9 @@ class AutomaticLoop:
                 "a second forward pass under gradients before the backward pass of the first",
                 "one forward pass of the guarded model for each backward pass",
                 "torch.no_grad() around passes that nothing learns from; guard.discard() for a "
-                "batch that is skipped; where a step needs several passes at once, call the guard "
-                "in the loop: guard.watch around all of them, and guard.backward",
+                "batch that is skipped, or whose loss.backward() has failed; where a step needs "
+                "several passes at once, call the guard in the loop: guard.watch around all of "
+                "them, and guard.backward",
             )
         self._dual.check_group()
         self._dual.forget_cleared()
@@ -174,7 +175,7 @@ class LoopHooks:
         self._around, self._loop, self._reads = around, loop, reads
         self._mask, self._image = mask, image
         self._parameters = inspect.signature(wrappers.unwrapped(around).forward)
-        self._in_pass = self._in_backward = self._accumulated = False
+        self._in_pass = self._in_backward = self._accumulated = self._at_output = False
         # Functions are no part of a copy of the module, as bound methods would be. Compiled code
         # leaves them alone.
         before = torch.compiler.disable(lambda *given: self._before(*given))
@@ -201,9 +202,10 @@ class LoopHooks:
         # A pass without gradients is an evaluation. A copy of the module has the hooks too.
         if module is not self._around or not torch.is_grad_enabled() or self._in_pass:
             return
-        if self._in_backward:  # the last one raised an exception, such as for want of memory
+        # A backward pass that never ended has raised an exception, such as for want of memory.
+        if self._in_backward or self._at_output:
             self._loop.discard()
-        self._in_backward = False
+        self._in_backward = self._at_output = False
         mask = image = None
         if self._reads:
             given = self._given(args, named)
@@ -219,10 +221,10 @@ class LoopHooks:
             self._loop.end(failed=output is None)
         finally:
             self._in_pass = False
-        if self._sharded:
-            for part in tree_leaves(output):
-                if isinstance(part, Tensor) and part.requires_grad:
-                    part.register_hook(self._on_gradient)
+        hook = self._on_gradient if self._sharded else self._on_output
+        for part in tree_leaves(output):
+            if isinstance(part, Tensor) and part.requires_grad:
+                part.register_hook(hook)
 
     def _given(self, args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name."""
@@ -248,6 +250,15 @@ class LoopHooks:
         return found
 
     # --- the backward pass ------------------------------------------------------------------------
+
+    def _on_output(self, gradient: Tensor) -> None:
+        """Note, until it has ended, a backward pass that may fail before the first parameter."""
+        if not self._at_output:
+            self._at_output = True
+            at_end(self._on_output_end)
+
+    def _on_output_end(self) -> None:
+        self._at_output = False
 
     def _on_gradient(self, gradient: Tensor) -> None:
         """Prepare for the end of a backward pass, at the first tensor that it comes to."""

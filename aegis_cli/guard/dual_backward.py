@@ -112,9 +112,21 @@ class DualBackward:
         """Whether `.grad` still holds the projected sum, which further passes add to.
 
         Raises:
-            AegisError: it is neither that nor cleared.
+            AegisError: it is neither that nor cleared, or a step was made of it already.
         """
-        return accumulation.continues(self._sum, self._learning())
+        continued = accumulation.continues(self._sum, self._learning())
+        if continued and self._sum is not None and not self._sum.empty:
+            self._refuse_uncleared()
+        return continued
+
+    def _refuse_uncleared(self) -> None:
+        """Refuse to add to gradients of which a step was made: they would count in the next too."""
+        if self._stepper.has_stepped:
+            raise AegisError(
+                "gradients that were not cleared after the step that was made of them",
+                "optimizer.zero_grad() after each step, or before the next one's first pass",
+                "call it; several guard.backward go before one step, and none between",
+            )
 
     def backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
         """Go back from the loss and the pass's penalty, and project the sum.

@@ -167,6 +167,7 @@ class Guard(Removable):
                 pass still unused, parameters that the guard does not know.
         """
         self._check_ready()
+        self._refuse_automatic("guard.watch", "the model itself")
         _check_mask(mask)
         self._stepper.check()
         if self._dual is None:
@@ -238,7 +239,12 @@ class Guard(Removable):
                 sharded weights, or a guard that is automatic already.
         """
         self._check_ready()
-        self._refuse_automatic("guard.automatic", "nothing more")
+        if self._automatic is not None:
+            raise AegisError(
+                "guard.automatic of an automatic guard",
+                "one call of it",
+                "leave the second one out; guard.callback() calls it as a training begins",
+            )
         if around is not None and not isinstance(around, nn.Module):
             raise AegisError(
                 f"around={around!r}", "the module whose call is a pass", "around=policy"
@@ -323,12 +329,7 @@ class Guard(Removable):
                 "the forward pass alone in the block",
                 "call it after the block",
             )
-        if loss.numel() != 1 or not loss.requires_grad:
-            raise AegisError(
-                f"a loss {list(loss.shape)} {'with' if loss.requires_grad else 'without'} a graph",
-                "one number with its graph",
-                "give the loss that the forward pass computed",
-            )
+        _check_loss(loss)
         scaled = loss if scaler is None else scaler.scale(loss)
         # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
@@ -362,6 +363,7 @@ class Guard(Removable):
         """
         self._check_ready()
         self._refuse_automatic("guard.step", "optimizer.step()")
+        _check_optimizer(optimizer, self._parts.constrains)
         dual = self._dual
         if self._parts.constrains and dual is not None and not dual.begun and scaler is None:
             raise AegisError(
@@ -431,7 +433,37 @@ def _check_mask(mask: object) -> None:
     """Raise AegisError for a mask that is no tensor."""
     if mask is not None and not isinstance(mask, Tensor):
         raise AegisError(
-            f"a mask that is a {type(mask).__name__}", "a tensor [B, T]", "torch.as_tensor(mask)"
+            f"a mask that is a {type(mask).__name__}",
+            "a tensor [B, T]",
+            "torch.as_tensor(mask); of a batch, its mask alone: batch['attention_mask']",
+        )
+
+
+def _check_loss(loss: object) -> None:
+    """Raise AegisError for a loss that no backward pass can begin with."""
+    if not isinstance(loss, Tensor):
+        raise AegisError(
+            f"a loss that is a {type(loss).__name__}",
+            "a tensor of one number with its graph",
+            "of a Hugging Face model's output, output.loss; leave .item() out",
+        )
+    if loss.numel() != 1 or not loss.requires_grad:
+        raise AegisError(
+            f"a loss {list(loss.shape)} {'with' if loss.requires_grad else 'without'} a graph",
+            "one number with its graph",
+            "give the loss that the forward pass computed",
+        )
+
+
+def _check_optimizer(optimizer: object, constrained: bool) -> None:
+    """Raise AegisError for what takes no step, or for one whose parameters have to be known."""
+    needed = "param_groups" if constrained else "step"
+    is_scheduler = isinstance(optimizer, torch.optim.lr_scheduler.LRScheduler)
+    if is_scheduler or not hasattr(optimizer, needed):
+        raise AegisError(
+            f"guard.step of a {type(optimizer).__name__}",
+            "an optimizer",
+            "guard.step(optimizer), and scheduler.step() after it as ever",
         )
 
 

@@ -88,9 +88,11 @@ class GuardedStepper:
         """Refuse a model whose parameters are not those that the guard was made with.
 
         Raises:
-            AegisError: they were replaced or moved, or further ones learn.
+            AegisError: they were replaced or moved, further ones learn, or another guard is at
+                work on them.
         """
         self._end_broken_step()
+        self._refuse_another_guard()
         self._stepper.known.check()
         self._learning.refuse_further()
         self._refuse_another_place()
@@ -145,6 +147,11 @@ class GuardedStepper:
             return True
         # An optimizer that is none of PyTorch's tells nothing, and may write past its count.
         return not (self._tells or skips)
+
+    @property
+    def has_stepped(self) -> bool:
+        """Whether an optimizer has told that it moved weights since the last guarded pass."""
+        return self._since.moved
 
     @property
     def _sums_late(self) -> bool:

@@ -54,8 +54,7 @@ def _header_facts(header: headers.Header) -> dict[str, Any]:
         "seed": header.seed,
         "fingerprint": header.fingerprint,
     }
-    return {
-        k: v
-        for k, v in (known | {"inputs": header.inputs or None} | header.meta).items()
-        if v is not None
-    }
+    facts = known | {"inputs": header.inputs or None} | header.meta
+    if header.kind == "ledger" and "step" in header.tensors:
+        facts["steps"] = header.tensors["step"].shape[0]
+    return {k: v for k, v in facts.items() if v is not None}

@@ -56,6 +56,7 @@ class MergeReport:
         points: the sweep, weakest first, beginning with 0, which is the fine-tuned model.
         passed: whether a strength keeps `max_drop`; None without that limit.
         gate: what of the drop that limits, MEAN or UPPER; None without it.
+        vqa, ask: the questions of a sweep, and what they became; None without one.
     """
 
     method: str
@@ -72,6 +73,8 @@ class MergeReport:
     points: tuple[MergePoint, ...] = ()
     validation_loss: float | None = None
     gate: str | None = None
+    vqa: str | None = None
+    ask: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -156,6 +159,8 @@ def _merge(
         points=tried.points,
         validation_loss=loss,
         gate=None if max_drop is None else gate,
+        vqa=settings.vqa if tried.points else None,
+        ask=settings.ask if tried.points else None,
     )
 
 

@@ -40,7 +40,7 @@ from aegis_cli.training import inputs as places
 _CARD = """# `{method}` merge of strength {strength:g}
 
 The fine-tuned model was moved back towards the pre-trained `{base}` by `aegis merge`, which kept
-{percent:.1f} % of the displacement of its maps. Damping {damping:g}.
+{percent:.1f} % of the displacement of its maps{damped}.
 """
 
 
@@ -318,7 +318,9 @@ class ModelFolder:
 
 
 def _card(merged: Mapping[str, Any]) -> str:
-    return _CARD.format(percent=100 * merged["kept"], **merged)
+    # The straight line between both models reads no curvature that could be damped.
+    damped = "" if merged["method"] == "linear" else f". Damping {merged['damping']:g}"
+    return _CARD.format(percent=100 * merged["kept"], damped=damped, **merged)
 
 
 def _check_alike(tuned: Backbone, base: Backbone) -> None:

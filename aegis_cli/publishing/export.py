@@ -6,6 +6,7 @@ A checkpoint has float32, to train on. A model that came in bfloat16 goes out in
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -115,7 +116,7 @@ def run(
         else:
             _write_checkpoint(aside, run_path, policy, meta)
         stored = card.Stored(meta.get("stored", FLOAT32), rounded)
-        _write_card(aside, run_path, form, repo or f"ORG/{out.name}", stored, cameras)
+        _write_card(aside, run_path, form, repo or f"ORG/{_hub_name(out.name)}", stored, cameras)
         put(aside, out)
     return ExportReport(
         str(out),
@@ -273,6 +274,11 @@ def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: PolicyMeta)
 def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
     """LeRobot's names of the pictures; a dataset's own, such as `observation.image`, stay."""
     return tuple(lerobot_folder.picture_key(name) for name in cameras)
+
+
+def _hub_name(name: str) -> str:
+    """A folder's name as a repository of the hub may be called, for commands on the card."""
+    return re.sub(r"[^A-Za-z0-9_.]+|\.{2,}", "-", name).strip("-.") or "NAME"
 
 
 def _write_card(

@@ -163,7 +163,7 @@ for _tag, _pattern, _first in (
 
 def dump(value: Any) -> str:
     """Plain values as YAML that `parse` reads back unchanged; keys keep their order."""
-    return yaml.dump(value, Dumper=_Dumper, sort_keys=False)
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def parse(text: str, source: str) -> tuple[Any, list[Problem]]:

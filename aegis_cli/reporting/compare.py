@@ -229,7 +229,10 @@ def _runs(path: Path) -> Iterator[Path]:
         raise AegisError(
             f"'{path}' is no run of a policy" if there else f"nothing is at '{path}'",
             "folders that aegis train wrote, or one that aegis run made of a recipe",
-            "aegis inspect shows studies and streams" if there else "check the path",
+            "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
+            "--baseline MODEL"
+            if there
+            else "check the path",
         )
     yield path
 

@@ -16,7 +16,7 @@ from aegis_cli import methods, recipes, sim
 from aegis_cli.anchors import measure
 from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import OnEvent, Progress, Warned
 from aegis_cli.data import mixture
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
@@ -581,11 +581,18 @@ class PolicyRunner:
         """
         if self.goes_on(label, key):
             return
-        moved = run_folder.clear(self.folder / label, ours=self.has_begun(label))
+        out, begun_record = self.folder / label, f"{label}/{BEGUN}"
+        begun = self.records.key_of(begun_record)
+        # Of `--overwrite` nothing is noted any more, and nobody has to be told.
+        if begun and begun != digest(key) and (out / "recipe.yaml").exists():
+            changed = ", ".join(self.records.changed(begun_record, key))
+            other = f"another {changed}" if changed else "other settings or inputs"
+            on_event(Warned("train", f"'{out}' was trained with {other}: it is trained anew"))
+        moved = run_folder.clear(out, ours=begun is not None)
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
         self.records.forget(f"{label}/train")
-        self.records.keep(f"{label}/{BEGUN}", key, [])
+        self.records.keep(begun_record, key, [])
 
     def has_begun(self, label: str) -> bool:
         """Whether it is written down that the cell's run was begun here."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,14 @@ def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _parts(key: Any) -> dict[str, str]:
+    """sha256 of each thing that a stage reads, and the version that reads it, by name."""
+    if not isinstance(key, Mapping):
+        return {}
+    parts = {name: hashlib.sha256(files.canonical(value).encode()) for name, value in key.items()}
+    return {name: part.hexdigest() for name, part in parts.items()} | {"version": __version__}
 
 
 def refuse_unfinished(folder: Path, command: str) -> None:
@@ -102,7 +110,8 @@ class StageRecords:
         if before is None:
             return "has not run yet"
         if before != digest(key):
-            return "what it reads has changed: keys of the recipe, files or the version"
+            changed = ", ".join(self.changed(stage, key))
+            return f"what it reads has changed: {changed or 'keys of the recipe, files or the version'}"
         # The key first, because outputs may be gigabytes to read.
         kept, found = self._record(stage)["outputs"], self._hashes(outputs)
         for name in sorted(kept.keys() | found.keys()):
@@ -147,10 +156,16 @@ class StageRecords:
         """Digest of what the stage read when it ran; None if it never did."""
         return self._record(stage).get("key")
 
+    def changed(self, stage: str, key: Any) -> list[str]:
+        """The names of what the stage reads that was another when it ran, as far as it is known."""
+        then, now = self._record(stage).get("parts", {}), _parts(key)
+        return sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
+
     def keep(self, stage: str, key: Any, outputs: list[Path]) -> None:
         """Record that the stage has run."""
-        label = stage.rpartition("/")[0]
-        self._of(label)[stage] = {"key": digest(key), "outputs": self._hashes(outputs)}
+        label, parts = stage.rpartition("/")[0], _parts(key)
+        noted = {"key": digest(key), "outputs": self._hashes(outputs)}
+        self._of(label)[stage] = noted | ({"parts": parts} if parts else {})
         files.make_folder(self._path(label).parent)
         files.save_json(self._path(label), self._of(label))
 

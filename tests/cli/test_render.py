@@ -38,7 +38,7 @@ from aegis_cli.evaluation.open_loop import (
 from aegis_cli.evaluation.results import Result
 from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy, SiteSpectrum
-from aegis_cli.merging.merge import MergeReport
+from aegis_cli.merging.merge import MergePoint, MergeReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 from aegis_cli.studies.comparison import POLICY_BAR
 from aegis_cli.studies.metrics import Column as Declared
@@ -599,6 +599,23 @@ def test_a_merge_all_the_way_back_keeps_none_of_the_displacement(
     )
     shown = " ".join(text_of(render.merge(report)).split())
     assert (f"kept {said}" in shown) if said else "kept" not in shown
+
+
+def test_the_probe_of_a_merge_asks_what_the_sweep_has_asked() -> None:
+    """Without its set the command asks a Hugging Face model about scenes that we have drawn."""
+    point = MergePoint(0.4, 0.6, 0.9, 0.5, (-1.0, 2.0))
+    asked: list[tuple[str | None, str | None, str]] = [
+        ("my set.jsonl", "{} Be brief.", " --vqa 'my set.jsonl' --ask '{} Be brief.'"),
+        ("scenes", "{}", ""),
+    ]
+    for vqa, ask, said in asked:
+        report = MergeReport(
+            *("linear", 0.01, "tuned", "vlm", 0.4, 0.6, 1.0, True, "merged", 18, 1.0, (point,)),
+            vqa=vqa,
+            ask=ask,
+        )
+        last = text_of(render.merge(report)).splitlines()[-1].strip()
+        assert last.endswith(f"aegis probe merged --baseline vlm{said}")
 
 
 def test_a_merge_is_told_without_what_was_not_measured() -> None:

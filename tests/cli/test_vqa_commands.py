@@ -13,11 +13,12 @@ from samples.small_run import recipe
 from samples.vqa_files import row, write_jsonl, write_official
 
 from aegis_cli.anchors import measure
+from aegis_cli.cli import question_sets
 from aegis_cli.common import artifacts, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import bootstrap_interval
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor, Probe, Rollout
 from aegis_cli.studies import pipeline, policy_cells
 
@@ -254,3 +255,14 @@ def test_a_bad_set_stops_a_recipe_before_anything_is_made(
     with pytest.raises(AegisError, match="nothing.jsonl', which does not exist"):
         pipeline.run(small, tmp_path / "runs")
     assert not made and not (tmp_path / "runs").exists()
+
+
+def test_a_set_that_a_shell_would_split_is_quoted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    of_run = replace(recipe("x"), probe=Probe(vqa=("one.jsonl", "my set.jsonl")))
+    monkeypatch.setattr(results, "run_of", lambda path: path)
+    monkeypatch.setattr(results, "recipe_of", lambda run: of_run)
+    assert question_sets.chosen(str(tmp_path), None, None, False, None).vqa == "one.jsonl"
+    said = " ".join(capsys.readouterr().err.split())
+    assert "asked are the questions of 'one.jsonl'" in said and "--vqa 'my set.jsonl'" in said

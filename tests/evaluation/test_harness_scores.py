@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from aegis_cli.cli.app import app
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import Warned
+from aegis_cli.common.events import Progress, Warned
 from aegis_cli.data.vqa.metrics import mean_loss_interval
 from aegis_cli.evaluation import harness_scores
 
@@ -269,3 +269,24 @@ def test_a_large_drop_is_told_from_a_small_one(tmp_path: Path) -> None:
     report = harness_scores.run(tmp_path / "a", tmp_path / "b", 5.0, "upper")
     assert report.passed is False and report.scores[0].drop_interval[0] > 5
     assert harness_scores.run(tmp_path / "a", tmp_path / "b", 10.0, "upper").passed is True
+
+
+def test_a_file_without_a_line_is_named(two: tuple[Path, Path]) -> None:
+    lmms(two[1], "textvqa_val", [])
+    with pytest.raises(AegisError, match=r"no question in .*samples_textvqa_val\.jsonl"):
+        harness_scores.run(*two)
+
+
+def test_a_file_of_another_name_is_not_told_to_have_no_samples(two: tuple[Path, Path]) -> None:
+    path = next(two[0].rglob("*.jsonl")).rename(two[0] / "before.jsonl")
+    with pytest.raises(AegisError, match=r"before\.jsonl', whose name .*\n.*_samples_TASK\.jsonl"):
+        harness_scores.run(path, two[1])
+
+
+def test_reading_is_told_to_its_end(two: tuple[Path, Path], monkeypatch: Any) -> None:
+    monkeypatch.setattr(harness_scores, "_TOLD_BYTES", 500)
+    told: list[Any] = []
+    harness_scores.run(*two, on_event=told.append)
+    size = sum(path.stat().st_size for each in two for path in each.rglob("*.jsonl"))
+    shares = [(event.done, event.total) for event in told if isinstance(event, Progress)]
+    assert len(shares) > 2 and shares == sorted(set(shares)) and shares[-1] == (size, size)

@@ -302,6 +302,62 @@ def test_an_exception_in_a_backward_pass_ends_no_training(anchors: dict[str, Pat
     assert torch.equal(vector(model), vector(one))
 
 
+class FailsOnce(torch.autograd.Function):
+    """Gives back its input, and fails in the first backward pass that comes to it."""
+
+    failed = False
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        if not FailsOnce.failed:
+            FailsOnce.failed = True
+            raise MemoryError
+        return gradient
+
+
+class WithLoss(nn.Module):
+    """Calls the model, and makes the loss of its scores, as Hugging Face models do."""
+
+    def __init__(self, model: Vlm) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        return {"loss": FailsOnce.apply(self.model(pixels, ids, mask)).square().mean()}
+
+
+def test_a_backward_pass_may_fail_before_it_comes_to_the_first_parameter(
+    anchors: dict[str, Path],
+) -> None:
+    FailsOnce.failed = False
+    model, guard = guarded("aegis", anchors)
+    policy = WithLoss(model)
+    guard.automatic(mask="mask", around=policy)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    with pytest.raises(MemoryError):
+        policy(*batch(0))["loss"].backward()
+    for seed in (1, 2):
+        policy(*batch(seed))["loss"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    assert len(guard.ledger) == 2
+
+
+def test_a_gradient_of_the_inputs_alone_takes_no_pass_away(anchors: dict[str, Path]) -> None:
+    """It ends well, and the loss of the same pass is still to go back."""
+    model, guard = automatic("aegis", anchors)
+    pixels, ids, mask = batch(0)
+    loss = model(pixels.requires_grad_(), ids, mask).square().mean()
+    torch.autograd.grad(loss, pixels, retain_graph=True)
+    refused(lambda: model(pixels, ids, mask), "a second forward pass")
+    loss.backward()
+    assert len(guard.ledger) == 1
+
+
 def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None:
     model, guard = automatic("aegis", anchors)
     plain_steps(model)
@@ -484,6 +540,7 @@ def test_calls_of_the_guard_in_an_automatic_loop(anchors: dict[str, Path]) -> No
     refused(lambda: guard.backward(loss), "automatic guard", "loss.backward()")
     refused(lambda: guard.step(torch.optim.SGD(model.parameters(), lr=0.1)), "automatic guard")
     refused(guard.automatic, "automatic guard")
+    refused(lambda: guard.watch(None).__enter__(), "guard.watch of an automatic guard")
 
 
 def test_a_name_in_place_of_the_module_whose_call_is_a_pass(anchors: dict[str, Path]) -> None:

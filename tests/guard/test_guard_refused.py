@@ -338,7 +338,62 @@ def test_losses_that_are_none(anchor: Path) -> None:
     loss = watched(guard, model, MASK)
     refused(lambda: guard.backward(loss.detach()), "without a graph")
     refused(lambda: guard.backward(loss.expand(3)), "[3]")
+    refused(lambda: guard.backward(loss.item()), "a loss that is a float", ".item()")
+    refused(lambda: guard.backward({"loss": loss}), "a loss that is a dict", "output.loss")
     guard.backward(loss)
+
+
+@pytest.mark.parametrize("method", ["aegis", "nullspace"])
+def test_what_is_stepped_is_no_optimizer(method: str, anchor: Path) -> None:
+    model, options = make(), {"vision": "vision", "energy": 1.0} if method == "nullspace" else {}
+    guard = Guard(model, anchor, LAYERS, method=method, **options)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    guard.backward(watched(guard, model, MASK))
+    scheduler = torch.optim.lr_scheduler.ConstantLR(optimizer)
+    for given, name in ((scheduler, "ConstantLR"), (None, "NoneType")):
+        refused(lambda given=given: guard.step(given), f"guard.step of a {name}")
+    guard.step(optimizer)
+
+
+def test_a_batch_in_the_place_of_its_mask(anchor: Path) -> None:
+    guard = Guard(make(), anchor, LAYERS)
+    given = {"attention_mask": MASK}
+    refused(lambda: guard.watch(given).__enter__(), "a mask that is a dict", "['attention_mask']")
+
+
+def test_a_second_guard_is_refused_before_its_backward_pass(anchor: Path) -> None:
+    """The first one's has freed the graph that both were to go through."""
+    model = make()
+    one, other = Guard(model, anchor, LAYERS), Guard(model, anchor, LAYERS)
+    with one.watch(MASK), other.watch(MASK):
+        loss = task_loss(model, 0)
+    one.backward(loss)
+    refused(lambda: other.backward(loss), "two guards at work", "guard.remove()")
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_gradients_that_are_never_cleared(is_automatic: bool, anchor: Path) -> None:
+    """Every step would be made of all batches so far, and the ledger have one row for all."""
+    model = make()
+    guard = Guard(model, anchor, LAYERS)
+    if is_automatic:
+        guard.automatic(mask="mask")
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+
+    def go_back(seed: int) -> None:
+        if is_automatic:
+            task_loss(model, seed).backward()
+        else:
+            guard.backward(watched(guard, model, MASK, seed=seed))
+
+    go_back(0)
+    optimizer.step()
+    refused(lambda: go_back(1), "not cleared after the step", "optimizer.zero_grad()")
+    guard.discard()
+    optimizer.zero_grad()
+    go_back(2)
+    optimizer.step()
+    assert len(guard.ledger) == 2
 
 
 @pytest.mark.parametrize("change", ["clipped", "added to"])

@@ -416,7 +416,8 @@ def test_a_hugging_face_pair(
     for name, found in merged.items():
         torch.testing.assert_close(found, (pre[name] + post[name]) / 2, rtol=0, atol=1e-5)
     card = (tmp_path / "line" / "README.md").read_text()
-    assert "merge of strength 0.5" in card and "50.0 % of the displacement" in card
+    assert "merge of strength 0.5" in card
+    assert "50.0 % of the displacement of its maps.\n" in card
     report = merge(*words, 1, "--task-vqa", "scenes", "--out", tmp_path / "two-sided")
     assert 0 < report["kept"] < 1
     assert aegis("probe", tmp_path / "two-sided", "--questions", 7)[0] == 0

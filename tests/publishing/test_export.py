@@ -185,6 +185,12 @@ def test_a_checkpoints_layout_has_the_recipe_that_its_card_names(
     assert checkpoint.load_policy(tmp_path / "x")[1]["task"] == "reach"
 
 
+def test_the_card_calls_the_policy_as_the_hub_can(run_folder: Path, tmp_path: Path) -> None:
+    export.run(run_folder, tmp_path / "für x -- y", "lerobot")
+    card = (tmp_path / "für x -- y" / "README.md").read_text(encoding="utf-8")
+    assert "--policy.path=ORG/f-r-x-y " in card
+
+
 def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None:
     export.run(exported, tmp_path / "again")
     one, other = (folder / "model.safetensors" for folder in (exported, tmp_path / "again"))

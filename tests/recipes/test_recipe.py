@@ -125,6 +125,12 @@ def test_round_trip_of_small_and_large_numbers(value, tmp_path):
     assert load(write(tmp_path, to_yaml(recipe))) == recipe
 
 
+def test_a_name_of_any_language_is_written_as_it_is(tmp_path):
+    recipe = Recipe(name="x", backbone="models/für Möbel")
+    assert "backbone: models/für Möbel\n" in to_yaml(recipe)
+    assert load(write(tmp_path, to_yaml(recipe))) == recipe
+
+
 @pytest.mark.parametrize("name", ["no", "1e3", "010", "2024-01-01", "null", "true", "12"])
 def test_round_trip_of_names_that_look_like_something_else(name, tmp_path):
     assert load(write(tmp_path, to_yaml(Recipe(name=name)))).name == name

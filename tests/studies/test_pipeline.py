@@ -481,8 +481,13 @@ def test_another_backbone_reruns_all_but_the_demonstrations(
 def test_other_demonstrations_rerun_all_but_the_anchor(
     small: Recipe, root: Path, calls: Counter[str]
 ) -> None:
-    pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root)
+    events: list[Any] = []
+    pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root, events.append)
     assert calls == PER_METHOD | {"demos": 1}
+    told = {e.stage: e.text for e in events if isinstance(e, Warned) and "anew" in e.text}
+    assert told.keys() == {f"{method}/train" for method in METHODS}
+    said = f"'{root / 'small/naive'}' was trained with another demos: it is trained anew"
+    assert told["naive/train"] == said
 
 
 def test_an_anchor_on_robot_frames_is_measured_anew_with_the_demonstrations(
@@ -652,15 +657,16 @@ def test_a_run_interrupted_under_other_settings_is_not_continued(
 ) -> None:
     other = replace(small, train=replace(small.train, expert_lr=5e-3))
 
-    def stop(event: Progress) -> None:
-        if event.stage == "naive/train" and event.done == 3:
+    def stop(event: Event) -> None:
+        if isinstance(event, Progress) and event.stage == "naive/train" and event.done == 3:
             raise Stop
 
     with pytest.raises(Stop):
         pipeline.run(other, root, stop)
-    events: list[Progress] = []
+    events: list[Event] = []
     pipeline.run(small, root, events.append)
-    assert [e.done for e in events if e.stage == "naive/train"] == [0, 1, 2, 3, 4]
+    steps = [e.done for e in events if isinstance(e, Progress) and e.stage == "naive/train"]
+    assert steps == [0, 1, 2, 3, 4]
     assert (
         recipes.load(root / "small" / "naive" / "recipe.yaml").train.expert_lr
         == small.train.expert_lr

@@ -57,7 +57,8 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
             parts.append(Text(f"nothing has learned of {_as_ranges(report.frozen)}\n"))
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "checkpoint", "ledger"):
-        parts.append(Text("no anchor gradient in this method: no energy of the gradient is shed"))
+        found = "no anchor gradient was taken in any step: no energy of the gradient is shed"
+        parts.append(Text(found))
     return Group(*parts)
 
 

@@ -59,7 +59,9 @@ def _points(report: Any) -> Any:
 def _next(report: Any) -> str:
     """What to do with the finding: a strength that was chosen has to be judged on other data."""
     if report.out is not None:
-        probe = commands.aegis("probe", report.out, "--baseline", report.base)
+        asked = [] if report.vqa in (None, "scenes") else ["--vqa", report.vqa]
+        asked += [] if report.ask in (None, "{}") else ["--ask", report.ask]
+        probe = commands.aegis("probe", report.out, "--baseline", report.base, *asked)
         return f"now ask the test questions: {probe}"
     if report.passed is False:
         return "no strength of this sweep passes: try stronger ones with --sweep"

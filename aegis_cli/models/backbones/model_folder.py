@@ -31,7 +31,7 @@ _PROCESSOR_SUFFIXES = (".json", ".jinja", ".txt", ".model")
 _STORED = {"BF16": "bfloat16", "F16": "float16"}  # safetensors' names
 GIVE = (
     "--backbone MODEL (anchor, bench), --set backbone=MODEL (train, run; of a stream's "
-    "encoder, encoder=MODEL), or as it is (probe)"
+    "encoder, encoder=MODEL), --baseline MODEL or as it is (probe)"
 )
 
 
