@@ -22,6 +22,7 @@ BEGUN = "begun"  # the stage of a run that has been started, finished or not
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
+    # Canonical JSON: equal keys give equal text, in whatever order they were put together.
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -95,6 +96,7 @@ class StageRecords:
         if same_key and self._record(stage)["outputs"] == self._hashes(outputs):
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
+        # Noted only afterwards: a stage that was interrupted is not up to date.
         make(self.named(stage))
         self.keep(stage, key, outputs)
 
@@ -126,6 +128,7 @@ class StageRecords:
             )
 
         if name is None:
+            # A slash, as in `suite/cartpole-swingup`, would be a folder.
             name = f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
         return self.shared(name, key, make)
 
@@ -145,6 +148,7 @@ class StageRecords:
         for path in [self._path(""), *sorted((self.folder / "stages").rglob("*.json"))]:
             if path.is_file():
                 begun = [stage for stage in _load(path) if stage.endswith(f"/{BEGUN}")]
+                # No digest is the empty text, so that the key of no stage is equal to it.
                 files.save_json(path, {stage: {"key": "", "outputs": {}} for stage in begun})
         self._records.clear()
 
