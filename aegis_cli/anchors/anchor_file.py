@@ -66,16 +66,17 @@ def _followers(anchor: Anchor) -> dict[str, dict[str, str]]:
 def _tensors(anchor: Anchor) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     if anchor.image:
+        # Every layer sees the same tokens, so that the first one's counts are those of all.
         tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count], device="cpu")
         for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
             for i, layer in enumerate(layers):
-                tensors |= {
-                    f"layers.{i}.{name}.mean": layer.mean,
-                    f"layers.{i}.{name}.var": layer.var,
-                }
+                tensors[f"layers.{i}.{name}.mean"] = layer.mean
+                tensors[f"layers.{i}.{name}.var"] = layer.var
     for part in _SPECTRA:
         spectra = getattr(anchor, part)
         followers = shared(spectra)
+        # One type for all of a part: half precision as soon as a map was too wide to be summed
+        # whole, as those of large models are.
         dtype = torch.float32 if all(s.whole for s in spectra.values()) else torch.float16
         for site, spectrum in spectra.items():
             if site not in followers:
@@ -90,16 +91,15 @@ def _spectrum_tensors(site: str, spectrum: Spectrum, dtype: torch.dtype) -> dict
         dtype: of the eigenvectors of a dense map.
     """
     values, vectors = spectrum.values, spectrum.vectors
-    if vectors is None:
+    if vectors is None:  # a table's
         return {f"{site}.values": values}
-    if vectors.ndim == 3:
+    if vectors.ndim == 3:  # [D, m, m] of a normalisation, with m of 2 at most: small anyway
         return {f"{site}.values": values, f"{site}.vectors": vectors.float()}
     found = {f"{site}.values": values, f"{site}.vectors": vectors.to(dtype)}
     if not spectrum.whole:
-        found |= {
-            f"{site}.values": values[: vectors.shape[1]],
-            f"{site}.rest": spectrum.rest.reshape(1),
-        }
+        # The values without an eigenvector are all the same one, which is written once.
+        found[f"{site}.values"] = values[: vectors.shape[1]]
+        found[f"{site}.rest"] = spectrum.rest.reshape(1)
     return found
 
 
@@ -138,11 +138,11 @@ def from_artifact(artifact: artifacts.Artifact) -> Anchor:
 def _spectra(
     part: str, tensors: artifacts.Tensors, followers: Mapping[str, str]
 ) -> dict[str, Spectrum]:
-    found = {
-        name.removesuffix(".values"): _spectrum(name.removesuffix(".values"), tensors)
-        for name in tensors
-        if name.startswith(part) and name.endswith(".values")
-    }
+    found = {}
+    for tensor in tensors:
+        if tensor.startswith(part) and tensor.endswith(".values"):  # every spectrum has values
+            site = tensor.removesuffix(".values")
+            found[site] = _spectrum(site, tensors)
     # One object for all that share it, so that it is in memory once.
     found |= {name: found[leader] for name, leader in followers.items() if leader in found}
     return {name.removeprefix(part): spectrum for name, spectrum in found.items()}
@@ -151,6 +151,7 @@ def _spectra(
 def _spectrum(site: str, tensors: artifacts.Tensors) -> Spectrum:
     values, vectors = tensors[f"{site}.values"], tensors.get(f"{site}.vectors")
     if vectors is not None and vectors.dtype == torch.float16:
+        # Rounded columns are no longer orthonormal, and U U^T would be no projection.
         vectors = orthonormal(vectors.float())
     if vectors is None or f"{site}.rest" not in tensors:
         return Spectrum(values, vectors)
@@ -183,7 +184,7 @@ def to_device(anchor: Anchor, device: torch.device) -> Anchor:
 
 
 def _moved(spectra: Mapping[str, Spectrum], device: torch.device) -> dict[str, Spectrum]:
-    moved: dict[int, Spectrum] = {}  # each once, by its id
+    moved: dict[int, Spectrum] = {}  # each once, by its id: maps that share one go on sharing it
     for spectrum in spectra.values():
         if id(spectrum) not in moved:
             vectors = None if spectrum.vectors is None else spectrum.vectors.to(device)

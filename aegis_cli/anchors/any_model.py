@@ -210,6 +210,7 @@ class Measurement(Removable):
                 "run the questions first",
             )
         image, text = self._moments.image, self._moments.text
+        # The sums stay, so that more passes may follow and `anchor` may be asked again.
         inputs = {} if self._inputs is None else self._inputs.spectra(self._energy)
         curvature = {} if self._curvature is None else self._curvature.spectra(self._energy)
         return Anchor(image, text, inputs, curvature=curvature)

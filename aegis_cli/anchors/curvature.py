@@ -66,7 +66,7 @@ class AnswerEntropy:
     def add(self, scores: Tensor) -> None:
         """Count the words that these scores [n, V] predict."""
         chances = scores.float().softmax(-1)
-        self.nats += float(torch.special.entr(chances).sum())
+        self.nats += float(torch.special.entr(chances).sum())  # -p log p, and 0 where p is 0
         self.words += len(scores)
 
     def mean(self, ranks: Ranks = ALONE) -> float:
@@ -166,6 +166,8 @@ class CurvatureRecorder:
         self._graph.lone = []
         with contextlib.ExitStack() as hooks:
             for name, module in structure.owning(self._model).items():
+                # It is a map to be measured, or a module whose call shows where its parameters
+                # enter the graph, or one whose parameters others use: they are ends themselves.
                 site = self._sites.get(name)
                 if site is not None:
                     after = partial(self._follow_call, site)
@@ -210,6 +212,7 @@ class CurvatureRecorder:
         # The gradients at the maps' outputs are all that counts. Asking for those at the entries
         # leaves out the parameters' own, half of the work and as much memory as the model.
         ends = [*self._graph.entries, *self._graph.lone]
+        # What it returns is dropped: the hooks on the maps' outputs have seen all they need.
         # pyrefly: ignore[no-matching-overload]: torch takes both kinds of ends in one list
         torch.autograd.grad(total, ends, retain_graph=keep, allow_unused=True)
         for reading in self._open:  # an answer may not depend on all that read the same
@@ -285,6 +288,7 @@ class CurvatureRecorder:
             return
         self._note_entry(module, arguments, named, output)
         read = arguments[0] if arguments else next(iter(named.values()))
+        # Readers of one tensor share its `Weighed`, and with it one input factor.
         if self._last is not None and self._last.serves(site, module, read):
             self._last.sites.append(site)
         else:
@@ -295,12 +299,13 @@ class CurvatureRecorder:
     def _count(self, reading: Weighed, site: str, module: nn.Module, gradient: Tensor) -> None:
         """Add what one call of the module says by the gradient at its output."""
         _refuse_changed(f"what '{site}' read", reading.x, reading.version)
-        x, g = inputs.dense_rows(module, reading.x), _output_rows(module, gradient)
-        g = widened(g)
+        x = inputs.dense_rows(module, reading.x)  # [n, d], with a 1 at the end for a bias
+        g = widened(_output_rows(module, gradient))  # [n, o]
         # |x|^2 g g^T is the second moment of the row |x| g, and so for the other factor.
         self._sums.note(f"{site}.{SIDES[0]}")
         self._sums.add_rows([f"{site}.{SIDES[1]}"], g * x.norm(dim=1, keepdim=True))
         size = g.norm(dim=1, keepdim=True)
+        # |(g1, g2)|^2 = |g1|^2 + |g2|^2: the outputs of all readers side by side.
         reading.weight = size if reading.weight is None else torch.hypot(reading.weight, size)
         reading.arrived += 1
         if reading.arrived == 1:
@@ -312,7 +317,7 @@ class CurvatureRecorder:
     def _count_inputs(self, reading: Weighed) -> None:
         """Add |g|^2 x x^T of what was read, when a backward pass has come to all its readers."""
         assert reading.weight is not None
-        rows = inputs.dense_rows(reading.module, reading.x.detach()) * reading.weight
+        rows = inputs.dense_rows(reading.module, reading.x.detach()) * reading.weight  # |g| x
         names = [f"{site}.{SIDES[0]}" for site in reading.sites]
         self._sums.add_rows(names, rows, reading.of_convolution)
         reading.arrived, reading.weight = 0, None
@@ -425,7 +430,7 @@ def _uniform(seed: int, question: Tensor) -> Tensor:
     Args:
         question: [n], the number of the question that each word answers.
     """
-    own, words = question.unique_consecutive(return_counts=True)
+    own, words = question.unique_consecutive(return_counts=True)  # a question's words are together
     found = []
     for number, count in zip(own.tolist(), words.tolist(), strict=True):
         found.append(np.random.default_rng((seed, number)).random(count))
@@ -449,7 +454,9 @@ def _log_likelihood(scores: Tensor, uniform: Tensor) -> Tensor:
             "finite scores; minus infinity for a word that is never said",
             f"{FINITE}, and see that its weights are finite",
         )
-    below = chances.double().cumsum(-1)
+    below = chances.double().cumsum(-1)  # [n, V]
+    # Divided by the last sum, which rounding may leave below 1, so that a word is found for every
+    # number. `right`, so that a word of chance 0 is never drawn, not even by the number 0.
     drawn = torch.searchsorted(below / below[:, -1:], uniform[:, None], right=True)  # [n, 1]
     drawn = drawn.to(scores.device)
     return scores.float().log_softmax(-1).gather(1, drawn).sum()

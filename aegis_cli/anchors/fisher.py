@@ -38,13 +38,14 @@ def measure(
     rows = spread.rows(len(asked.questions), samples)
     on_event(Progress("anchor fisher", 0, samples, "samples"))
     for done, row in enumerate(rows.tolist(), start=1):
-        if (done - 1) % ranks.count == ranks.rank:
+        if (done - 1) % ranks.count == ranks.rank:  # the processes take turns
             likelihood = _log_likelihood(model, asked, row)
             wanted = list(parameters.values())
+            # Not by `backward`, which would leave a gradient in every parameter.
             gradients = torch.autograd.grad(likelihood, wanted, allow_unused=True)
             for name, gradient in zip(parameters, gradients, strict=True):
                 if gradient is not None:
-                    total[name] += gradient.double().square()
+                    total[name] += gradient.double().square()  # widened before it is squared
         if done % 50 == 0 or done == samples:
             on_event(Progress("anchor fisher", done, samples, "samples"))
     ranks.add_up(list(total.values()))

@@ -96,6 +96,7 @@ class LayerHooks:
                 "one at a time",
                 "close the first before the second",
             )
+        # `_graph`: whether hidden states are to have one, which a layer may fail to give them.
         self._calls, self._graph = [[] for _ in self._names], torch.is_grad_enabled()
         self._noted = set()
         try:
@@ -172,7 +173,8 @@ class LayerHooks:
                 'gradient_checkpointing_kwargs={"use_reentrant": False}; in the place of '
                 "torch.no_grad(), layer.requires_grad_(False) before the guard is made",
             )
-        self._calls[index].append(first.flatten(1, -2))  # [B, ..., D] -> [B, T, D]
+        # [B, ..., D] -> [B, T, D], also of a layer that returns [B, H, W, D].
+        self._calls[index].append(first.flatten(1, -2))
 
     def _joined(self, name: str, calls: list[Tensor]) -> Tensor:
         if not calls:
@@ -190,6 +192,7 @@ class LayerHooks:
                 "one batch per watched block",
                 "watch one forward pass at a time",
             )
+        # A layer may be called for some of the tokens at a time, as for a cached prefix first.
         return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
 
 
@@ -285,6 +288,8 @@ class SharedInput:
 
     def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
         """Whether this is also what a module reads that has been called with x."""
+        # The same object: equal values in another tensor may be changed by themselves later. With a
+        # bias the rows end with a 1, so that readers with and without one have other rows.
         return (
             x is self.x
             and not self.of_convolution
@@ -314,7 +319,8 @@ def watch_uses(model: nn.Module, report: Report) -> Generator[None]:
     tensors.
     """
     owners = structure.owners(model)
-    inside: list[str] = []  # the modules whose forward is running, the innermost last
+    # Only modules that own parameters are pushed; the innermost is the last.
+    inside: list[str] = []
 
     def used(
         function: Callable[..., Any], parameter: nn.Parameter, arguments: tuple[Any, ...]

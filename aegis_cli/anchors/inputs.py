@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -56,6 +57,14 @@ class Drawn:
 
     share: float = 1.0
     seed: int = 0
+
+    def of_process(self, rank: int) -> Drawn:
+        """What the process of this number draws: the first as it would alone, others otherwise."""
+        if rank == 0:
+            return self
+        # A generator on the CPU takes 32 bits of its seed, so that the number has to be mixed in.
+        mixed = np.random.SeedSequence([self.seed, rank]).generate_state(1)
+        return replace(self, seed=int(mixed[0]))
 
     def generator(self) -> torch.Generator:
         return torch.Generator().manual_seed(self.seed)
@@ -136,6 +145,7 @@ class InputRecorder:
             if self._follow_uses:
                 hooks.enter_context(watch_uses(self._model, self._count_use))
             for name, site in modules_of_sites(self._model, self._maps).items():
+                # Before the call: a module may change in place what it was given.
                 before = partial(self._count_call, name, site)
                 module = self._model.get_submodule(name)
                 hooks.callback(module.register_forward_pre_hook(before, with_kwargs=True).remove)
@@ -234,6 +244,7 @@ class InputRecorder:
         if any(row is parameter for row in self._lone.values()):
             return
         site = next((name for name in names if name in self._maps.kinds), names[0])
+        # x W^T without a bias, with a table for W: a head that is tied to the word embeddings.
         scores = (
             function is F.linear
             and len(arguments) == 2
@@ -284,11 +295,11 @@ class InputRecorder:
         batch, length = self._mask.shape
         if x.ndim > 3 and x.shape[:2] == self._mask.shape:  # several rows a token, as of heads
             self._covered[name] = self._covered.get(name, 0) + length
-            per_token = x.shape[2:-1].numel()
+            per_token = x.shape[2:-1].numel()  # of [B, T, ..., d]
             return self._mask.flatten().repeat_interleave(per_token).to(x.device)
         # A map that is called again after all T tokens begins with the first of them again.
         begun, rows = self._covered.get(name, 0) % length, x.shape[:-1].numel()
-        tokens = rows // batch
+        tokens = rows // batch  # of each text; x is [B, tokens, d], or flat, [B * tokens, d]
         if rows % batch or x.shape[0] not in (batch, rows) or begun + tokens > length:
             raise _misfit(name, x.shape, self._mask.shape)
         self._covered[name] = self._covered.get(name, 0) + tokens
@@ -304,6 +315,7 @@ class InputRecorder:
             whole = torch.cat([ids.flatten(1) for ids in read], dim=1)  # [B, tokens]
             if whole.shape == self._mask.shape:
                 read = [whole[self._mask.to(whole.device)]]
+        # If the calls do not make up the tokens of the mask, all that was read counts.
         for ids in read:
             self._sums.add(site, *moment(self._modules[site], ids))
 
@@ -337,7 +349,7 @@ def measure(
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
-        own = replace(drawn, seed=drawn.seed + (ranks.rank << 32))
+        own = drawn.of_process(ranks.rank)
         recorder = InputRecorder(model, maps, follow_uses=False, whole=whole, drawn=own)
         with recorder.watch(None):
             for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
@@ -394,6 +406,7 @@ def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
     rows = widened(rows_of(module, x))
     if getattr(module, "bias", None) is None:
         return rows
+    # W x + b = (W, b) (x, 1): a bias is one more column, whose input is always 1.
     return torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)
 
 
@@ -401,6 +414,7 @@ def dense_width(module: nn.Module) -> int | None:
     """The width d of these rows; None for a module that is neither of both."""
     if not isinstance(module, DENSE):
         return None
+    # A weight is [o, d], or a convolution's [o, c, k, k], of which an output reads c * k * k.
     return module.weight[0].numel() + (module.bias is not None)
 
 

@@ -225,6 +225,7 @@ def _on_frames(
         demos, None, 0, selection, model.image_size, on_event=on_event, cache=False
     )
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
+    # Drawn at random and read in their order, as videos are decoded.
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
     start = time.perf_counter()
 

@@ -93,6 +93,7 @@ def measure_passes(
         ranks: the processes that take turns in passing a batch.
     """
     recorder, done = MomentRecorder(), 0
+    # Whole batches in turns: merging is associative, so that who passed which does not matter.
     own = itertools.islice(batches, ranks.rank, None, ranks.count)
     on_event(Progress("anchor", done, total, "samples"))
     with prefetch.for_device(lambda batch: model.process(*read(batch)), own, model.device) as ready:

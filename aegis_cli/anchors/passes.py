@@ -55,12 +55,13 @@ def groups(
     found: list[list[str]] = []
     left = 0
     for sites in parents.values():
+        # A lone row is no module and has no sum.
         needed = sum(size(modules[site]) for site in sites if site in modules)
         if not found or (memory is not None and needed > left):
             found.append([])
             left = memory or 0
         found[-1] += sites
-        left -= needed
+        left -= needed  # below 0 after a module that is too large by itself: the next group begins
     for number, sites in enumerate(found, start=1):
         kinds = {site: whole.kinds[site] for site in sites}
         heads = {table: head for table, head in whole.heads.items() if table in kinds}
@@ -89,6 +90,7 @@ def run(
     on_event(Progress(stage, 0, own.stop - own.start, "images"))
     for first in range(own.start, own.stop, step):
         last = min(first + step, own.stop)
+        # Numbers of the questions about these images, wherever they stand in the set.
         rows = ((image_of >= first) & (image_of < last)).nonzero().squeeze(1)
         images = tensors(asked.images[first:last])
         questions = [asked.questions[i] for i in rows.tolist()]

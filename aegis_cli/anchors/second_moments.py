@@ -53,6 +53,7 @@ class SecondMoments:
 
     def add_rows(self, names: Iterable[str], rows: Tensor, convolution: bool = False) -> None:
         """Add x x^T of rows x [n, d] that these maps have read."""
+        # Whichever of them came first, it is the same sum.
         readers = tuple(sorted(names))
         if readers not in self._rows:
             self._rows[readers] = moment_sums.make(
@@ -70,6 +71,7 @@ class SecondMoments:
         """
         if not ranks.several:
             return
+        # Sums are added by their place, so that all processes have to have the same in one order.
         names = [list(self._rows), list(self._small), list(self._counts)]
         if any(theirs != names for theirs in ranks.gathered(names)):
             raise AegisError(
@@ -116,8 +118,13 @@ class SecondMoments:
             AegisError: a sum that is not finite.
         """
         names = [name for name in self._counts if name not in leave_out]
+        # A map may have read alone in one pass and together with others in another. Its moment is
+        # the total of all sums that it is a reader of, and the same sums give the same spectrum.
         sums_of = {name: tuple(r for r in self._rows if name in r) for name in names}
-        last_use = {readers: name for name, sums in sums_of.items() for readers in sums}
+        last_use: dict[Readers, str] = {}
+        for name, sums in sums_of.items():
+            for readers in sums:
+                last_use[readers] = name
         shared: dict[tuple[Readers, ...], Spectrum] = {}
         found: dict[str, Spectrum] = {}
         with devices.single_threaded():  # the eigensolver waits for its own threads
@@ -146,6 +153,7 @@ def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
     first: dict[int, str] = {}
     followers = {}
     for name, spectrum in spectra.items():
+        # One object for all that share it: equal values would not tell, and take long to compare.
         leader = first.setdefault(id(spectrum), name)
         if leader != name:
             followers[name] = leader

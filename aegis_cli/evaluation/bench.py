@@ -108,6 +108,7 @@ def run(
         "anchor": lambda: _moments(model, images, texts),
     }
     taken = bench_runs.take_turns("bench anchor", passes, repeats, on_event)
+    # One anchor for all methods, with the parts that any of them reads.
     needed = {part for name in recipes for part in methods.get(name).needs}
     settings = Anchor(
         samples=_SAMPLES, parts=tuple(sorted(needed)) or ("moments",), fisher_samples=7

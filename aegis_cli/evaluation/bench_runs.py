@@ -23,8 +23,6 @@ from aegis_cli.training.assemble import TrainingRun
 
 INSTRUCTION = "move the finger to the red target"
 _ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # A, P, and frames per episode
-
-
 NAIVE = "naive"  # what the others are measured against
 
 
@@ -77,7 +75,7 @@ def take_turns(
                 wait()
             start = time.perf_counter()
             part()
-            wait()
+            wait()  # a GPU's kernels are only queued when the call returns
             times[name].append(time.perf_counter() - start)
         on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
     return {name: statistics.median(taken[1:]) for name, taken in times.items()}
@@ -108,6 +106,7 @@ def beside(
     Returns:
         Medians over `rounds` rounds, after one that warms up.
     """
+    # As many steps for all as the longest turn has, rounded up to whole turns of each.
     most = max(one.in_turn for one in others.values())
     ratios: dict[str, list[float]] = {name: [] for name in others}
     step_s: list[float] = []
@@ -116,7 +115,7 @@ def beside(
         in_turn = others[name].in_turn
         count = math.ceil(most / in_turn) * in_turn
         own_s, reference_s = _alternating(others[name], reference, count)
-        if done > 0:
+        if done > 0:  # the first round warms up
             ratios[name].append(own_s / reference_s)
             step_s.append(reference_s / count)
         on_event(Progress(stage, number, len(turns), "turns"))
@@ -185,6 +184,7 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
         ignore,
     )
     run.policy.train()
+    # Frames come again where a batch is larger than the episode: only their number costs.
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     frames, device = run.demos.train[rows], run.policy.backbone.device
     batch = run.demos.batch(frames, recipe.train.chunk)

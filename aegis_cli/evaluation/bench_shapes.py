@@ -278,7 +278,7 @@ def _unless_full(work: Callable[..., T], *arguments: Any) -> tuple[T | None, boo
     except torch.OutOfMemoryError:
         return None, False
     if not devices.on_gpu():
-        return found, False
+        return found, False  # a process's peak never falls again
     gc.collect()
     torch.cuda.empty_cache()
     return found, torch.cuda.memory_allocated() <= _KEPT
@@ -315,7 +315,7 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
     prepared = run.policy.backbone.prepare(batch.images[:1], batch.instructions[:1])
     tokens = prepared.ids.shape[1]
     flop = counter.get_total_flops() // steps.in_turn
-    own = own and own / steps.in_turn
+    own = None if own is None else own / steps.in_turn
     return _Measured(statistics.median(times), needed, own, flop, tokens)
 
 
@@ -339,6 +339,8 @@ def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:
 
         return measured
 
+    # Where a training step calls the method: for the gradient, for the rates, and before and after
+    # the optimizer's step, where the weights are copied and the update is constrained.
     run.parts = replace(
         parts,
         pull=parts.pull and timed(parts.pull),
@@ -382,6 +384,7 @@ def _cost(found: _Measured | None, naive: _Measured, assumed: Peak | None) -> St
         return StepCost()
     mfu = None
     if assumed is not None:
+        # Operations that a step needs, of those that the device could have made meanwhile.
         mfu = min(found.flop, naive.flop) / (found.seconds * assumed.tflops * 1e12)
     return StepCost(
         step_s=found.seconds,

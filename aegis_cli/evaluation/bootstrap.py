@@ -88,8 +88,10 @@ def crossed_interval(seeds: Sequence[Units], seed: int = 0) -> tuple[float, floa
     found = []
     for first in range(0, RESAMPLES, _AT_ONCE):
         resamples = min(_AT_ONCE, RESAMPLES - first)
+        # To draw S of S with replacement is to draw how often each one comes.
         drawn = rng.multinomial(count, np.full(count, 1 / count), size=resamples)  # [R, S]
         found.append((drawn * _resampled_means(seeds, resamples, rng)).sum(1) / count)
+    # Divided by sqrt((S - 1) / S), which is by how much few seeds make a bootstrap too narrow.
     deviations = (np.concatenate(found) - mean) * math.sqrt(count / (count - 1))
     low, high = np.quantile(mean + deviations, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     least, most = _of_few(seeds)
@@ -108,7 +110,7 @@ def _of_few(seeds: Sequence[Units]) -> tuple[float, float]:
 
     each = [one.values / one.counts for one in seeds]
     outcomes, times = np.unique(np.concatenate(each), return_counts=True)
-    common = float(outcomes[times.argmax()])
+    common = float(outcomes[times.argmax()])  # what most units came out as
     if any(np.count_nonzero(means != common) >= FEW for means in each):
         return 0.0, 0.0
     looks: dict[Hashable, list[float]] = {}
@@ -117,6 +119,7 @@ def _of_few(seeds: Sequence[Units]) -> tuple[float, float]:
             looks.setdefault(unit, []).append(mean)
     if sum(any(mean != common for mean in own) for own in looks.values()) >= FEW:
         return 0.0, 0.0
+    # How far each unit is from the common outcome, its looks averaged, as a share of `reach`.
     apart = np.array([sum(own) / len(own) - common for own in looks.values()]) / seeds[0].reach
     low, high = mean_loss_interval(apart.clip(-1, 1), range(len(apart)))
     middle = float(apart.clip(-1, 1).mean())
@@ -142,6 +145,7 @@ def _resampled_means(
     means = []
     for one in seeds:
         known = one.draw if one.names is None else None
+        # Drawn once for all seeds that share the units, whose difficulty is in each one's mean.
         if known not in weights:
             size = len(one.values) if one.names is None else len(column)
             weights[known] = rng.multinomial(size, np.full(size, 1 / size), size=resamples)

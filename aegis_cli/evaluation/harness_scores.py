@@ -162,7 +162,7 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
     if not found:
         fix = "evaluate again with --log_samples, and give the folder of --output_path"
         raise AegisError(f"no file of samples in '{place}'", _WRITTEN, fix)
-    newest = {task: max(own) for task, own in found.items()}
+    newest = {task: max(own) for task, own in found.items()}  # dates that sort as texts do
     for task, own in found.items():
         if len({path.parent for _, path in own}) > 1:
             folders = sorted({str(path.parent) for _, path in own})
@@ -257,7 +257,7 @@ def _number(value: Any) -> float | None:
     """A metric's value for one question, or what a task that sums up by itself has noted of it."""
     if isinstance(value, dict):
         value = next((value[name] for name in _NOTED if name in value), None)
-    # A whole number may be too large for a float, and is no share then.
+    # A whole number may be too large for a float, and is no share then. NaN fails every comparison.
     if not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         return None
     return float(value)
@@ -272,6 +272,7 @@ def _falling(path: Path) -> frozenset[str]:
         beside = path.with_name(shape.format(date=date))
         if beside.is_file():
             found = files.load_json(beside)
+            # {"higher_is_better": {TASK: {METRIC: true}}}, where it says so at all.
             for key in ("higher_is_better", task):
                 found = found.get(key) if isinstance(found, dict) else None
             rising = found if isinstance(found, dict) else {}
@@ -326,6 +327,7 @@ def _drop(
     _check_same(task, metric, logs)
     before, after = (log.values[metric] for log in logs)
     values = np.array([[before[question], after[question]] for question in before])  # [N, 2]
+    # Pairs: what a question's own difficulty adds is in both and goes out of the difference.
     losses = values[:, 0] - values[:, 1]
     low, high = mean_loss_interval(losses, range(len(losses)))
     drop, interval = 100 * float(losses.mean()), (100 * low, 100 * high)

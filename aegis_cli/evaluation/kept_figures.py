@@ -194,6 +194,7 @@ def read(path: Path, kind: Any) -> dict[str, Any]:
     """
     raw = files.load_json(path)
     try:
+        # As JSON, where a strict check takes a list for a tuple, which JSON does not have.
         _adapter(kind).validate_json(files.canonical(raw), strict=True)
     except ValidationError as error:
         first = error.errors()[0]

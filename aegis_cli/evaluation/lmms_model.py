@@ -102,13 +102,13 @@ class AegisModel(lmms):
         shown = to_images(self.task_dict[task][split][number]) or []
         _check_greedy(settings, task)
         _check_images(shown, task, self._backbone)
-        until = settings.get("until") or ()
+        until = settings.get("until") or ()  # one text, or several
         return _Asked(
             place,
-            text.replace(_MARK, "").strip(),
-            [torch.from_numpy(pictures.rgb(image)) for image in shown],
-            int(settings.get("max_new_tokens", _MOST)),
-            tuple(end for end in ([until] if isinstance(until, str) else until)),
+            text=text.replace(_MARK, "").strip(),
+            images=[torch.from_numpy(pictures.rgb(image)) for image in shown],
+            most=int(settings.get("max_new_tokens", _MOST)),
+            until=(until,) if isinstance(until, str) else tuple(until),
         )
 
     def _batches(self, asked: Sequence[_Asked]) -> Iterator[list[_Asked]]:
@@ -117,6 +117,7 @@ class AegisModel(lmms):
         A batch is as long as its longest question, and generates as many tokens as any of its
         answers may have.
         """
+        # Sorted by length, so that questions which are padded together are about as long.
         alike: dict[tuple[int, int], list[_Asked]] = {}
         for one in asked:
             alike.setdefault((one.most, len(one.images)), []).append(one)

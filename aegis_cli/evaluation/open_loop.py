@@ -340,6 +340,7 @@ class _Source:
             AegisError: some that are not there, or none that is known not to be trained on.
         """
         count = demonstrations.count_episodes(data)
+        # Told apart by what the data holds, and not by where it lies.
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
             if asked is None and data.resolve() in self.places:
                 raise _has_changed(self.name, data, count)
@@ -356,6 +357,7 @@ class _Source:
                 "demonstrations that it was not trained on",
             )
         share = self.recipe.train.validation_share
+        # Drawn again as the training drew them: from the episodes that it learned from, by seed.
         own = demonstrations.learned_from(data, count, self.recipe.demos.only)
         held_out = own[demonstrations.held_out(len(own), share, self.recipe.seed)].tolist()
         if asked is None:
@@ -600,12 +602,13 @@ def _trace(
     starts = shown.tensors["episode_starts"]
     first, end = int(starts[episode]), int(starts[episode + 1])
     at = torch.arange(first, end, replan)
-    chunks = _predict(policy, shown, at, seed, batch_size)[:, :replan]
+    chunks = _predict(policy, shown, at, seed, batch_size)[:, :replan]  # [n, replan, A]
+    joined = chunks.reshape(-1, chunks.shape[-1])
     return Trace(
         episode,
         replan,
-        shown.tensors["actions"][first:end].numpy(),
-        chunks.reshape(-1, chunks.shape[-1])[: end - first].numpy(),
+        recorded=shown.tensors["actions"][first:end].numpy(),
+        predicted=joined[: end - first].numpy(),  # the last chunk may go past the episode's end
     )
 
 
@@ -628,9 +631,11 @@ def compare(
     error = predicted.double().numpy() - recorded
     hold = None
     if _are_positions(shown):
+        # The position at the frame, for every step of the chunk: [N, 1, A] less [N, H, A].
         hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
-    relative = _relative(error, training_std)
+    relative = _relative(error, training_std)  # [N, H]
     held = None if hold is None else _relative(hold, training_std)
+    # The episode of each valid step, in the order of `relative[valid]`.
     episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
     interval = None if relative is None else _interval(relative[valid], episode_of)
     return OpenLoopReport(
@@ -678,7 +683,7 @@ def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float]
     if episodes == 1:
         return None
     mean, half = float(errors.mean()), t_quantile(episodes - 1) * error
-    return max(0.0, mean - half), mean + half
+    return max(0.0, mean - half), mean + half  # no squared error is below 0
 
 
 def _are_positions(shown: Demonstrations) -> bool:
@@ -713,10 +718,13 @@ def _dimensions(
     training_std: np.ndarray,
 ) -> list[DimensionError]:
     unit = None if shown.task is None else FULL_ACTION
-    steps = [own for h in range(valid.shape[1]) if (own := valid[:, h]).any()]
+    # Padding is at a chunk's end. So the steps that any frame has are the first ones, and their
+    # places among these are their numbers.
+    rows_of_step = [valid[:, h] for h in range(valid.shape[1]) if valid[:, h].any()]
     found = []
     for d, name in enumerate(action_names(shown)):
-        own, by_step, std = error[..., d][valid], error[..., d], float(training_std[d])
+        by_step, std = error[..., d], float(training_std[d])  # [N, H]
+        own = by_step[valid]
         found.append(
             DimensionError(
                 name=name,
@@ -727,7 +735,7 @@ def _dimensions(
                 constant_rmse=float(recorded[..., d][valid].std()),
                 hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
                 relative_error=float(np.square(own / std).mean()) if std else None,
-                rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(steps)],
+                rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(rows_of_step)],
             )
         )
     return found

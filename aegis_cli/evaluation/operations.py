@@ -34,11 +34,16 @@ def _attention(query: Size, key: Size, value: Size, *_: Any, **__: Any) -> int:
         query: [B, H, T, D]; key: [B, h, S, D] of h heads, each for as many of the queries';
         value: [B, h, S, E].
     """
-    return 2 * math.prod(query[:3]) * key[2] * (query[3] + value[3])
+    scores = math.prod(query[:3]) * key[2]  # B H T S
+    # A multiplication and an addition for each of the D entries of a score, and the E of a value.
+    return 2 * scores * (query[3] + value[3])
 
 
 def _attention_backward(
     gradient: Size, query: Size, key: Size, value: Size, *_: Any, **__: Any
 ) -> int:
     """Operations of its gradients: scores anew, and four products of their size."""
-    return 2 * math.prod(query[:3]) * key[2] * (3 * query[3] + 2 * value[3])
+    scores = math.prod(query[:3]) * key[2]  # B H T S
+    # D each: the scores anew, the queries' and the keys' gradients. E each: the values' gradient
+    # and that of the weights.
+    return 2 * scores * (3 * query[3] + 2 * value[3])

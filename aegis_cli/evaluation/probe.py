@@ -142,6 +142,7 @@ def run(
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, seed, checks, on_event)
     with joined() as ranks:
+        # One model after the other: each is on the device only while it answers.
         after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
         if before is not None:
@@ -255,6 +256,7 @@ def warn_of_few_questions(
         return
     low, high = drop_interval
     apart = (high - low) / 2
+    # Fine enough for the gate, or an interval that lies wholly on one side of it.
     if apart <= max_drop or not low <= max_drop <= high:
         return
     text = (
@@ -401,6 +403,7 @@ def ask(
             batch_size,
             on_event,
         )
+    # Shares follow each other as the processes do, so that answers come in the questions' order.
     return [one for part in ranks.gathered(graded) for one in part]
 
 
@@ -425,6 +428,7 @@ def _layers(now: Sequence[float], then: Sequence[float] | None) -> list[LayerW2]
 def _distances(
     model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks
 ) -> list[float]:
+    # The first ones, so that every model of one probe is measured on the same.
     head = asked.sized(model.image_size).part(slice(W2_QUESTIONS))
     batches, count = head.batches(batch_size), len(head.questions)
     image, text = moments.measure(model, batches, count, ranks=ranks)
@@ -435,6 +439,7 @@ def _distances(
             now, then = text_now, text_then
         else:
             now, then = merge(image_now, text_now), merge(image_then, text_then)
+        # Both Gaussians are diagonal: W2^2 = |mean - mean'|^2 + |std - std'|^2.
         found.append(float(w2_diag(now.mean, now.var, then.mean, then.var)))
     return found
 
@@ -506,6 +511,7 @@ def by_image(
         names: of the set's images, which tell where another set has the same: `images`; None: no
             other has.
     """
+    # By image, whose questions share its difficulty: the crossed bootstrap draws whole images.
     lost: dict[int, int] = {}
     questions: dict[int, int] = {}
     for now, then in zip(after, before, strict=True):

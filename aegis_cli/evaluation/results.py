@@ -70,6 +70,7 @@ def keep(
     figures, settings = _in_utf8(figures), _in_utf8(settings)
     # A file's name or a data set's path may hold anything.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
+    # What is measured of the last checkpoint has the plain name, of an earlier one its step too.
     of_last = step == _last_step(run)
     with _soon_alone(run / FOLDER):
         path = run / FOLDER / (f"{plain}.json" if of_last else f"{plain}-{step:06d}.json")
@@ -147,11 +148,13 @@ def _beside_what_tells_more(
     Those beside it that tell no more than the new one are removed, as if they had been replaced.
     """
     told = _told(figures)
-    by_told = {
-        path.with_name(f"{path.stem}-with-{'-'.join(some or ('accuracy',))}.json"): set(some)
-        for size in range(len(_TOLD))
-        for some in itertools.combinations(_TOLD.values(), size)
-    }
+    # A name for each choice of what a probe may tell, such as PROBE-with-drop-gate. One that tells
+    # all of it has the plain name, so that the choices here are of fewer words.
+    by_told: dict[Path, set[str]] = {}
+    for size in range(len(_TOLD)):
+        for some in itertools.combinations(_TOLD.values(), size):
+            words = "-".join(some or ("accuracy",))
+            by_told[path.with_name(f"{path.stem}-with-{words}.json")] = set(some)
     for other, theirs in by_told.items():
         if theirs <= told:
             other.unlink(missing_ok=True)
@@ -310,8 +313,11 @@ def told_apart(played: Sequence[Played]) -> list[str]:
     """In words how each rollout was played, as far as others beside it were played otherwise."""
     names = [field.name for field in dataclasses.fields(Played)]
     differ = [name for name in names if len({getattr(one, name) for one in played}) > 1]
-    told = [[_said(name, getattr(one, name)) for name in differ] for one in played]
-    return [", ".join(filter(None, words)) for words in told]
+    found = []
+    for one in played:
+        words = [_said(name, getattr(one, name)) for name in differ]
+        found.append(", ".join(filter(None, words)))  # what is not guided has no word for it
+    return found
 
 
 def _said(name: str, value: float | None) -> str:
@@ -362,7 +368,8 @@ def _each(
         # What a study measures on validation data chooses its knobs, and is no result.
         if not re.match(rf"{kind}-validation(-|$)", path.stem):
             by_recipe.append(path)
-    # A probe that tells less than another of the same questions comes after it.
+    # A probe that tells less than another of the same questions comes after it: its name goes on
+    # with `-with-...` where the other's ends.
     apart = sorted((run / FOLDER).glob(f"{kind}-*.json"), key=lambda path: path.stem)
     recipe = recipe_of(run) if by_recipe else None
     for path in [*by_recipe, *apart]:
@@ -435,6 +442,7 @@ def gate(probed: Sequence[Result], settings: recipes.Probe) -> bool | None:
     verdicts = []
     for result in probed:
         passed, drop = result.figures.get("passed"), result.figures.get("drop_points")
+        # Measured by `aegis run` when its recipe had no gate, and held to the one that it has now.
         if passed is None and max_drop is not None and not result.settings and drop is not None:
             interval = result.figures.get("drop_interval")
             passed = within(limited(drop, interval, settings.gate), max_drop)

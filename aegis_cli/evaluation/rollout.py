@@ -210,6 +210,8 @@ def run(
     gl.check()
     asked = task
     policy, task, planned, cameras, own, sizes = (load or load_run)(Path(run_path), asked)
+    # Whoever asks for another number of executed actions does without the policy's own ensemble,
+    # which executes one.
     decay = own if ensemble is None and replan is None else ensemble
     if not sim.has_colors(task) and colors != DEFAULT:
         raise AegisError(
@@ -291,9 +293,9 @@ def play(
     for first in range(0, episodes, _LOCKSTEP):
         numbers = range(first, min(episodes, first + _LOCKSTEP))
         colored = TARGET_COLORS[colors]
-        group = [
-            _begin(task, seed, stream, i, colored, i < clips, cameras, ensemble) for i in numbers
-        ]
+        group = []
+        for i in numbers:  # the first episodes are filmed
+            group.append(_begin(task, seed, stream, i, colored, i < clips, cameras, ensemble))
         for _ in _play(policy, group, pace, first, seed, sizes):
             longest = group[0].env.spec.max_steps
             # An episode that ended early counts in full, so that the progress reaches its end.
@@ -325,7 +327,7 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
     if sim.is_suite(task):
         return _returns(finished)
     found: dict[str, Any] = {**vars(_success(finished))}
-    del found["episodes"]
+    del found["episodes"]  # which every report has, also one of returns
     found["outcomes"] = "".join(str(int(bool(e.end.success))) for e in finished)
     if sim.has_colors(task):
         wrong = sum(bool(e.end.wrong_target) for e in finished) / len(finished)
@@ -333,7 +335,8 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
         found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
     tasks = sim.members(task)
     if tasks != (task,):
-        # The tasks take turns; with few episodes, not every one has its turn.
+        # The tasks take turns: episode i is of task i mod n. With few episodes, not every one has
+        # its turn.
         turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
         found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
     found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
@@ -426,7 +429,8 @@ def _play(
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         continued = _continued(active, pace)
-        chunks = _decide(policy, [e.observation for e in active], generator, continued, sizes)
+        seen = [e.observation for e in active]
+        chunks = _decide(policy, seen, generator, continued, sizes)  # [B, H, A]
         for episode, chunk in zip(active, chunks, strict=True):
             _execute(episode, _to_execute(episode, chunk, pace))
         yield
@@ -437,14 +441,16 @@ def _continued(active: Sequence[_PlayedEpisode], pace: _Pace) -> Continued | Non
     left = [e.left for e in active if e.left is not None and len(e.left)]
     if pace.delay is None or not pace.guided or not left:
         return None
+    # In lockstep all have as many actions left, so that they stack to [B, n, A].
     return Continued(torch.from_numpy(np.stack(left)), pace.delay)
 
 
 def _to_execute(episode: _PlayedEpisode, chunk: np.ndarray, pace: _Pace) -> np.ndarray:
     """The actions [*, A] until the next prediction: of a chunk [H, A], or of the ensemble's."""
     if episode.ensemble is not None:
-        return episode.ensemble.next(torch.from_numpy(chunk))[None].numpy()
+        return episode.ensemble.next(torch.from_numpy(chunk))[None].numpy()  # one action, [1, A]
     if pace.delay and episode.left is not None:
+        # While the policy predicted, the robot went on with the old chunk for so many steps.
         chunk = np.concatenate([episode.left[: pace.delay], chunk[pace.delay :]])
     episode.left = chunk[pace.replan :]
     return chunk[: pace.replan]
@@ -492,6 +498,7 @@ def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
         if episode.executed is not None:
             episode.changes.append(float(np.square(given - episode.executed).mean()))
         episode.executed = given
+        # To look is to render; without it a step has no observation.
         episode.last = step = episode.env.step(given, look)
         episode.steps += 1
         episode.observation = step.observation or episode.observation

@@ -31,8 +31,10 @@ def examples(graded: Sequence[Graded], asked: VQASet, size: int | None) -> list[
     for answer in graded:
         if not answer.correct:
             families.setdefault(answer.question.family, []).append(answer)
-    turns = range(max(map(len, families.values()), default=0))
-    chosen = [own[turn] for turn in turns for own in families.values() if turn < len(own)][:MOST]
+    chosen: list[Graded] = []
+    for turn in range(max(map(len, families.values()), default=0)):
+        chosen += [own[turn] for own in families.values() if turn < len(own)]
+    chosen = chosen[:MOST]
     images = asked.sized(size).images
     return [_example(answer, images[np.array([answer.image])][0]) for answer in chosen]
 
@@ -54,7 +56,7 @@ def encoded(image: np.ndarray) -> str:
 
 def _small(image: np.ndarray) -> np.ndarray:
     """Every n-th row and column of an image [H, W, 3], so that its longer side is small."""
-    every = -(-max(image.shape[:2]) // _SIDE)
+    every = -(-max(image.shape[:2]) // _SIDE)  # rounded up, so that no side is larger than that
     return image[::every, ::every]
 
 

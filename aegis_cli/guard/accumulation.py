@@ -60,6 +60,7 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
     """Add a micro-batch to the means."""
     total.count += 1
     share = 1 / total.count
+    # A running mean, m_n = m_(n-1) + (a - m_(n-1)) / n; a gradient that is None counts as zeros.
     for i, a in anchor.items():
         mean = total.anchor[i]
         if mean is not None:
@@ -104,7 +105,7 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
     parameters = [p for group in groups for p in group]
     if all(_untouched(p, total.marks.get(id(p))) for p in parameters):
         return True
-    if cleared(groups):
+    if cleared(groups):  # the last projection was of zeros, and others were written since
         return False
     if _only_cleared(total, parameters):
         refuse_partly_cleared(parameters)
@@ -119,7 +120,8 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
 
 def refuse_partly_cleared(parameters: Sequence[nn.Parameter]) -> None:
     """Raise AegisError where some of the gradients are cleared, and others are not."""
-    parameters = [p for p in parameters if rows_here(p).numel()]  # else nothing can be told
+    # A process may have no row of a small sharded parameter, which then tells nothing.
+    parameters = [p for p in parameters if rows_here(p).numel()]
     kept = sum(not cleared([[p]]) for p in parameters)
     if 0 < kept < len(parameters):
         raise AegisError(
@@ -173,6 +175,7 @@ def _shift(total: Accumulation, groups: Groups, times: int) -> None:
             if weight == 0 or a is None:
                 continue
             if id(parameter) in total.idle:
+                # All of it is the anchor's: without that there is none.
                 parameter.grad = None if times < 0 else projection.scaled(a, weight)
             elif parameter.grad is not None:
                 projection.add_scaled([parameter.grad], [a], times * weight)

@@ -98,6 +98,7 @@ class AutomaticLoop:
     def _note(self, seen: Pass) -> None:
         assert self._dual is not None
         self._check(seen)
+        # Now, and not in the loop's own backward pass: that frees the graph.
         device = seen.hidden[0].device.type
         # The loop may call the model inside an autocast of its own.
         with torch.autocast(device, enabled=False):
@@ -221,6 +222,7 @@ class LoopHooks:
             self._loop.end(failed=output is None)
         finally:
             self._in_pass = False
+        # A backward pass comes to the call's outputs before any of the model's gradients.
         hook = self._on_gradient if self._sharded else self._on_output
         for part in tree_leaves(output):
             if isinstance(part, Tensor) and part.requires_grad:
@@ -229,6 +231,7 @@ class LoopHooks:
     def _given(self, args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name."""
         given = dict(self._parameters.bind_partial(*args, **named).arguments)
+        # What the signature calls **kwargs was given by names of its own.
         for name, kind in self._parameters.parameters.items():
             if kind.kind is inspect.Parameter.VAR_KEYWORD:
                 given |= given.pop(name, {})
@@ -264,6 +267,7 @@ class LoopHooks:
         """Prepare for the end of a backward pass, at the first tensor that it comes to."""
         if self._in_pass or self._in_backward:  # the guard's own pass, or a later tensor
             return
+        # Of sharded parameters nobody tells whether anything is left in `.grad`: it is taken to be.
         self._in_backward, self._accumulated = True, self._sharded
         self._loop.before_backward()
         at_end(self._on_end)

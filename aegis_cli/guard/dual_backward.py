@@ -141,6 +141,8 @@ class DualBackward:
         groups = self._learning()
         continued = self.continues()
         total, self._sum = self._sum if continued else None, None  # until this pass has ended well
+        # PyTorch adds to `.grad`, where the sum has to lie plain: what is projected is the sum, not
+        # each pass's share of it.
         if total is not None:
             accumulation.take_back(total, groups)
         else:
@@ -150,6 +152,7 @@ class DualBackward:
         # gradients are those of unscaled ones.
         loss.backward(retain_graph=True)
         self._stepper.passed()
+        # Under FSDP a gradient is reduced and cut only on its way into `.grad`.
         if self._owners.several:
             taken = backward.second_backward_of_rows(groups, penalty * scale, self._around)
         else:
@@ -231,6 +234,7 @@ class DualBackward:
             if not self._owners.several:  # else they arrive as means
                 learning = {id(p): p for group in groups for p in group}
                 taken = process_groups.mean_gradients(taken, learning, processes)
+            # The same figures in every process: they decide together whether the step is finite.
             numbers = [w2] if loss is None else [w2, loss]
             w2, *rest = process_groups.mean_over(numbers, processes)
             loss = next(iter(rest), None)
@@ -241,6 +245,7 @@ class DualBackward:
         else:
             accumulation.grow(total, taken, w2)
         over_rows = self._owners.total if self._owners.several else None
+        # Noted before the combination, which may give these parameters the anchor's gradient.
         total.idle = {id(p) for group in groups for p in group if p.grad is None}
         gram, weights = backward.combine_gradients(
             groups, total.anchor, self._parts.combine, over_rows
@@ -254,6 +259,7 @@ class DualBackward:
             self._poisoned = accumulation.poison(total, groups)
             return
         check_row(gram, self._ledger.groups)
+        # Both gradients are scaled, so that each inner product has the scale twice.
         tt, ta, aa = (x / scale**2 for x in gram)
         self._ledger.append(self._step, tt, ta, aa, total.w2)
         self._row_is_open, self._skips = True, skips

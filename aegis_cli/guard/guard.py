@@ -189,6 +189,7 @@ class Guard(Removable):
         self._check_image(image)
         self._dual.check_group()
         self._dual.forget_cleared()
+        # In every pass, for the model may be compiled after the guard was made.
         backward.recompile_for_two_backward_passes()
         with self._hooks.watch(mask, image, self._note):
             yield
@@ -268,6 +269,7 @@ class Guard(Removable):
         )
         self._stepper.take_by_itself(self._anchor_gradient)
         called = self._model if around is None else around
+        # Hooks on sharded parameters would see nothing: see `LoopHooks`.
         learning = [] if self._owners.several else structure.learning(self._model).values()
         reads = self._dual is not None
         self._loop_hooks = LoopHooks(learning, called, self._automatic, reads, mask, image)
@@ -334,6 +336,8 @@ class Guard(Removable):
         # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
         if self._dual is None:
+            # No second backward pass: the method constrains the update, and gradients stay as the
+            # task leaves them.
             if not skips and not loss.isfinite():
                 raise diverged(len(self.ledger))
             scaled.backward()
@@ -341,7 +345,7 @@ class Guard(Removable):
             if not skips and not self._stepper.gradients_finite(self._owners):
                 raise diverged(len(self.ledger))
             return
-        seen, self._seen = self._seen, None
+        seen, self._seen = self._seen, None  # each pass once: its graph is used up here
         if seen is None:
             raise AegisError(
                 "guard.backward without a watched pass",
@@ -372,6 +376,7 @@ class Guard(Removable):
                 "call it instead of loss.backward()",
             )
         self._stepper.step(optimizer, scaler, self._anchor_gradient())
+        # With several optimizers another one may still step on the same sum.
         if dual is not None and self._stepper.is_of_all(optimizer):
             dual.close_row()
 

@@ -79,6 +79,7 @@ class LearningParameters:
 
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
         """Whether every gradient is finite, in all processes."""
+        # The largest entry is finite only if all are; NaN passes through the maximum.
         largest = nn.utils.get_total_norm(self.gradients(), norm_type=math.inf)
         return not owners.any(not largest.isfinite())[0]
 

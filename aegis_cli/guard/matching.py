@@ -46,12 +46,14 @@ def match(
         AegisError: several sites of equal values, and not as many parameters; a weight without its
             bias.
     """
+    # Parameters of a shape that the VLM does not have are not read at all.
     shapes = {tensor.shape for pair in base.values() for tensor in pair if tensor is not None}
     places: dict[str, list[int]] = {}
     for place, parameter in enumerate(ordered):
         if parameter.shape in shapes and id(parameter) not in claimed:
             places.setdefault(_values(parameter), []).append(place)
     found: dict[str, Pair] = {}
+    # In float32 first: a site that has its exact values somewhere is not looked for as rounded.
     for dtype in _TYPES:
         rest = {site: pair for site, pair in base.items() if site not in found}
         found |= _match_in(dtype, rest, ordered, places)
@@ -82,7 +84,8 @@ def _match_in(
                 "freeze them in the policy, and leave only their kind out of protect=: what "
                 "is left free can undo what the others hold",
             )
-        # Where there are none, nothing is found: a truncated VLM, or one that has learned.
+        # Where there are none, nothing is found: a truncated VLM, or one that has learned. Sites of
+        # equal values, as tied or fresh ones, are told by their order.
         for site, place in zip(sites, at, strict=False):
             found[site] = (ordered[place], _bias(site, base[site][1], place, ordered, places))
     return found
@@ -270,6 +273,8 @@ def freeze_rest(
     """
     held = {id(t) for site in protected for t in weights(base, site) if t is not None}
     in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
+    # `given` counts the optimizer's parameters by their values, `others` those of the VLM that are
+    # to be frozen; `sequence` has all of the VLM's in its order.
     given = Counter(value for _, values in in_groups for value in values)
     named, sequence = list(base.named_parameters()), []
     for _, parameter in named:
@@ -281,6 +286,8 @@ def freeze_rest(
     for (name, parameter), (value, is_held) in zip(named, sequence, strict=True):
         if not is_held and given[value] < others[value]:
             lost[name] = on_cpu(parameter)
+    # Values that do not tell: more parameters have them than the VLM has to freeze, or a protected
+    # one has them too. Then the order in the group decides.
     unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
     names = {value: name for (name, _), (value, _) in zip(named, sequence, strict=True)}
     frozen: list[tuple[str, Tensor]] = []
@@ -302,6 +309,8 @@ def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> se
         sequence: the values of the VLM's parameters, and whether each is protected.
         values: those of the group, which may have some of them, and others.
     """
+    # Both sequences have the VLM's parameters in its order; what the group has besides lies between
+    # them. The blocks that match are the VLM's.
     here = set(values)
     expected = [pair for pair in sequence if pair[0] in here]
     matcher = SequenceMatcher(None, [value for value, _ in expected], values, autojunk=False)

@@ -86,6 +86,7 @@ class ProtectedAdamW(torch.optim.AdamW):
             )
         self._kinds = _kinds(method, base, self._anchor, self._options)
         self._lone = self._kinds.keys() - base.site_modules().keys()
+        # These tensors alone stay in memory, and not the base model.
         self._base = {site: _copied(weights(base, site)) for site in self._kinds}
         # Weight and bias of each site have a number, by which a resumed training knows them.
         self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
@@ -139,6 +140,8 @@ class ProtectedAdamW(torch.optim.AdamW):
             super(ProtectedAdamW, self).step()
             slowed.go_back()
 
+        # AdamW and the constraint both see float32: a projected update that was rounded in between
+        # would not be orthogonal any more. Neither method reads an anchor gradient.
         with self._wide.taken():
             self._stepper.step(self._count, move, {})
         self._remember()
@@ -200,11 +203,14 @@ class ProtectedAdamW(torch.optim.AdamW):
         if not known:
             matching.refuse_strays(self._base, found, self._ordered())
             matching.refuse_lost(self._lost, self._base, found, self._ordered())
+        # A method works on named modules, which the program has not given.
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
         anchor = anchor_file.to_device(self._anchor, device)
         self._wide = WideStep(self, model.parameters())
+        # A method takes the values that it finds for the pre-trained ones, which a resumed
+        # training's weights no longer are.
         with self._wide.taken(), _at_origin(learning, self._base):
             context = MethodContext(model, {}, kinds, self._options, anchor)
             self._parts = methods.get(self._method).start(context)
@@ -277,6 +283,7 @@ def _kinds(
     sites = base.sites()
     measured = set(anchor.inputs)
     if method == "kfac":
+        # Each map has two factors there, `SITE.inputs` and `SITE.outputs`.
         measured = {name.rpartition(".")[0] for name in anchor.curvature}
     return {s: kind for s, kind in sites.items() if s in measured and kind in options["protect"]}
 
@@ -289,12 +296,11 @@ def _copied(pair: Pair) -> Pair:
 @contextlib.contextmanager
 def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Generator[None]:
     """Give the parameters the VLM's values inside the block, and then back their own."""
-    pairs = [
-        (parameter, value)
-        for site, pair in found.items()
-        for parameter, value in zip(pair, base[site], strict=True)
-        if parameter is not None and value is not None
-    ]
+    pairs = []
+    for site, pair in found.items():
+        for parameter, value in zip(pair, base[site], strict=True):
+            if parameter is not None and value is not None:
+                pairs.append((parameter, value))
     now = [parameter.detach().clone() for parameter, _ in pairs]
     with torch.no_grad():
         for parameter, value in pairs:
@@ -318,6 +324,7 @@ def _tree(found: Mapping[str, Pair], lone: Collection[str]) -> nn.Module:
     """Modules that hold the parameters under the names that they have in the base model."""
     root = nn.Module()
     for site, pair in found.items():
+        # The pair of a lone row is (row, None), and its site is the row's own name.
         names = [site] if site in lone else [f"{site}.weight", f"{site}.bias"]
         for name, parameter in zip(names, pair, strict=False):
             if parameter is not None:

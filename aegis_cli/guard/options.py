@@ -98,6 +98,7 @@ def start(
             unprotected = tuple(sorted({*unprotected, *_without_curvature(anchor, sites)}))
         else:
             anchor = _renamed(anchor, sites, maps.heads, unmeasured, plain)
+    # In a model on several GPUs this is the device of the first parameter that learns.
     device = next(p for p in model.parameters() if p.requires_grad).device
     held = anchor_file.to_device(anchor, device)
     context = MethodContext(model, groups, sites, chosen, held, owners=owners)
@@ -125,9 +126,9 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     if method == "kfac":
         protect["protect"] = _dense_kinds(given.pop("protect", _DENSE_KINDS))
     # The checks are those of YAML's values, which has lists and no tuples.
-    raw = {
-        name: list(value) if isinstance(value, tuple) else value for name, value in given.items()
-    }
+    raw = {}
+    for name, value in given.items():
+        raw[name] = list(value) if isinstance(value, tuple) else value
     section = build(SECTIONS[method], raw, problems, f"{method}.")
     refuse(problems, "the guard's options")
     chosen = asdict(section)
@@ -233,6 +234,7 @@ def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames
     plain = plain_names(model)
     if structure.fingerprint(model) == header.fingerprint:
         return plain
+    # Names are part of the digest, and `aegis anchor` measures the model as a part `vlm`.
     if structure.fingerprint(model, within=_IN_BACKBONE) == header.fingerprint:
         return lambda name: _IN_BACKBONE + plain(name)
     expected, fix = "the pre-trained weights", "measure again with Guard.measure"
@@ -281,6 +283,7 @@ def _protected(
         dense: only linear maps and convolutions can be protected.
     """
     all_kinds = _DENSE_KINDS if dense else policy.SITE_KINDS
+    # What is frozen cannot move, and asks for no protection.
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {
         name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))

@@ -71,6 +71,7 @@ def mean_gradients(
     A gradient that a process lacks counts as zero there; one that all lack stays None.
     """
     like = next(iter(parameters.values()))
+    # In the order of `parameters`, which is the same in every process; ids are not.
     here = [gradients[i] is not None for i in parameters]
     # Every process has to join each reduction below, so they agree first on which there are.
     counts = torch.tensor(here, dtype=torch.int32, device=like.device)

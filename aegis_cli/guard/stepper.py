@@ -62,6 +62,7 @@ class GuardedStepper:
         self._tells = False  # whether any optimizer has ever told of a step
         self._buffers = _BufferWatch(model)
         _AT_WORK.add(self)
+        # On every optimizer of the process: the loop's own may be made after the guard.
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
             register_optimizer_step_pre_hook(before),
@@ -189,6 +190,7 @@ class GuardedStepper:
         self._refuse_second(optimizer)
         self._refuse_unreached()
         self._stepper.begin(self._learning.by_name(anchor))
+        # Before the step: the shares are those of the gradients that it is made of.
         slowed = SlowedStep(self._parts)
         taken = self._taken = _TakenStep(self._learning.versions())
         try:
@@ -205,6 +207,7 @@ class GuardedStepper:
         if not moved:
             self._stepper.cancel()
             return
+        # First the shares, as a lower rate would have moved it; what is constrained is the result.
         slowed.go_back()
         self._count += 1
         self._stepper.end(self._count)
@@ -249,6 +252,8 @@ class GuardedStepper:
             return None
         self._depth += 1
 
+        # The backward passes happen inside the step, so that its gradients can only be looked at
+        # between the closure's end and the first weight that moves.
         def guarded() -> Any:
             self._in_closure = True
             try:
@@ -283,10 +288,12 @@ class GuardedStepper:
             return
         moved = not overflowed(optimizer, scaler)
         self._tells = True
+        # A second step of this optimizer before the next pass would be one on used gradients.
         self._since.stepped.add(id(optimizer))
         self._since.moved = moved or self._since.moved
         if self._taken is not None:
             self._taken.told = moved or bool(self._taken.told)
+        # Only when the outermost step has ended have the weights moved for good.
         self._depth = max(0, self._depth - 1)
         if not self._depth:
             self._end_own(moved)
@@ -441,6 +448,7 @@ class SlowedStep:
     def go_back(self) -> None:
         """Leave of what has moved each parameter's share."""
         for parameter, share in self._shares.items():
+            # before + share (after - before)
             parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
 
 
@@ -449,7 +457,10 @@ def _read(shares: Mapping[Tensor, float | Tensor]) -> dict[Tensor, float]:
     unread = {p: share for p, share in shares.items() if isinstance(share, Tensor)}
     numbers = torch.stack([*unread.values()]).tolist() if unread else []
     read = dict(zip(unread, numbers, strict=True))
-    return {p: read[p] if isinstance(share, Tensor) else share for p, share in shares.items()}
+    found = {}
+    for parameter, share in shares.items():
+        found[parameter] = read[parameter] if isinstance(share, Tensor) else share
+    return found
 
 
 def overflowed(optimizer: Optimizer, scaler: Scaler | None = None) -> bool:

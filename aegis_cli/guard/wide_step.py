@@ -53,6 +53,7 @@ class WideStep:
         narrow = [p.data for p in self._half]
         given = [p.grad for p in self._half]
         for parameter, master in zip(self._half, self._masters(), strict=True):
+            # A gradient has its parameter's type, so that it is taken off while that changes.
             gradient, parameter.grad = parameter.grad, None
             parameter.data = master
             parameter.grad = None if gradient is None else gradient.float()
@@ -102,6 +103,7 @@ def loading(optimizer: Optimizer, state: Mapping[str, Any]) -> Generator[None]:
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
     numbers = [number for group in state["param_groups"] for number in group["params"]]
     wide: list[nn.Parameter] = []
+    # Not strict: PyTorch has an error of its own for a state of other groups.
     for number, parameter in zip(numbers, ordered, strict=False):
         if MASTER in state["state"].get(number, {}):
             wide.append(parameter)

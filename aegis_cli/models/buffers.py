@@ -66,7 +66,9 @@ def _kept(model: nn.Module) -> Iterator[tuple[str, list[Tensor]]]:
         own = []
         for leaf, buffer in module._buffers.items():
             lasts = buffer is not None and leaf not in module._non_persistent_buffers_set
-            if lasts and not buffer.is_inference():  # which is never written to
+            # A tensor that was made in inference mode has no count of writes, and PyTorch refuses
+            # to write to it in training.
+            if lasts and not buffer.is_inference():
                 own.append(buffer)
         if own:
             yield name, own

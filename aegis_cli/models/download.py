@@ -27,6 +27,7 @@ def locate(name: str | Path) -> Path:
     Raises:
         AegisError: neither here nor to be had, or a repository without a policy of ours.
     """
+    # What is on the disk goes before an id of the same name, which is asked for over a network.
     path = Path(name)
     return path if path.exists() or hub.is_local(str(name)) else fetch(str(name))
 

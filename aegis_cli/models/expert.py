@@ -88,10 +88,11 @@ class ExpertLayer(nn.Module):
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
         qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads + 2 kv_heads, K, H, head_dim]
         query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
+        # The backbone's keys come rotated: they stand at the positions before these.
         if rotation is not None:
             query, key = rotate(query, rotation), rotate(key, rotation)
         mixed = self._grouped(query, KeyValue(key, value), prefix, prefix_mask)
-        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
+        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))  # of [B, K, H, heads * head_dim]
         return x + self.down(squared_relu(self.up(self.norm2(x))))
 
     def _grouped(
@@ -101,6 +102,7 @@ class ExpertLayer(nn.Module):
 
         The queries of a group are made more blocks of their head of keys.
         """
+        # A backbone may pass in another type than the expert, whose queries decide here.
         prefix = KeyValue(prefix.key.to(query.dtype), prefix.value.to(query.dtype))
         groups, blocks = self.heads // self.kv_heads, query.shape[2]
         if groups == 1:
@@ -168,7 +170,7 @@ class ActionExpert(nn.Module):
         """
         state = self.proprio_in(proprio)[:, None].expand(-1, times.shape[1], -1)  # [B, K, W]
         features = torch.cat([_time_features(times, self.shape.width), state], dim=-1)
-        condition = self.condition(features)
+        condition = self.condition(features)  # [B, K, W], the same for all tokens of a chunk
         tokens = self.action_in(x) + self.position + condition[:, :, None]  # [B, K, H, W]
         masks = self._masks(prefix_mask)
         for_all = rotation is None or isinstance(rotation, Rotation)

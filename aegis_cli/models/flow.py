@@ -40,6 +40,7 @@ def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, 
         times: t [...].
     """
     t = times[..., None, None]
+    # The path is a straight line, so that its velocity is the same at every t.
     return t * noise + (1 - t) * actions, noise - actions
 
 
@@ -54,7 +55,7 @@ def masked_mse(
         shown: valid steps of the larger batch that this one is a share of; then the result is what
             the share contributes to that batch's mean.
     """
-    valid = (~is_pad)[:, None, :, None].expand_as(target)
+    valid = (~is_pad)[:, None, :, None].expand_as(target)  # [B, 1, H, 1] -> [B, K, H, A]
     squares = (velocity - target).square() * valid
     # A mean over all entries would shrink with the padding, and with it each frame's gradient.
     entries = valid.sum() if shown is None else shown * target.shape[1] * target.shape[3]

@@ -120,6 +120,7 @@ def load(folder: Path) -> tuple[Policy, PolicyMeta]:
         relative = relative_of(meta, int(sizes["actions"]), int(sizes["positions"]))
         stored = STORED_TYPES[meta.get("stored", FLOAT32)]
     policy = Policy(backbone, ActionExpert(shape), positions, actions, relative)
+    # `fill` wants the file's own types. Then all is float32, as of any backbone that is loaded.
     backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)
@@ -157,6 +158,7 @@ def fill(policy: Policy, tensors: Mapping[str, Tensor], source: str) -> None:
 
 
 def _unit(size: int) -> Normalizer:
+    """A normalizer of that many numbers, whose scales are still to be filled in."""
     if size < 1:
         raise ValueError(f"a size of {size}")
     zeros = torch.zeros(size, dtype=torch.float32)
@@ -176,7 +178,7 @@ def _config(policy: Policy, meta: PolicyMeta, cameras: Sequence[str]) -> dict[st
     }
     return {
         "type": TYPE,
-        "n_obs_steps": 1,
+        "n_obs_steps": 1,  # a policy sees the frame of now alone
         "input_features": {
             **pictures,
             STATE: _feature("STATE", len(policy.proprio_scale.mean)),

@@ -202,9 +202,11 @@ class Policy(nn.Module):
         field: continuation.Velocity = velocity
         origins = self.origins(proprio)
         if continued is not None:
+            # In the flow's units, which are relative to where the robot is now.
             old = self.action_scale(continued.actions.to(state.device) - origins)
             field = continuation.guided(velocity, Continued(old, continued.delay), noise.shape[1])
         predicted = flow.integrate(field, noise.to(state.device))
+        # `targets` backwards.
         return self.action_scale.invert(predicted) + origins
 
     def _velocity(

@@ -225,9 +225,11 @@ def parameter_groups(
     outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()}, plain)
     groups: dict[str, list[nn.Parameter]] = {}
     seen: set[int] = set()
+    # The layers come first, so that what one shares with a part outside belongs to the layer.
     for name, parameters in [*inside, *outside]:
         fresh = {id(p): p for p in parameters if id(p) not in seen}
         seen |= fresh.keys()
+        # A layer keeps its group even if all of it belongs to an earlier one: groups are counted.
         if fresh or name.startswith("layers."):
             groups.setdefault(name, []).extend(fresh.values())
     return groups
@@ -261,10 +263,11 @@ def _outside(
 ) -> Iterator[tuple[str, Iterator[nn.Parameter]]]:
     if id(module) in layers:
         return
-    if id(module) not in ancestors:
+    if id(module) not in ancestors:  # no layer in it: the whole part is one group
         group = "embeddings" if isinstance(module, nn.Embedding) else plain(name)
         yield group, module.parameters()
         return
+    # What lies around layers is a group of what it owns itself, and its parts are looked at.
     yield plain(name) or "model", module.parameters(recurse=False)
     for child, part in module.named_children():
         yield from _outside(f"{name}.{child}" if name else child, part, ancestors, layers, plain)
@@ -439,6 +442,7 @@ def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Generator
     They must have no gradient, which is of a parameter's type.
     """
     own = [p.data for p in parameters]
+    # By `.data`: the parameters stay the same objects, which optimizers and methods hold on to.
     for parameter, values in zip(parameters, of_one_type(own, dtype), strict=True):
         parameter.data = values
     try:
@@ -523,7 +527,9 @@ def _is_same_for_all(parameter: nn.Parameter) -> bool:
     A row has all its entries along one dimension, and such a table is a batch of one.
     """
     shape = parameter.shape
-    return parameter.numel() == max(shape, default=1) or (len(shape) == 3 and shape[0] == 1)
+    is_row = parameter.numel() == max(shape, default=1)  # a number by itself too
+    is_table_for_all = len(shape) == 3 and shape[0] == 1
+    return is_row or is_table_for_all
 
 
 def site_kind(module: nn.Module) -> str | None:

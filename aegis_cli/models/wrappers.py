@@ -58,6 +58,7 @@ def plain_names(model: nn.Module) -> PlainNames:
     What does not begin with the name of a module stays as it is.
     """
     table = {"": ""}
+    # `named_modules` gives a module before what it holds, whose own name builds on it.
     for name, module in model.named_modules():
         held = _held(module)
         for child, _ in module.named_children():
@@ -65,6 +66,8 @@ def plain_names(model: nn.Module) -> PlainNames:
             table[_joined(name, child)] = plain
 
     def plain(name: str) -> str:
+        # The longest beginning that names a module; what follows it, as `weight`, stays. The empty
+        # name is in the table, so that this ends.
         known, rest = name, ""
         while known not in table:
             known, _, last = known.rpartition(".")
@@ -83,6 +86,7 @@ def innermost(model: nn.Module, name: str) -> nn.Module | None:
     plain = plain_names(model)
     modules = dict(model.named_modules())
     wanted = plain(name) if name in modules else name
+    # A wrapper has the plain name of what it holds, and comes before it.
     found = [module for known, module in modules.items() if plain(known) == wanted]
     return found[-1] if found else None
 
@@ -101,6 +105,7 @@ def adapter_weights(model: nn.Module) -> set[str]:
     found = set()
     for name in model.state_dict():
         parts = name.split(".")
+        # Below a module that adapts, whatever is not in what it adapts is its own.
         for i, part in enumerate(parts):
             outer = ".".join(parts[:i])
             if outer in held and part != held[outer]:
@@ -137,6 +142,7 @@ class _Adapting(Protocol):
 
 def _is_idle(module: nn.Module) -> bool:
     if _held(module) == "original_module":
+        # `map` ends with the copies; of originals there is no end.
         return all(map(_equal_weights, _copies(module), _originals(module)))
     if not _says(module):
         return False

@@ -11,7 +11,14 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from aegis_cli.recipes.keys import LARGEST, LARGEST_FLOAT, Check, base_type, is_retired, is_too_large
+from aegis_cli.recipes.keys import (
+    LARGEST,
+    LARGEST_FLOAT,
+    Check,
+    base_type,
+    is_retired,
+    is_too_large,
+)
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 
 if TYPE_CHECKING:

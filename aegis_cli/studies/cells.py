@@ -186,7 +186,7 @@ class CellStore(Generic[R]):
         Equal cells are measured once.
         """
         keys = {cell.label: self.runner.key(cell) for cell in cells}
-        todo: dict[str, Cell[R]] = {}
+        todo: dict[str, Cell[R]] = {}  # of equal cells the first, which is measured for all
         for cell in cells:
             if keys[cell.label] in self.cells:
                 yield cell, self._deliver(keys[cell.label])
@@ -197,6 +197,7 @@ class CellStore(Generic[R]):
         waiting = [cell for cell in cells if keys[cell.label] in todo]
         together = self.workers > 1 and len(todo) > 1
         self.kind.prepare(self.runner, list(todo.values()), together)
+        # Closed at once if the caller stops: then the processes at work are ended, not waited for.
         with contextlib.closing(self._measure(list(todo.values()), together)) as found:
             for first, figures in found:
                 key = keys[first.label]
@@ -226,7 +227,7 @@ class CellStore(Generic[R]):
         self.done += 1
         self.on_event(Progress("study", self.done, self.total, "cells"))
         entry = self.cells[key]
-        diverged = isinstance(entry, dict) and "good_steps" in entry
+        diverged = isinstance(entry, dict) and "good_steps" in entry  # no figures have that key
         return self.known(key, Divergence if diverged else self.kind.figures)
 
     def keep(self, key: str, found: Any) -> None:
@@ -239,6 +240,8 @@ class CellStore(Generic[R]):
 
         A process that is killed meanwhile leaves a note, by which the next one removes the rest.
         """
+        # In this order: wherever a kill falls, the figures are there before the run goes, and the
+        # note is there as long as some of the run may be left.
         note = self.folder / CLEARING
         files.save_json(note, {"cell": key, "run": label})
         self.keep(key, found)
@@ -309,7 +312,7 @@ def _measure_together(
         AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
             step to resume from.
     """
-    reports: Queue[Event] = SPAWN.Queue()
+    reports: Queue[Event] = SPAWN.Queue()  # by which the processes tell this one how far they are
     arguments = (make, folder, reports, threads_per_worker(workers))
     with WorkerPool(workers, "a process of the study", _FIX, _begin, arguments) as pool:
         numbers = {pool.submit(_measure_here, cell): i for i, cell in enumerate(cells)}
@@ -325,8 +328,9 @@ def _finished(
         done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
         while not reports.empty():
             on_event(reports.get())
+        # `done` is a set, whose order changes from run to run.
         for future in sorted(done, key=lambda f: numbers[f]):
-            yield numbers[future], future.result()
+            yield numbers[future], future.result()  # raises what the process has raised
 
 
 _runner: CellRunner[Any]  # of a process of its own
@@ -335,7 +339,7 @@ _runner: CellRunner[Any]  # of a process of its own
 def _begin(make: MakeRunner[R], folder: Path, reports: Queue[Event], threads: int) -> None:
     global _runner
     _runner = make(folder, reports.put)
-    torch.set_num_threads(threads)
+    torch.set_num_threads(threads)  # else each would take all cores
 
 
 def _measure_here(cell: Cell[R]) -> Outcome:

@@ -340,6 +340,7 @@ def _cost(name: str, against: str | None, costs: Mapping[str, Cost]) -> Cost | N
     reference = costs.get(against)
     if reference is None:
         return None
+    # Both are over naive, which goes out of their ratio.
     return dataclasses.replace(
         own,
         step_time=own.step_time / reference.step_time,
@@ -370,18 +371,20 @@ def task_results(
     results, pairs = [], list[tuple[PolicyFigures, PolicyFigures]]()
     for name, own in found.items():
         variant = variants[name]
-        # Contrasts are declared against naive, whose place a variant may give to another.
+        # Contrasts are declared against naive, whose place a variant may give to another: its
+        # `against`. Naive itself is compared with nobody.
         against = variant.against or (None if name == NAIVE else NAIVE)
         references = {NAIVE: samples[against]} if against in samples else {}
         for other in references.values():
             pairs += _pairs(samples[name], other)
         cost = _cost(name, variant.against, costs)
+        diverged = sorted(seed for seed, row in own.items() if not measured(row))
         made = PolicyResult(
             variant=name,
             method=variant.method,
             knob=variant.knob,
             value=values.get(name),
-            diverged=sorted(seed for seed, row in own.items() if not measured(row)),
+            diverged=diverged,
             **measure(PolicyResult, samples[name], references),
             step_time=None if cost is None else cost.step_time,
             peak_memory=None if cost is None else cost.peak_memory,
@@ -405,6 +408,7 @@ def task_results(
 
 def _pairs(sample: Sample, reference: Sample) -> list[tuple[PolicyFigures, PolicyFigures]]:
     """Cells of the same task and seed."""
+    # A cell that diverged is in no sample, and its setting then in no pair.
     settings = sample.figures.keys() & reference.figures.keys()
     return [(sample.figures[setting], reference.figures[setting]) for setting in settings]
 
@@ -631,21 +635,23 @@ def stream_results(
     """
     paired = dataclasses.astuple(pairs) if pairs else ()
     samples = {stream: _samples(found, variants, (stream,), unseeded) for stream in paired}
+    # The pairs answer questions of their own, and no mean over streams counts them.
     streams = {stream for own in found.values() for stream, _ in own} - {*paired}
     main = _samples(found, variants, streams, unseeded)
     results = []
     for name, own in found.items():
         variant = variants[name]
-        both = [
-            PairResult(**measure(PairResult, samples[stream][name], samples[stream]))
-            for stream in paired
-        ]
+        both = []
+        for stream in paired:
+            measured_pair = measure(PairResult, samples[stream][name], samples[stream])
+            both.append(PairResult(**measured_pair))
+        diverged = [f"{s} {seed}" for (s, seed), row in own.items() if not measured(row)]
         made = StreamResult(
             variant=name,
             method=variant.method,
             knob=variant.knob,
             value=values.get(name),
-            diverged=sorted(f"{s} {seed}" for (s, seed), row in own.items() if not measured(row)),
+            diverged=sorted(diverged),
             told=Accuracies(**measure(Accuracies, main[name], main)),
             inferred=Accuracies(**measure(Accuracies, main[name], main, "inferred_")),
             **measure(StreamResult, main[name], main),
@@ -823,10 +829,9 @@ def robot_stream_results(
         values: variant -> what its knob is set to.
         tasks: of the stream, in their order.
     """
-    samples = {
-        name: Sample({run: row for run, row in own.items() if measured(row)})
-        for name, own in found.items()
-    }
+    samples = {}
+    for name, own in found.items():
+        samples[name] = Sample({run: row for run, row in own.items() if measured(row)})
     return [
         RobotStreamResult(
             variant=name,
@@ -848,9 +853,10 @@ def _task_by_task(sample: Sample, tasks: Sequence[str]) -> list[AfterTask]:
     still = all(_knows_the_same(figures) for _, figures in cells)
     for t, task in enumerate(tasks):
         success = []
-        for i in range(t + 1):
+        for i in range(t + 1):  # the matrix is a triangle: later tasks have not come yet
             acted = over_seeds({run: figures.success[t][i] for run, figures in cells})
             success.append(acted and unless_alike(acted, sure=False))
+        # `vqa` begins before the first task, so that after task t it is at t + 1.
         lost = over_seeds({r: 100 * (found.vqa[0] - found.vqa[t + 1]) for r, found in cells})
         rows.append(AfterTask(task, success, lost and unless_alike(lost, still)))
     return rows

@@ -36,7 +36,8 @@ def decode(kind: type[T], raw: Any) -> T:
         made: T = _adapter(kind).validate_json(text, strict=True)
     except ValidationError as error:
         raise Misfit(_listed(error.errors())) from None
-    # What was not read, at any depth, is missing in what was.
+    # What was not read, at any depth, is missing in what was. pydantic itself passes over keys that
+    # a standard dataclass does not have.
     read, given = json.loads(_adapter(kind).dump_json(made)), json.loads(text)
     unread = [k for k in given if not _was_read({k: given[k]}, read)]
     if unread:

@@ -41,6 +41,7 @@ class Sample:
 
 def over_seeds(values: Values) -> Mean:
     """The estimate from each seed's mean over its tasks or streams; None without values."""
+    # First over a seed's tasks, which are no draws of anything: the n of the interval is of seeds.
     seeds: dict[int, list[float]] = {}
     for (_, seed), value in values.items():
         seeds.setdefault(seed, []).append(value)
@@ -158,6 +159,7 @@ def measure(
             values = _compared(column, values, _values(column, prefix + name, other))
             seeded = sample.seeded or other.seeded
         known = {setting: value for setting, value in values.items() if value is not None}
+        # One run counted once per seed would pass for several that agree.
         made = column.summary(known if seeded else _once(known))
         if isinstance(made, Estimate) and column.units is not None:
             crossed = _crossed(column.units, known, sample, other)
@@ -184,8 +186,12 @@ def _surely(column: Metric, known: Values, sample: Sample, other: Sample | None)
     """
     if other is sample:
         return True
-    figures = [each.figures[s] for each in (sample, other) if each is not None for s in known]
-    return column.sure is not None and all(column.sure(found) for found in figures)
+    if column.sure is None:
+        return False
+    figures = []
+    for each in [sample] if other is None else [sample, other]:
+        figures += [each.figures[setting] for setting in known]
+    return all(map(column.sure, figures))
 
 
 def _crossed(
@@ -221,7 +227,7 @@ def _compared(
     other: Mapping[Setting, float | None],
 ) -> dict[Setting, float | None]:
     made: dict[Setting, float | None] = {}
-    for setting, value in own.items():
+    for setting, value in own.items():  # a setting that only one of both has is left out
         against = other.get(setting)
         if value is not None and against is not None:
             made[setting] = contrast.compare(value, against)
@@ -273,6 +279,7 @@ def deciding_decimals(value: float, demand: str, decimals: int) -> int:
     sign, _, rest = demand.partition(" ")
     if sign not in _SIGNS:
         return decimals
+    # The words of a limit begin with its number: `<= 1.02 x naive`.
     holds, limit = _SIGNS[sign], float(rest.partition(" ")[0])
     while decimals < _ALL_DECIMALS and holds(round(value, decimals), limit) != holds(value, limit):
         decimals += 1
@@ -319,7 +326,7 @@ class Demand:
     def check(self, result: Any, frozen: bool = False) -> Check:
         """The demand made of a result."""
         found = result
-        for name in self.of.split("."):
+        for name in self.of.split("."):  # a study without pairs has None for `pair_a`
             found = None if found is None else getattr(found, name)
         passed = None if found is None else self.limit.holds(found)
         value, interval = found, None
@@ -337,6 +344,7 @@ def bar(demands: Sequence[Demand], result: Any, frozen: bool = False) -> Bar:
     """
     checks = [demand.check(result, frozen) for demand in demands]
     passed = [check.passed for check in checks]
+    # A mean over the seeds that did not diverge is no mean over seeds.
     if result.diverged or False in passed:
         return Bar(checks, False)
     return Bar(checks, None if None in passed else True)
@@ -367,6 +375,7 @@ def _reaches(found: Estimate | float, side: int, limit: float) -> bool | None:
     A plain number is both of its ends. Several runs that came out alike, and tell nothing of how
     runs vary, fail where that is on the bad side.
     """
+    # Times -1 an inequality turns round: -x <= -limit is x >= limit.
     if not isinstance(found, Estimate):
         return side * found <= side * limit
     if found.ends is None:

@@ -154,22 +154,26 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."
+    # Of the questions that naive lost most of: an interval that holds 0 does not tell a loss.
     low, high = max(sets, key=lambda asked: asked.drop_points).drop_interval
     if low <= 0:
         return (
             f"naive lost {lost}, or none: its 95 % interval is {low:.1f} to {high:.1f}. So few "
             "questions do not tell who kept VQA; raise probe.questions."
         )
-    kept = [
-        row
-        for row in rows
-        if row.method != "naive" and max(_drops(row)) <= max(_drops(naive)) * _KEPT_SHARE
-    ]
+    most = max(_drops(naive)) * _KEPT_SHARE
+    others = [row for row in rows if row.method != "naive"]
+    kept = [row for row in others if max(_drops(row)) <= most]
     if not kept:
         return (
             f"No method here kept VQA: naive lost {lost}, and each of the others over half of it."
         )
-    best = max(kept, key=lambda row: -math.inf if (acts := _acts(row)) is None else acts)
+
+    def ability(row: PolicyFigures) -> float:
+        acts = _acts(row)
+        return -math.inf if acts is None else acts  # what was not measured is never the best
+
+    best = max(kept, key=ability)
     if naive.success_seen is None:
         at = f"an open-loop error of {best.open_loop_error:.3f} where naive has "
         at += f"{naive.open_loop_error:.3f}"
@@ -194,7 +198,7 @@ def _acts(row: PolicyFigures) -> float | None:
     """How well a policy acts, more being better; None where that is not measured."""
     if row.success_seen is not None:
         return row.success_seen
-    return None if row.open_loop_error is None else -row.open_loop_error
+    return None if row.open_loop_error is None else -row.open_loop_error  # less error is better
 
 
 def _past(row: PolicyFigures, settings: Probe) -> bool:
@@ -240,9 +244,7 @@ def of_method(recipe: Recipe, method: str) -> Recipe:
 
 def _with_ratios(rows: list[PolicyFigures]) -> list[PolicyFigures]:
     """The step times over naive's, if there is a naive."""
-    naive = next((row.step_s for row in rows if row.method == "naive"), None)
-    return (
-        rows
-        if naive is None
-        else [dataclasses.replace(row, step_time_ratio=row.step_s / naive) for row in rows]
-    )
+    naive_s = next((row.step_s for row in rows if row.method == "naive"), None)
+    if naive_s is None:
+        return rows
+    return [dataclasses.replace(row, step_time_ratio=row.step_s / naive_s) for row in rows]

@@ -118,10 +118,14 @@ class PolicyStudy:
         for cell in cells:
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 runner.check_questions(cell.recipe, split)
-        recipes_of = (cell.recipe for cell in cells)
-        distinct = {(recipe.backbone, recipe.demos, recipe.task): recipe for recipe in recipes_of}
+        # To load a backbone and demonstrations takes long, so each combination is checked once.
+        distinct = {}
+        for cell in cells:
+            recipe = cell.recipe
+            distinct[recipe.backbone, recipe.demos, recipe.task] = recipe
         for recipe in distinct.values():
             loading.check_named(recipe, runner.on_event)
+        # One process makes what it needs when it needs it; of several each would make its own.
         for cell in cells if together else ():
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
@@ -157,6 +161,7 @@ class PolicyStudy:
         if not store.known_only:
             here = machine.name()
             old = {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
+            # Ratios of times hold on the machine that they were measured on alone.
             missing = [name for name in made if name not in old or old[name].machine != here]
             # Variants whose steps take the same are measured once: those of other learning rates,
             # and those that are merged in several ways.
@@ -180,6 +185,7 @@ class PolicyStudy:
         Variants whose anchors differ are timed apart, each with its own.
         """
         runner = _runner(store)
+        # Each of the different settings once, in the order of the variants.
         for settings in dict.fromkeys(made[name].anchor for name in names):
             group = {name: made[name] for name in names if made[name].anchor == settings}
             anchor_path = runner.anchor(next(iter(group.values()))).path
@@ -275,10 +281,9 @@ def cell_key(
         vqa_state: of the question files that it reads, if any.
     """
     key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
-    key |= {
-        name: recipes.changed(getattr(cell.recipe, name))
-        for name in ("demos", "anchor", "probe", "rollout")
-    }
+    for name in ("demos", "anchor", "probe", "rollout"):
+        key[name] = recipes.changed(getattr(cell.recipe, name))
+    # What is not there adds no key, so that cells of before there was any are still found.
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if demos_sha256 is not None:
@@ -288,6 +293,7 @@ def cell_key(
 
 def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
     """Digest of what shapes a cost: neither the seed nor the learning rates do."""
+    # Naive's own settings count as well: the cost is a ratio to its step.
     timed = [bench_runs.unmoved(one) for one in (recipe, naive)]
     parts = [{**_shaping(one), "seed": 0, "backbone": backbone_sha256} for one in timed]
     return digest({"cost": parts, "anchor": recipes.changed(recipe.anchor)})
@@ -295,12 +301,11 @@ def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
 
 def _shaping(recipe: Recipe) -> dict[str, Any]:
     """What shapes a training, as far as it is not at the default that it came with."""
-    sections = {
-        name: getattr(recipe, name, None) for name in ("train", "expert", recipe.train.method)
-    }
-    changed = {
-        name: recipes.changed(section) for name, section in sections.items() if section is not None
-    }
+    changed = {}
+    # Of the methods' sections only the one's own; a method without options has none.
+    for name in ("train", "expert", recipe.train.method):
+        if (section := getattr(recipe, name, None)) is not None:
+            changed[name] = recipes.changed(section)
     if recipe.expert.start is not None:  # the expert itself, wherever it lies
         changed["expert"]["start"] = checkpoint.expert_sha256(recipe.expert.start)
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
@@ -353,6 +358,7 @@ class PolicyRunner:
         settings = recipe.demos
         if settings.path is not None:
             return self._given_demos(settings.path, settings.selection)
+        # A job's own are `demos.safetensors`; a study may have others, told apart by a digest.
         plain = self.plain is not None and (recipe.task, settings) == (
             self.plain.task,
             self.plain.demos,
@@ -376,6 +382,7 @@ class PolicyRunner:
         shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
         key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
         if shown is not None:
+            # Which episodes and cameras it is measured on; positions and actions are not read.
             chosen = recipes.selected(recipe)
             key |= {name: chosen[name] for name in ("only", "rename") if name in chosen}
 
@@ -493,29 +500,31 @@ class PolicyRunner:
             run_folder.renew_recipe(self._policy(label, recipe), recipe)
             merged = files.load_json(self._policy(label, recipe) / run_folder.MERGE_REPORT)
             trained["validation_loss"] = merged["validation_loss"]
-        asked = {
-            settings.only_set: _vqa_figures(self.probe(label, recipe, settings, number, validation))
-            for number, settings in enumerate(recipe.probe.of_each_set(), start=1)
-        }
+        asked = {}
+        for number, settings in enumerate(recipe.probe.of_each_set(), start=1):
+            probed = self.probe(label, recipe, settings, number, validation)
+            asked[settings.only_set] = _vqa_figures(probed)
         if recipe.anchor.source == "demos":
             # The distance of questions from robot frames is no drift.
             asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
-        first, *further = asked
+        first, *further = asked  # the table's own columns are of the first set
         last = self._policy(label, recipe) / "checkpoints" / "last"
         header = artifacts.read_header(last / checkpoint.EXPERT)
         playable = _playable(cast(PolicyMeta, header.meta), recipe)
         played = {colors: self.rollout(label, recipe, colors, validation) for colors in playable}
-        success = {colors: report["success"] for colors, report in played.items()}
+        # A task without colours has its figures under `seen`; a policy that cannot be rolled out
+        # has none at all.
+        seen, held_out = played.get("seen"), played.get("held-out")
         error, hold = None, None
         if not playable and not validation:
             error, hold = self.open_loop_errors(label, recipe)
         return PolicyFigures(
             method=recipe.train.method,
             **vars(asked[first]),
-            success_seen=success.get("seen"),
-            success_held_out=success.get("held-out"),
-            wrong_target=played["seen"]["wrong_target"] if "seen" in played else None,
-            return_share=played["seen"]["return_share"] if "seen" in played else None,
+            success_seen=None if seen is None else seen["success"],
+            success_held_out=None if held_out is None else held_out["success"],
+            wrong_target=None if seen is None else seen["wrong_target"],
+            return_share=None if seen is None else seen["return_share"],
             open_loop_error=error,
             hold_error=hold,
             energy_shed=trained["energy_shed_mean"],
@@ -523,8 +532,8 @@ class PolicyRunner:
             step_time_ratio=None,
             validation_loss=trained["validation_loss"],
             probe_seed=recipe.probe.seed,
-            outcomes_seen=played["seen"].get("outcomes") if "seen" in played else None,
-            outcomes_held_out=played["held-out"].get("outcomes") if "held-out" in played else None,
+            outcomes_seen=None if seen is None else seen.get("outcomes"),
+            outcomes_held_out=None if held_out is None else held_out.get("outcomes"),
             rollout_seed=recipe.rollout.seed,
             code=version.code(),
             others={name: asked[name] for name in further},
@@ -542,6 +551,7 @@ class PolicyRunner:
 
         def make(on_event: OnEvent) -> None:
             self._clear_other_run(label, key, on_event)
+            # `resume` begins a run where none is there, and goes on with one that was interrupted.
             report = leading.together(
                 train.run,
                 recipe,
@@ -579,6 +589,7 @@ class PolicyRunner:
         Args:
             key: what shapes the training.
         """
+        # Begun with the very same inputs and interrupted: the training goes on with it.
         if self.goes_on(label, key):
             return
         out, begun_record = self.folder / label, f"{label}/{BEGUN}"
@@ -591,6 +602,7 @@ class PolicyRunner:
         moved = run_folder.clear(out, ours=begun is not None)
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
+        # Noted before the training begins: by that a killed one is known as ours the next time.
         self.records.forget(f"{label}/train")
         self.records.keep(begun_record, key, [])
 
@@ -651,12 +663,12 @@ class PolicyRunner:
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
         name = name if number == 1 else f"{name}-{number}"
         path, measured = self._policy(label, recipe) / f"{name}.json", self.anchor(recipe)
+        # All that the report is made of: weights, the anchor that W2 is measured from, the backbone
+        # that answers before, and the questions.
         key = {
             "policy": _sha256(self._policy(label, recipe)),
             "anchor": measured.sha256,
             "backbone": self.backbone_sha256(recipe),
-        }
-        key |= {
             "settings": _probe_settings(settings),
             "split": split,
             **self.source(settings).state,
@@ -751,6 +763,7 @@ class PolicyRunner:
         errors, holds = [], []
         for number, data in enumerate(paths, start=1):
             report = self.evaluated(label, recipe, data, given.sha256, number)
+            # None where no action varied in training: there is no variance to measure by.
             if report["relative_error"] is not None:
                 errors.append(report["relative_error"])
                 holds.append(report["hold_error"])
@@ -786,7 +799,7 @@ def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
         drop_points=probed["drop_points"],
         drop_interval=tuple(probed["drop_interval"]),
         cross_entropy=probed["cross_entropy"],
-        w2=sum(layers) / len(layers) if layers else None,
+        w2=sum(layers) / len(layers) if layers else None,  # every layer counts alike, unweighted
         baseline_accuracy=probed["baseline_accuracy"],
         baseline_cross_entropy=probed["baseline_cross_entropy"],
         majority_accuracy=probed["majority"],

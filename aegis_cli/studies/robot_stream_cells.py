@@ -168,6 +168,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         """The recipe that is learned, on validation episodes if the cell is of the tuning."""
         recipe = cell.recipe
         split = "validation" if cell.validation else "evaluation"
+        # With the paths filled in, a run finds the demonstrations that all cells share.
         return dataclasses.replace(
             recipe,
             demos=dataclasses.replace(recipe.demos, paths=self.demonstrations(recipe)),
@@ -210,7 +211,7 @@ def cell_key(
     recipe = cell.recipe
     method = recipe.train.method
     sections = {name: getattr(recipe, name) for name in ("train", "expert", "rollout", "probe")}
-    sections["demos"] = dataclasses.replace(recipe.demos, paths=None)
+    sections["demos"] = dataclasses.replace(recipe.demos, paths=None)  # wherever they lie
     sections[method] = getattr(recipe, method.replace("-", "_"), None)
     shaping: dict[str, Any] = {
         name: recipes.changed(section) for name, section in sections.items() if section is not None

@@ -178,10 +178,10 @@ def cell_key(cell: Cell[StreamRecipe], fingerprint: str, image_set: str) -> str:
 def stream_figures(report: ImageStreamReport) -> StreamFigures:
     """The figures of a learned stream that studies compare."""
     told, inferred = report.scores, report.inferred_scores
-    owned = [
-        sum(site.owners.count(task) for site in record.sites)
-        for task, record in enumerate(report.records)
-    ]
+    # Of the experts that a task uses at its end, those of its own, over all maps.
+    owned = []
+    for task, record in enumerate(report.records):
+        owned.append(sum(site.owners.count(task) for site in record.sites))
     return StreamFigures(
         method=report.method,
         transfer=told.transfer,
@@ -198,6 +198,7 @@ def stream_figures(report: ImageStreamReport) -> StreamFigures:
         trained=report.trained,
         trained_mean=report.trained_mean,
         reuse=report.reuse,
+        # Row t has the accuracies after task t: its diagonal is each task right after its learning.
         own=tuple(row[task] for task, row in enumerate(report.oracle)),
         added=tuple(record.added for record in report.records),
         new_experts=tuple(owned),

@@ -57,7 +57,7 @@ class StreamRuns(ABC, Generic[S]):
         if not same or _named_otherwise(out, recipe):
             run_folder.clear(out, ours=begun)
             files.make_folder(out.parent)
-            files.write_text(_note(out), key)
+            files.write_text(_note(out), key)  # before the run begins: by it a killed one is ours
 
         def named(event: Any) -> None:
             self.on_event(dataclasses.replace(event, stage=f"{cell.label}/{event.stage}"))
@@ -81,6 +81,7 @@ class StreamRuns(ABC, Generic[S]):
         """Remove the folders that are empty once the cells of these labels are measured."""
         for label in labels:
             with contextlib.suppress(OSError):  # other runs are there, or it is gone
+                # From the innermost folder outwards, and none that holds the study itself.
                 for folder in (self.folder / label).parents[: len(Path(label).parts) - 1]:
                     folder.rmdir()
 

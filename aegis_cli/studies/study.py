@@ -82,6 +82,7 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
         AegisError: no cells, or none of this study.
     """
     kind = kind_of(study)
+    # A copy of its own: a store reads its folder's `cells.json`, and writes a table beside it.
     with tempfile.TemporaryDirectory() as aside:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
@@ -148,11 +149,12 @@ def _tuned_whole(kind: StudyKind[R], store: CellStore[R]) -> list[str]:
     judged by another, and other values would be chosen.
     """
     variants, tuned = kind.recipe.variants, _tuned(kind, trials(kind))
-    whole = [
-        name
-        for name in variants
-        if all(store.runner.key(cell) in store.cells for _, cell in tuned.get(name, ()))
-    ]
+    whole = []
+    for name in variants:
+        # None to measure, where the variant has no choice: then it is whole.
+        own = [cell for _, cell in tuned.get(name, ())]
+        if all(store.runner.key(cell) in store.cells for cell in own):
+            whole.append(name)
     return whole if set(_judges(kind)) <= set(whole) else []
 
 
@@ -177,6 +179,7 @@ def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
     findings = _tune(kind, store, tuned)
     if tuned and not findings.chosen:
         return _write(kind, store, findings)  # known cells alone, of which some are not there
+    # A variant that is not tuned has one value, or is compared with its first.
     chosen = {name: own[0][0] for name, own in tried.items()} | dict(findings.chosen)
     findings = dataclasses.replace(findings, chosen=chosen)
     found: dict[str, dict[Setting, Outcome]] = {}
@@ -185,9 +188,11 @@ def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
     with contextlib.closing(store.measured(cells)) as measured:
         for number, (cell, figures) in enumerate(measured, 1):
             place, name, seed = cell.label.rsplit("/", 2)  # a task's name may hold a slash
+            # They come as they are finished, and are put in order for the table.
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
-            # A table of many cells takes seconds, and the last one is written below.
+            # A table of many cells takes seconds: it is not written for each known one, which come
+            # first, and the last one is written below.
             if known <= number < len(cells):
                 _write(kind, store, findings)
     store.tidy([cell for own in tuned.values() for _, cell in own] + cells)
@@ -248,25 +253,23 @@ def _tune(kind: StudyKind[R], store: CellStore[R], tuned: Trials[R]) -> Findings
             so_far = [point for own in points.values() for point in own]
             if number >= known and known < len(cells):
                 _write(kind, store, Findings(so_far))
-    if len(found) < len(cells):
+    if len(found) < len(cells):  # only finished cells are delivered, and some are not there
         return Findings([point for own in points.values() for point in own])
     best = choose(kind.rule, points, tuning.within)
-    decided = [
-        dataclasses.replace(point, chosen=number == best[name])
-        for name, own in points.items()
-        for number, point in enumerate(own)
-    ]
+    decided = []
+    for name, own in points.items():
+        for number, point in enumerate(own):
+            decided.append(dataclasses.replace(point, chosen=number == best[name]))
     return Findings(decided, {name: own[best[name]].value for name, own in points.items()})
 
 
 def _points(kind: StudyKind[R], tuned: Trials[R], found: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What the finished values led to, in the recipe's order, whichever was finished first."""
-    return {
-        name: [
-            kind.point(name, value, found[cell.label]) for value, cell in own if cell.label in found
-        ]
-        for name, own in tuned.items()
-    }
+    points: dict[str, list[Any]] = {}
+    for name, own in tuned.items():
+        finished = [(value, cell.label) for value, cell in own if cell.label in found]
+        points[name] = [kind.point(name, value, found[label]) for value, label in finished]
+    return points
 
 
 def _compared(kind: StudyKind[R], chosen: Mapping[str, Any]) -> Iterator[Cell[R]]:
@@ -276,6 +279,7 @@ def _compared(kind: StudyKind[R], chosen: Mapping[str, Any]) -> Iterator[Cell[R]
 
 def _settings(kind: StudyKind[Any]) -> Iterator[tuple[str, str, int]]:
     """Variant, task or stream, and seed of every compared cell, in the order of measuring."""
+    # Seeds outermost: a study that is interrupted has all variants with the seeds that it has.
     for seed in kind.recipe.seeds:
         for place in kind.places:
             for name in kind.recipe.variants:
@@ -295,11 +299,12 @@ def _ordered(
 ) -> dict[str, dict[Setting, Outcome]]:
     """Variants and cells in the recipe's order, whichever was finished first."""
     settings = [(place, seed) for place in kind.places for seed in kind.recipe.seeds]
-    return {
-        name: {setting: found[name][setting] for setting in settings if setting in found[name]}
-        for name in kind.recipe.variants
-        if name in found
-    }
+    ordered: dict[str, dict[Setting, Outcome]] = {}
+    for name in kind.recipe.variants:
+        if name in found:
+            own = found[name]
+            ordered[name] = {setting: own[setting] for setting in settings if setting in own}
+    return ordered
 
 
 def _write(kind: StudyKind[R], store: CellStore[R], findings: Findings) -> Report:

@@ -60,6 +60,7 @@ def runs(report: PipelineReport) -> list[Path]:
 
 def _kind(raw: object) -> type[Report]:
     """The report that has the table's keys; an older table has none of those with a default."""
+    # No two kinds need the same keys, so that the first that fits is the one.
     for kind in get_args(Report):
         fields = dataclasses.fields(kind)
         known = {field.name for field in fields}

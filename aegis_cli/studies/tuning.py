@@ -125,6 +125,7 @@ def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> 
     for variant, own in points.items():
         compared = measures if rule.reference else own
         best = max(_ability(rule, point) for point in compared)
+        # At least 0, so that a value that diverged, whose ability is -1, is never an able one.
         chosen[variant] = _best(rule, own, max(0, best - within / 100 - ROUNDING))
     return chosen
 

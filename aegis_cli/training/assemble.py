@@ -178,6 +178,8 @@ class TrainingRun:
         if self.plain is not None:
             policy = parallel.filled(self.plain, checkpoint.policy_of(state))
             averaged = nullcontext
+        # The ledger first. If the process ends between the two, the ledger is ahead of the last
+        # checkpoint, and a resumed run cuts it; one that lacked rows it would have to refuse.
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -243,9 +245,11 @@ def build(
     # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     masters = _adapted(recipe, method, backbone, on_event)
-    # The first process writes checkpoints from an unsharded copy.
+    # The first process writes checkpoints from an unsharded copy, which has what the method added.
     plain = copy.deepcopy(policy) if shards and ranks.first else None
     owners = ranks if shards else ALONE
+    # Sharding puts other parameters in the place of these, so that whatever holds on to them comes
+    # after it: the method's groups, the optimizers and the average.
     if shards:
         parallel.shard(policy, recipe.train.precision, device)
     parts = _start(recipe, method, policy, loaded.demos, measured, sites, source, owners, on_event)
@@ -381,7 +385,7 @@ def _learning_sites(
         AegisError: a site of which only a half learns, or none of the kinds that are protected.
     """
     found = {site: kind for site, kind in sites.items() if not structure.frozen(backbone, site)}
-    kinds = options.get("protect", ())
+    kinds = options.get("protect", ())  # only nullspace has such an option
     if any(kind in kinds for kind in sites.values()) and not set(found.values()) & set(kinds):
         raise AegisError(
             f"nothing that learns is of the kinds {', '.join(kinds)}",
@@ -399,7 +403,6 @@ def _vqa_loss(
     chosen = source.choose("train", options["questions"], recipe.seed, checks, on_event)
     asked = chosen.sized(backbone.image_size)
     order = BatchOrder(len(asked.questions), options["batch_size"], recipe.seed)
-
     waits = devices.reading_stalls(backbone.device)
 
     def make(place: tuple[int, Share]) -> tuple[Any, list[str], list[str], Any]:
@@ -413,14 +416,19 @@ def _vqa_loss(
         prepared = backbone.prepare_answers(images, texts, answers) if waits else None
         return images, texts, answers, prepared
 
+    def same_of_next_step(place: tuple[int, Share]) -> tuple[int, Share]:
+        number, share = place
+        return number + 1, share
+
     # A step would wait for images to be decoded and scaled.
-    fetch = prefetch.one_ahead(make, lambda place: (place[0] + 1, place[1])) if waits else make
+    fetch = prefetch.one_ahead(make, same_of_next_step) if waits else make
 
     def loss(seen: Pass) -> Tensor:
         images, texts, answers, prepared = fetch((seen.step, seen.share))
-        said = -backbone.answer_log_likelihood(images, texts, answers, prepared)
+        said = -backbone.answer_log_likelihood(images, texts, answers, prepared)  # [N]
         if seen.total is None:
             return said.mean()
+        # Divided by the questions of all processes: their gradients are added, not averaged.
         return said.sum() / seen.total(said.new_tensor(len(texts)))
 
     return loss
@@ -462,5 +470,6 @@ def expert_shape(
         chunk=recipe.train.chunk,
         width=recipe.expert.width,
         mlp_ratio=recipe.expert.mlp_ratio,
+        # None where they are equal, which is how a shape without grouped queries is written.
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )

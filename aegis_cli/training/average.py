@@ -64,9 +64,11 @@ class Average:
         if not self._parameters or (not isinstance(waited, Tensor) and waited <= 0):
             return
         decay = self._decay_after(step) ** waited
+        # In place through the local rows: the average stays sharded as the weights are.
         means = [rows_here(mean) for mean in self.weights.values()]
         now = [rows_here(p) for p in self._parameters.values()]
         if isinstance(decay, Tensor):
+            # After a step that moved nothing `waited` is 0, the decay 1, and the mean stays.
             torch._foreach_lerp_(means, now, [(1 - decay).float()] * len(means))
         else:
             get_ema_multi_avg_fn(decay)(means, now, None)

@@ -88,11 +88,11 @@ def policy_of(state: State) -> dict[str, Tensor]:
 
 def _running(policy: Policy) -> dict[str, Tensor]:
     """The buffers that training passes write, by the policy's names."""
-    return {
-        f"backbone.{name}.{leaf}": buffer
-        for name, module in structure.averaging(policy.backbone).items()
-        for leaf, buffer in module.named_buffers(recurse=False)
-    }
+    found = {}
+    for name, module in structure.averaging(policy.backbone).items():
+        for leaf, buffer in module.named_buffers(recurse=False):
+            found[f"backbone.{name}.{leaf}"] = buffer
+    return found
 
 
 def save(
@@ -123,9 +123,8 @@ def save(
     """
     going_on = going_on or {}
     target = folder / "checkpoints" / f"{step:06d}"
-    if (target.with_name(LAST) / EXPERT).is_file() and target.with_name(
-        LAST
-    ).resolve() == target.resolve():
+    link = target.with_name(LAST)
+    if (link / EXPERT).is_file() and link.resolve() == target.resolve():
         return target
     aside = target.with_name(f".{target.name}.tmp")
     try:
@@ -147,6 +146,8 @@ def save(
                 meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: state.stateless},
             )
             files.reach_disk(aside)
+            # `last` moves only when the new checkpoint is complete under its own name. What may lie
+            # under that name, as in a run that was taken back to an earlier step, is not `last`.
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
             point_last_at(target)
@@ -196,11 +197,8 @@ def _save_expert(
 ) -> None:
     scales = {"proprio": policy.proprio_scale, "action": policy.action_scale}
     tensors = {f"expert.{name}": t for name, t in policy.expert.state_dict().items()}
-    tensors |= {
-        f"{kind}.{name}": t
-        for kind, scale in scales.items()
-        for name, t in scale.state_dict().items()
-    }
+    for kind, scale in scales.items():
+        tensors |= {f"{kind}.{name}": t for name, t in scale.state_dict().items()}
     artifacts.save(
         path,
         "expert",
@@ -215,6 +213,8 @@ def _save_expert(
 def point_last_at(target: Path) -> None:
     """Let `checkpoints/last` lead to this checkpoint."""
     link = target.with_name(LAST)
+    # A link cannot be changed in one step, but another one can be renamed over it. It is relative,
+    # so that a run folder may be moved.
     fresh = target.with_name(f".{LAST}.tmp")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target.name)
@@ -331,7 +331,10 @@ def is_one(folder: Path) -> bool:
 
 def run_of(path: Path) -> Path | None:
     """The run that a checkpoint's folder lies in; None where it has been taken out of one."""
-    run = (path if path.parent.name == "checkpoints" else path.resolve()).parent.parent
+    # `RUN/checkpoints/last` says by its own name where it lies; of another link only its target
+    # does.
+    inside = path if path.parent.name == "checkpoints" else path.resolve()
+    run = inside.parent.parent
     return run if (run / "recipe.yaml").is_file() else None
 
 
@@ -429,6 +432,8 @@ def _load_expert(
             check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         policy_meta.check(meta, shape.actions, shape.proprio)
         relative_of(meta, shape.actions, shape.proprio)
+    # The expert that the header describes, without memory: the file's tensors are compared with it
+    # before one of that size is made.
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
         for kind, size in (("proprio", shape.proprio), ("action", shape.actions)):
@@ -463,7 +468,7 @@ def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     named = meta.get("cameras", ())
     before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
     found = tuple(before.get(layout.short(name), layout.short(name)) for name in named)
-    known = () if task is None else sim.cameras(task)
+    known = () if task is None else sim.cameras(task)  # the first is the task's own
     if len(found) == 1 and found[0] not in known[1:]:
         return ()  # whatever the only camera is called
     if not set(found) <= {*known}:
@@ -498,6 +503,8 @@ def restore(
         if step_of(path.parent.parent) != step or step < 0:
             raise ValueError(f"a state after {step} steps")
         bare = optimizer_state.said_stateless(saved.header.meta)
+    # Every kind of tensor is checked before the first value is changed. `from_tensors` comes last
+    # among the checks, since it puts its own back at once.
     reused = _reused(path, saved.tensors, policy.backbone)
     average.check(_named(_AVERAGE, saved.tensors), f"the average in '{path}'")
     running, buffers = _running(policy), _named(_BUFFER, saved.tensors)

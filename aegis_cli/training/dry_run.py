@@ -276,6 +276,7 @@ def _needs(
         step_s = _step_s(training, ranks, on_event)
         fits = False  # unless the steps show that it does
     if step_s is not None:
+        # Steps were taken, but no checkpoint was written: its share is still the estimate's.
         needed = memory.peak(device) - base + parts["checkpoint"]
         measured = max(ranks.gathered(needed))
         fits = _fits(needed, free, device, ranks)
@@ -285,6 +286,7 @@ def _needs(
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
     """The most frames that one process passes at once."""
+    # -(-a // b) rounds up: shares differ by one frame at most, and the largest decides.
     return -(-settings.batch_size // (ranks.count * settings.accumulate))
 
 
@@ -292,6 +294,8 @@ def _together(needed: int, device: torch.device, ranks: Ranks) -> int | None:
     """Bytes that the processes on this one's machine need, where they share its memory."""
     if device.type == "cuda" or not ranks.several:
         return None
+    # The launcher numbers the processes of one machine one after the other, and starts as many on
+    # each.
     here = launch.local_world_size()
     first = ranks.rank // here * here
     return sum(ranks.gathered(needed)[first : first + here])
@@ -357,12 +361,14 @@ def _pass_kept(training: TrainingRun, frames: int) -> tuple[int, int]:
     """
     tokens, of_two = _pass_some(training, 2)
     _, of_three = _pass_some(training, 3)
-    return tokens, of_two + (frames - 2) * (of_three - of_two)
+    per_frame = of_three - of_two
+    return tokens, of_two + (frames - 2) * per_frame
 
 
 def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
     """Tokens of a frame, and bytes that a pass keeps of the first frame, so many times over."""
     settings, policy = training.recipe.train, training.policy.train()
+    # One frame over and over, so that passes differ in nothing but how many they are.
     batch = training.demos.batch(training.demos.train[:1].repeat(frames), settings.chunk)
     own: set[int] = set()
     # The storages are held, so that no address is given to another one meanwhile.
@@ -406,8 +412,9 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
     weights = [*training.policy.parameters(), *training.policy.buffers()]
     known = [*weights, *training.average.weights.values()]
     known += [*training.demos.held, *_plain(training)]
+    # What was there before anything was built, and what is counted under another name.
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
-    gc.collect()
+    gc.collect()  # what only waits to be collected is not kept
     alive = _alive(training.policy.backbone.device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in others)
 
@@ -434,6 +441,8 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
         "weights before the step": _remembered(training),
         "activations": activations,
     }
+    # A checkpoint is written between two steps, when what a step takes is free again: only what it
+    # takes beyond that raises the peak.
     more = _while_saving(training) - sum(in_a_step.values())
     return throughout | in_a_step | {"checkpoint": max(0, more)}
 
@@ -545,8 +554,10 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     """Checkpoints that are still to be written."""
     steps, every = recipe.train.steps, recipe.train.checkpoint_every
     done = _done(written)
-    # The last step has one too, whether or not its turn has come.
-    return 0 if done >= steps else -(-steps // every) - done // every
+    if done >= steps:
+        return 0
+    # Rounded up: the last step has one too, whether or not its turn has come.
+    return -(-steps // every) - done // every
 
 
 def _done(written: Sequence[Path]) -> int:

@@ -75,11 +75,12 @@ def owns(optimizer: Optimizer) -> bool:
 def kept(parameter: Tensor) -> dict[str, Tensor]:
     """What a checkpoint has of a parameter's state, as far as shapes and types go."""
     coded = parameter.numel() >= _SMALLEST
-    like = torch.empty_like(parameter, dtype=torch.uint8 if coded else None, device="meta")
-    moment = like if coded else like.float()
+    kind = torch.uint8 if coded else torch.float32
+    moment = torch.empty_like(parameter, dtype=kind, device="meta")
     found = {_COUNT: torch.empty((), device="meta"), "state1": moment, "state2": moment}
     if coded:
-        scales = torch.empty(-(-parameter.numel() // _BLOCK), device="meta")
+        blocks = -(-parameter.numel() // _BLOCK)  # rounded up: the last one may be short
+        scales = torch.empty(blocks, device="meta")
         found |= {"absmax1": scales, "absmax2": scales}
     return found
 

@@ -95,8 +95,11 @@ def continues(out: Path, recipe: Trained) -> bool:
     """
     begun = _begun(out, recipe)
     if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
-        there, here = (backbones.divided(each.backbone)[1] for each in (begun, recipe))
-        if there == here:  # other layers of one model have the same weights, and learn otherwise
+        # A backbone is PATH#LAYERS. Only the path may differ: other layers of one model have the
+        # same weights and the same digest, and learn otherwise.
+        _, layers_there = backbones.divided(begun.backbone)
+        _, layers_here = backbones.divided(recipe.backbone)
+        if layers_there == layers_here:
             begun = dataclasses.replace(begun, backbone=recipe.backbone)
     return recipes.training_part(begun) == recipes.training_part(recipe)
 
@@ -111,9 +114,11 @@ def _differences(there: Trained, here: Trained) -> str:
 
     It names none of two methods' options, since one run has no use for the other's.
     """
-    shared = recipes.training_part(there).keys() & recipes.training_part(here).keys() | {"split"}
+    shared = recipes.training_part(there).keys() & recipes.training_part(here).keys()
+    # A stream's split is part of its training only where it is not the default.
+    shared |= {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
-    return differences(*(_shaping(r, names) for r in (there, here)))
+    return differences(_shaping(there, names), _shaping(here, names))
 
 
 def _shaping(recipe: Trained, names: Collection[str]) -> dict[str, Any]:
@@ -128,10 +133,11 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     For example `train.steps: 450 there, 460 here`.
     """
     old, new = dict(_flat(there)), dict(_flat(here))
-    keys = [key for key in old | new if old.get(key) != new.get(key)]
-    return "; ".join(
-        f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here" for key in keys
-    )
+    found = []
+    for key in old | new:
+        if old.get(key) != new.get(key):
+            found.append(f"{key}: {_said(old.get(key))} there, {_said(new.get(key))} here")
+    return "; ".join(found)
 
 
 def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -144,10 +150,11 @@ def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 def _said(value: Any) -> str:
     """A value on one line, as a recipe has it."""
-    plain = "nothing" if value is None else value
-    return (
-        json.dumps(plain).replace('"', "") if isinstance(plain, bool | list | tuple) else str(plain)
-    )
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool | list | tuple):
+        return json.dumps(value).replace('"', "")  # true instead of True, and lists as YAML's
+    return str(value)
 
 
 def clear(out: Path, ours: bool) -> Path | None:
@@ -182,6 +189,7 @@ def _clear(out: Path, ours: bool) -> Path | None:
     if not any(_is_foreign(path, out) for path in out.rglob("*")):
         shutil.rmtree(out, ignore_errors=True)
         return None
+    # Somebody's own files are never removed: the whole folder makes way under another name.
     aside = _free(out.with_name(f"{out.name}.{time.strftime('%Y-%m-%d_%H%M%S')}"))
     with checkpoint.writing(out):
         out.rename(aside)
@@ -231,13 +239,14 @@ def remove(out: Path) -> None:
 def _is_foreign(path: Path, out: Path) -> bool:
     """Whether Aegis writes no file or folder of that name into a run."""
     parts = path.relative_to(out).parts
-    if files.is_left(out / parts[0]):
+    if files.is_left(out / parts[0]):  # a temporary file of a process that was killed
         return False
     if parts[0] in _FOLDERS:
         return False  # a model's folder holds what its family writes
     if parts[0] == MERGED and (len(parts) > 1 or (path / "recipe.yaml").is_file()):
-        return len(parts) > 1 and _is_foreign(path, out / MERGED)
+        return len(parts) > 1 and _is_foreign(path, out / MERGED)  # a run within the run
     if parts[0] != "checkpoints":
+        # No other folder is Aegis's, so that anything inside one is somebody else's.
         return len(parts) > 1 or not any(fnmatch(parts[0], name) for name in _FILES)
     step = parts[1] if len(parts) > 1 else checkpoint.LAST
     if not (step.isdecimal() or step == checkpoint.LAST or step.startswith(".")):
@@ -344,6 +353,7 @@ def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dic
 def _is_figure(value: Any) -> bool:
     if value is None:
         return True
+    # Every comparison with NaN is false, so that it is no figure; neither is infinity.
     return isinstance(value, int | float) and abs(value) < sys.float_info.max
 
 

@@ -48,6 +48,8 @@ def adapt(
     method.adapt(backbone, free, options)
     if not still.given:
         return
+    # What is named stops something from learning in two ways: parameters that the method would
+    # train, and maps to which a method with modules of its own would add one.
     adds_less = method.export is not None and len(free) < len(maps)
     stops = adds_less or any(p.requires_grad for p in still.parameters.values())
     still.hold()
@@ -113,6 +115,7 @@ def named(backbone: Backbone, freeze: str | Sequence[str] | None) -> Still:
     """
     given, every = names(freeze or ()), _every(backbone)
     own = {name: every[name] for name in sorted(_named(backbone, given))}
+    # A tied weight has several names and is one parameter: under each of them it stands still.
     first = {id(parameter): name for name, parameter in own.items()}
     tied = {}
     for name, parameter in every.items():
@@ -155,6 +158,8 @@ def _named(backbone: Backbone, given: Sequence[str]) -> set[str]:
     """
     found: set[str] = set()
     for pattern in given:
+        # A range has to have both of its ends, or `layers.0-99` would pass in a model of 24 layers.
+        # The pattern itself comes last, so that `matched` is left with all that it names.
         for needed in (*patterns.at_its_ends(pattern), pattern):
             matched = _matched(backbone, needed)
             if not matched:

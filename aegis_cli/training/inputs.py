@@ -35,10 +35,11 @@ class Inputs:
     @classmethod
     def given(cls, demos: Paths, anchor: Path | None) -> Inputs:
         """Those that a command names, from the folder that it is called in."""
-        return cls(
-            tuple(str(p.absolute() if p.exists() else p) for p in mixture.each(demos)),
-            None if anchor is None else str(anchor.absolute()),
-        )
+        places = []
+        for path in mixture.each(demos):
+            # What is not here may be the id of a dataset on the hub, which is no path.
+            places.append(str(path.absolute() if path.exists() else path))
+        return cls(tuple(places), None if anchor is None else str(anchor.absolute()))
 
     def each(self, change: Callable[[str], str]) -> Inputs:
         """The same with every place changed."""
@@ -49,7 +50,7 @@ class Inputs:
 def is_gone(place: str) -> bool:
     """Whether nothing is there; the id of a dataset is the hub's to find."""
     path = Path(place)
-    return path.is_absolute() and not path.exists()
+    return path.is_absolute() and not path.exists()  # what is kept of a file is absolute
 
 
 def keep(out: Path, inputs: Inputs, place: Path | None = None) -> None:
@@ -80,6 +81,7 @@ def of(out: Path) -> Inputs | None:
         return None
     said = files.load_json(path)
     kept = _read(said)
+    # The first version kept no places as seen from the run. Then each stands for itself.
     relative = _read(said[_RELATIVE]) if kept and _RELATIVE in said else kept
     if kept is None or relative is None or len(relative.demos) != len(kept.demos):
         raise AegisError(

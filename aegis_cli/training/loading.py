@@ -87,6 +87,7 @@ def _demonstrations(
     recipe: Recipe, backbone: Backbone, demos: Paths, on_event: OnEvent, ranks: Ranks
 ) -> demonstrations.Demonstrations:
     """The demonstrations; one process per machine decodes their frames, the others reuse them."""
+    # All call `wait` once, the decoding ones after their work: the others find the cache complete.
     decodes = launch.local_rank() == 0
     found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
     ranks.wait()
@@ -179,6 +180,7 @@ def _measured(path: Path, fingerprint: str, method: Method, device: torch.device
 
 def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:
     """Raise AegisError where the anchor lacks what the method needs."""
+    # What users call moments is two parts, `image` and `text`, which are measured together.
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
     missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
@@ -270,6 +272,7 @@ def _warn_of_other_cameras(
     """
     meta = artifacts.read_header(path).meta
     own = meta.get("cameras", [])
+    # One side names no camera and the other at most one: it may well be the same.
     unnamed = not (own and shown) and max(len(own), len(shown)) < 2
     if "demos" not in meta or own == list(shown) or unnamed:
         return

@@ -31,7 +31,7 @@ def plan(out: Path, recipe: Recipe) -> Recipe:
     if recipe.train.extended_from not in (None, there.extended_from):
         return recipe
     plans = there.plans if there.steps == steps else (*there.plans, steps)
-    if plans != tuple(sorted(plans)):
+    if plans != tuple(sorted(plans)):  # fewer steps than before: `folder.check` refuses that
         return recipe
     planned = _replanned(recipe, plans)
     return planned if folder.continues(out, planned) or lengthens(out, planned) else recipe
@@ -90,7 +90,7 @@ def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
             "a run whose backbone moves to its end",
             "begin another run with it: --set backbone=… --set expert.start=…",
         )
-    share = rate_factor(planned, settings)
+    share = rate_factor(planned, settings)  # at the first step of the new plan
     text = (
         f"'{out}' goes on from step {planned} to {settings.steps}; the learning rates rise again "
         f"to {100 * share:.0f} % of their peaks"

@@ -74,12 +74,14 @@ class Masters:
         Afterwards the parameters are float32 again, with the values that they had, and so are their
         gradients: what the block's backward passes leave is added to what was there.
         """
+        # A parameter that changes its type may have no gradient, which is of the same type.
         before = _taken(self._parameters)
         with structure.of_type(self._parameters, BF16):
             try:
                 yield
             finally:
                 found = _taken(self._parameters)
+        # All of them are widened at once, in few kernels, and dealt out again in the same order.
         present = [gradient for gradient in found if gradient is not None]
         wide = iter(structure.of_one_type(present, torch.float32))
         for parameter, known, new in zip(self._parameters, before, found, strict=True):

@@ -79,10 +79,15 @@ def from_tensors(
         AegisError: tensors that are not those of these parameters and optimizers; nothing was put
             back.
     """
-    owner = {id(p): (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}
+    owner: dict[int, tuple[torch.optim.Optimizer, dict[str, Any]]] = {}
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                owner[id(parameter)] = optimizer, group
     states = {label for label in tensors if label.startswith(_OPTIMIZER)}
     expected = {n: p for n, p in parameters.items() if id(p) in owner}
-    # Every parameter has all of its optimizer's state, or nothing of it.
+    # Every parameter has all of its optimizer's state, or nothing of it. An earlier version's file
+    # does not say which have nothing, so that one whose state was lost passes for one of them.
     has_some = {label.partition("/")[2] for label in states}
     bare = expected.keys() - has_some if without is None else set(without)
     wanted: dict[str, Tensor] = {WEIGHT + name: p for name, p in parameters.items()}
@@ -105,6 +110,7 @@ def from_tensors(
         # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter
         # is.
         device = "cpu" if key == _COUNT and not group.get("fused") else parameter.device
+        # A copy, for what was read is memory-mapped, and the optimizer writes into its state.
         value = tensors[label].to(device, copy=True)
         optimizer.state[parameter][key] = value if key == _COUNT else sharded_as(value, parameter)
     for name, saved in coded.items():

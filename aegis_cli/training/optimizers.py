@@ -28,11 +28,15 @@ def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Opti
     """
     learning = [p for p in policy.backbone.parameters() if p.requires_grad]
     parts = [[p] for p in learning] if rate_per_parameter else [learning]
+    # No group is empty, also where nothing of the backbone learns: a step looks up a group's share
+    # of its rate by the first parameter.
     backbone = [_group("backbone", part, settings.backbone_lr) for part in parts if part]
     expert = [_group("expert", list(policy.expert.parameters()), settings.expert_lr)]
     if settings.optimizer == "adamw":
         return [_adamw(backbone + expert, settings)]
-    return [*([_sgd(backbone, settings)] if backbone else []), _adamw(expert, settings)]
+    if not backbone:
+        return [_adamw(expert, settings)]
+    return [_sgd(backbone, settings), _adamw(expert, settings)]
 
 
 def state_bytes(optimizers: Sequence[Optimizer], here: bool = False) -> int:
@@ -41,12 +45,12 @@ def state_bytes(optimizers: Sequence[Optimizer], here: bool = False) -> int:
     Args:
         here: of sharded weights, only those of this process's rows.
     """
-    return sum(
-        _state_bytes(group, rows_here(p) if here else p)
-        for optimizer in optimizers
-        for group in optimizer.param_groups
-        for p in group["params"]
-    )
+    total = 0
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                total += _state_bytes(group, rows_here(parameter) if here else parameter)
+    return total
 
 
 def _state_bytes(group: dict[str, Any], parameter: Tensor) -> int:
@@ -63,12 +67,14 @@ def _moments(group: dict[str, Any]) -> int:
 
 
 def _group(name: str, parameters: list[nn.Parameter], rate: float) -> dict[str, Any]:
+    # `lr` is written anew in each step; the schedule scales `peak`.
     return {"params": parameters, "lr": rate, "peak": rate, "name": name}
 
 
 def _adamw(groups: Groups, settings: Train) -> Optimizer:
     if settings.states == eight_bit.STATES:
         return eight_bit.adamw(groups, settings.weight_decay)
+    # Of PyTorch's AdamW only the fused one heeds `found_inf`, by which step_figures.py stops it.
     return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)
 
 

@@ -208,6 +208,7 @@ def added_up(
     """The sum of each gradient over the processes, by the parameters' ids."""
     parameters = [p for group in groups for p in group]
     given = [gradients[id(p)] for p in parameters]
+    # FSDP has summed those of sharded parameters on their way into `.grad`.
     if not ranks.several or any(map(is_cut, parameters)):
         return dict(gradients)
     # Copies: autograd may give several parameters one and the same tensor.
@@ -220,6 +221,8 @@ def _summed(
     parameters: Iterable[nn.Parameter], gradients: list[Tensor | None], ranks: Ranks
 ) -> list[Tensor | None]:
     """Gradients summed in place; None only where no process has one."""
+    # A sum needs the same tensors from every process. One whose share of the frames has given a
+    # parameter no gradient adds zeros; where nobody has one, it stays None, and the weight is left.
     somewhere = ranks.any(*(g is not None for g in gradients))
     found: list[Tensor | None] = []
     for parameter, gradient, there in zip(parameters, gradients, somewhere, strict=True):

@@ -26,6 +26,7 @@ def prune(out: Path, step: int, count: int) -> None:
     there = {int(path.name): path for path in checkpoint.whole(out)}
     behind = sorted(number for number in there if number <= step)
     for number in {*behind[:-count]} - {best(out, behind)}:
+        # A rename is one step: a checkpoint is there whole, or not at all.
         aside = there[number].with_name(f".{there[number].name}.tmp")
         with checkpoint.writing(out):
             os.rename(there[number], aside)

@@ -24,6 +24,7 @@ def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> flo
 
 def rate_factor(step: int, settings: Train) -> float:
     """The factor on a training's peak learning rates at `step`, by the plan of that step."""
+    # The first plan that the step is still within: what was planned later changes nothing before.
     planned = next((steps for steps in settings.plans if step < steps), settings.steps)
     return warmup_cosine(step, planned, settings.warmup, settings.final_lr_share)
 
@@ -59,6 +60,7 @@ class BatchOrder:
 
     def rows(self, step: int) -> np.ndarray:
         """Row indices [batch] int64 of a step."""
+        # Epochs follow each other without a gap in one endless sequence, which is cut in batches.
         place = np.arange(step * self._batch, (step + 1) * self._batch)
         epochs, offsets = (place // self._size).tolist(), (place % self._size).tolist()
         # Only the orders of the epochs at hand are kept: one, or those that this batch is cut from.
@@ -82,10 +84,16 @@ class BatchOrder:
         """
         first, found = 0, list[np.ndarray]()
         for number, (size, count) in enumerate(self._shares, start=1):
+            # The epoch has the set's draws `begin` to `end`, of all that it ever deals. A round is
+            # `size` of them, so that they lie in one round or in several.
             begin, end = epoch * count, (epoch + 1) * count
-            for each in range(begin // size, -(-end // size)):
-                # The number keeps this generator apart from an epoch's.
+            rounds = range(begin // size, -(-end // size))  # -(-a // b) rounds up
+            for each in rounds:
+                # The number keeps this generator apart from an epoch's. It starts at 1, because
+                # NumPy fills seeds up with zeros: [s, e, 0] would be the generator of [s, e].
                 order = np.random.default_rng([self._seed, each, number]).permutation(size)
-                found.append(first + order[max(0, begin - each * size) : end - each * size])
+                start = each * size
+                found.append(first + order[max(0, begin - start) : end - start])
             first += size
+        # Sorted, so that shares by which each row comes once give the order of no shares at all.
         return np.sort(np.concatenate(found))

@@ -130,6 +130,8 @@ def compute_gradients(
         reuses=reused is not None,
     )
     loss, w2, taken = _all_passes(settings, batch, generator, masters)
+    # Both gradients become the whole batch's before any inner product is taken: that of two sums
+    # is not the sum of the processes' inner products.
     parallel.add_up_gradients(policy, ranks)
     loss = ranks.total(loss)
     if w2 is None:
@@ -139,12 +141,13 @@ def compute_gradients(
             taken = {i: reused.get(name) for i, name in names.items()}
         else:
             taken = parallel.added_up(taken, groups, ranks)
+        # What later steps may reuse stays unmasked: their task gradients have zeros elsewhere.
         anchor = where_task_moves(groups, taken) if parts.keeps_idle else taken
         gram = _combine_gradients(settings, anchor)
         row = LedgerRow(*gram, w2)
         found = StepGradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
-        parts.pull()
+        parts.pull()  # after the combination: nothing projects what it adds to `.grad`
     return found
 
 
@@ -160,22 +163,27 @@ def _all_passes(
     losses, distances = [], []
     taken: dict[int, Tensor | None] = {}
     noise = generator.get_state()
-    each = passes(batch, settings.ranks, settings.accumulate, settings.policy.backbone.device)
-    for number, (part, of) in enumerate(each):
+    device = settings.policy.backbone.device
+    each_pass = passes(batch, settings.ranks, settings.accumulate, device)
+    for number, (part, whole_batch) in enumerate(each_pass):
         generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
         prepared = batch.prepared[number] if batch.prepared else NOT_PREPARED
         with masters.rounded():
-            loss, w2, anchor = _backward(settings, part, of, generator, prepared)
+            loss, w2, anchor = _backward(settings, part, whole_batch, generator, prepared)
         losses.append(loss)
         if w2 is not None:
             distances.append(w2)
         _add(taken, masters.wide(anchor))
-    return torch.stack(losses).sum(), torch.stack(distances).mean(0) if distances else None, taken
+    # A pass's loss is its part of the whole batch's mean, but its W2^2 is that of its own frames.
+    loss = torch.stack(losses).sum()
+    w2 = torch.stack(distances).mean(0) if distances else None  # [L]
+    return loss, w2, taken
 
 
 def _combine_gradients(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
     """Bend the task's gradient by the anchor's, group by group; their inner products before."""
     combine = settings.parts.combine or projection.naive
+    # Only where each process has some rows are its inner products a share of the whole ones.
     total = settings.ranks.total if parallel.is_sharded(settings.policy) else None
     reads = not devices.reading_stalls(settings.policy.backbone.device)
     gram, _ = combine_gradients(settings.groups, anchor, combine, total, reads)
@@ -186,7 +194,8 @@ def own_rows(rows: Rows, ranks: Ranks, accumulate: int = 1) -> Rows:
     """Which of a step's rows this process takes, those of its first pass first."""
     places: list[int] = []
     for share in shares(ranks, accumulate):
-        places.extend(range(len(rows))[share.rows(len(rows))])
+        within = share.rows(len(rows))
+        places += range(within.start, within.stop)
     return rows[places]
 
 
@@ -201,11 +210,14 @@ def passes(
 ) -> Iterator[tuple[RobotBatch, WholeBatch]]:
     """This process's frames of each pass, and the batch that they are a share of."""
     if batch.of_step is not None:
+        # Counted when the batch was prepared: to ask the others would wait for a GPU in each step.
         frames, shown = batch.of_step
     else:
         frames, shown = len(batch), int((~batch.is_pad).sum())
         if ranks.several:
             frames, shown = ranks.total(torch.tensor([frames, shown], device=device)).tolist()
+    # `rows` are places in the whole step. Here this process's shares follow each other without a
+    # gap, so that of those places only the number counts.
     begin = 0
     for share in shares(ranks, accumulate):
         rows = share.rows(frames)
@@ -252,7 +264,7 @@ def first_frames(batch: RobotBatch, fraction: float) -> RobotBatch:
 def _backward(
     settings: _Settings,
     batch: RobotBatch,
-    of: WholeBatch,
+    whole_batch: WholeBatch,
     generator: torch.Generator,
     prepared: PreparedPass,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
@@ -271,31 +283,40 @@ def _backward(
     def encode_part() -> Pass:
         shown = first_frames(batch, parts.fraction)
         with devices.autocast(device, settings.precision), torch.enable_grad():
-            return _encode(settings, shown, of, prepared.anchor_inputs, prepared.by_method)[1]
+            inputs = prepared.anchor_inputs
+            return _encode(settings, shown, whole_batch, inputs, prepared.by_method)[1]
 
     with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
         # A backbone that gets no gradient needs no graph, which would only take memory.
         with torch.set_grad_enabled(not method.stop_gradient):
-            encoding, seen = _encode(settings, batch, of, prepared.inputs, prepared.by_method)
+            inputs = prepared.inputs
+            encoding, seen = _encode(settings, batch, whole_batch, inputs, prepared.by_method)
         if method.stop_gradient:
             # Before torch 2.11 autocast keeps weights that it has rounded without a graph for later
             # passes with one, such as a method's own, and these then give the weights no gradient.
             torch.clear_autocast_cache()
         loss = policy.flow_loss(
-            batch, encoding, settings.flow_samples, generator, method.stop_gradient, of
+            batch, encoding, settings.flow_samples, generator, method.stop_gradient, whole_batch
         )
-        whole = loss
+        objective = loss  # what the task's gradient is of; the report's loss stays the task's own
         if parts.auxiliary is not None:
-            whole = loss + parts.auxiliary(seen) / settings.accumulate
+            # The task's loss has the whole batch's divisor already; this one is a pass's own mean.
+            objective = loss + parts.auxiliary(seen) / settings.accumulate
+    # Backward passes run outside autocast, as PyTorch asks: each operation goes back in the type
+    # in which it went forward.
     if parts.penalty is None:
-        whole.backward()
+        objective.backward()
         return loss.detach(), None, {}
-    w2, taken = _dual_backward(settings, whole, seen, encode_part)
+    w2, taken = _dual_backward(settings, objective, seen, encode_part)
     return loss.detach(), w2.detach(), taken
 
 
 def _encode(
-    settings: _Settings, frames: RobotBatch, of: WholeBatch, inputs: Batch | None, by_method: Any
+    settings: _Settings,
+    frames: RobotBatch,
+    whole_batch: WholeBatch,
+    inputs: Batch | None,
+    by_method: Any,
 ) -> tuple[Encoding, Pass]:
     """The backbone's pass over frames, and what a method sees of it.
 
@@ -304,7 +325,7 @@ def _encode(
         by_method: what the method has made of them.
     """
     backbone, ranks = settings.policy.backbone, settings.ranks
-    if inputs is None:
+    if inputs is None:  # on a CPU nothing is prepared ahead
         inputs = backbone.prepare(frames.images, frames.instructions)
     encoding = backbone.encode(inputs)
     seen = Pass(
@@ -314,7 +335,7 @@ def _encode(
         mask=encoding.mask,
         image=encoding.image,
         frames=frames,
-        share=of.share,
+        share=whole_batch.share,
         total=ranks.total if ranks.several else None,
         prepared=by_method,
     )
@@ -322,29 +343,31 @@ def _encode(
 
 
 def _dual_backward(
-    settings: _Settings, whole: Tensor, seen: Pass, encode_part: Callable[[], Pass]
+    settings: _Settings, objective: Tensor, seen: Pass, encode_part: Callable[[], Pass]
 ) -> tuple[Tensor, dict[int, Tensor | None]]:
     """Go back from the loss and from the penalty.
 
     Args:
-        whole: what the task's gradient is of.
+        objective: what the task's gradient is of.
         encode_part: passes the share of the frames that the anchor gradient is taken on.
     """
     penalty_of, parts = settings.parts.penalty, settings.parts
     assert penalty_of is not None
     if settings.reuses:
+        # The ledger has this step's own W2^2 all the same; it costs no backward pass.
         with torch.no_grad():
             _, w2 = penalty_of(seen)
-        whole.backward()
+        objective.backward()
         return w2, {}
     if parts.fraction < 1:
-        whole.backward()  # lets go of the whole graph before the small one is made
+        objective.backward()  # lets go of the whole graph before the small one is made
         penalty, w2 = penalty_of(encode_part())
     else:
         penalty, w2 = penalty_of(seen)
-        whole.backward(retain_graph=True)
+        objective.backward(retain_graph=True)  # g goes into `.grad`; the penalty needs the graph
     sharded = parallel.is_sharded(settings.policy)
     again = second_backward_of_rows if sharded else second_backward
+    # a is returned and leaves `.grad` alone. Divided, so that the passes' sum is their mean.
     return w2, again(settings.groups, penalty / settings.accumulate)
 
 
@@ -352,8 +375,11 @@ def _add(total: dict[int, Tensor | None], more: Mapping[int, Tensor | None]) -> 
     """Add a pass's anchor gradient to those before."""
     for i, gradient in more.items():
         known = total.get(i)
-        # Never in place: autograd may give several parameters one and the same tensor.
-        total[i] = gradient if known is None else known if gradient is None else known + gradient
+        if known is None:
+            total[i] = gradient
+        elif gradient is not None:
+            # Never in place: autograd may give several parameters one and the same tensor.
+            total[i] = known + gradient
 
 
 def _learning_names(backbone: Backbone) -> dict[int, str]:

@@ -84,10 +84,14 @@ class UnreadFigures:
         parts = [found.loss.reshape(1), norm.reshape(1)]
         if found.row is not None:
             parts += [found.row.tt, found.row.ta, found.row.aa, found.row.w2]
+        # One tensor [2 + 3 G + L] per step, so that `taken` needs one transfer for all steps.
         figures = torch.cat([part.detach().double() for part in parts])
         self._steps.append((index, figures, [len(part) for part in parts]))
         if self.deferred:
+            # Plain arithmetic on the device stands for `if`, which would have to read the flag.
             broken = (~figures.isfinite().all()).float()
+            # Once 1 it stays 1: the run ends at the first broken step, and what was queued after it
+            # may not move the weights either.
             self._broken = broken if self._broken is None else self._broken.maximum(broken)
             before = index if self.moves is None else self.moved
             self.moves = 1 - self._broken.double()
@@ -110,9 +114,10 @@ class UnreadFigures:
         every = torch.cat([figures for _, figures, _ in steps]).cpu()
         found = every.split([sum(sizes) for _, _, sizes in steps])
         for (index, _, sizes), figures in zip(steps, found, strict=True):
-            loss, norm, *columns = figures.split(sizes)
+            loss, norm, *columns = figures.split(sizes)  # columns: tt, ta, aa [G] and w2 [L]
             row = LedgerRow(*columns) if columns else None
             checked = {"loss": float(loss), "gradient norm": float(norm)}
             if row is not None:
+                # The largest stands for all of a column: PyTorch's max is NaN where any entry is.
                 checked |= {f"largest {n}": float(x.abs().max()) for n, x in vars(row).items()}
             yield StepFigures(index, checked, row)

@@ -111,8 +111,11 @@ def tell(recipe: Recipe, out: Path, name: str, report: Mapping[str, Any], step: 
 def _measured(name: str, report: Mapping[str, Any], step: int) -> Measured:
     """The plain figures of a report, and its table if it has one."""
     table = next((report[key] for key in _TABLES if report.get(key)), {})
+    # The first line's figures are the columns: a measurement has the same ones for every line.
     columns = list(_numbers(next(iter(table.values()), {})))
-    rows = [[line, *(figures[column] for column in columns)] for line, figures in table.items()]
+    rows = []
+    for line, figures in table.items():
+        rows.append([line, *(figures[column] for column in columns)])
     video = report.get("video")
     return Measured(
         name,
@@ -126,6 +129,7 @@ def _measured(name: str, report: Mapping[str, Any], step: int) -> Measured:
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     plain = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    # A bool is an int to Python, and no curve to a tracker.
     return {name: value for name, value in plain.items() if not isinstance(value, bool)}
 
 
@@ -152,7 +156,7 @@ def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> 
     def log(line: Mapping[str, float]) -> None:
         for name, value in _figures(line).items():
             writer.add_scalar(name, value, int(line["step"]))
-        writer.flush()
+        writer.flush()  # by itself it writes every two minutes, and a killed run would lose them
 
     def show(found: Measured) -> None:
         for name, value in found.figures.items():

@@ -121,6 +121,7 @@ def run(
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out, places = Path(out), inputs.Inputs.given(demos, anchor)
+    # One process writes and speaks, so that one lock holds the folder for all of them.
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if resume:
@@ -131,6 +132,7 @@ def run(
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
             restored = _restore(training, places)
+            # Where all steps are behind it, `_train` takes none and reports what there is.
             if restored[0] >= recipe.train.steps:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
@@ -141,6 +143,7 @@ def run(
                 inputs.keep(out, places)
             return _train(training, *restored, on_event)
         if ranks.first:
+            # Everything has been loaded and checked by now; only then is an old run removed.
             if overwrite:
                 folder.remove(out)
             folder.begin(out, recipe)
@@ -190,6 +193,8 @@ def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event:
     learned = inputs.of(before)
     if learned is None or learned.demos != places.demos:
         return
+    # Which episodes are held out follows from the share, the seed, and which are learned from; and
+    # from how many there are, which the digests tell.
     begun = recipes.load(before / "recipe.yaml", kind=Recipe)
     splits = {(each.train.validation_share, each.seed, each.demos.only) for each in (begun, recipe)}
     there = artifacts.read_header(before / LEDGER).inputs
@@ -220,6 +225,7 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
         How many steps lie behind it, and the sums since the last line of metrics.
     """
     state = checkpoint.kept_state(run.out)
+    # The header alone: other inputs are refused before gigabytes of state are read.
     with _reading_state(run.out):
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
@@ -231,6 +237,8 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
             run.out, run.policy, run.optimizers, run.average
         )
     _check_behind(run, done, meta, kept, lines)
+    # A run that was killed may have written more ledger and metrics than its last checkpoint
+    # knows of. The steps after that are taken again.
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
     window = Window()
@@ -393,6 +401,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             _take_step(run, index, batches, window, due)
             if index == done:
                 warn_of_written(run.policy.backbone, buffers, on_event)
+            # First the line: by its validation loss the checkpoint chooses which others stay.
             if due.line:
                 shown = _log(run, finished, window, due.validation, on_event)
                 log(shown)
@@ -401,6 +410,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 _save(run, finished)
             told = {k: shown[k] for k in ("loss",) if k in shown}
             on_event(Progress("train", finished, settings.steps, "steps", told))
+            # All processes leave together: one that went on alone would wait for the others.
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
                 _save_interrupted(run, finished, window)
                 signaled.leave()
@@ -418,6 +428,8 @@ class _Due:
     @classmethod
     def after(cls, finished: int, settings: Train) -> _Due:
         """What is due after so many steps; the last has all."""
+        # The end of an earlier plan counts as well: a run that was planned as long from the start
+        # writes what one that was made longer has written.
         last = finished in settings.plans
         save = finished % settings.checkpoint_every == 0 or last
         validate = finished % settings.validate_every == 0 or last
@@ -436,6 +448,7 @@ def _take_step(
     batch = next(batches)
     fetched = time.perf_counter()
     with _good_steps_saved(run):
+        # Neither a checkpoint nor a validation may see an update that is still to be constrained.
         update(run, index, batch, window, settle=due.checkpoint or due.validation)
         if due.line:
             read_figures(run, window)
@@ -501,10 +514,19 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         frames = of_step[own]
         batch = run.demos.batch(frames, settings.chunk)
         if settings.augment is not None:
-            drawn_from = settings.augment, settings.augment_count
+            # A batch may have a frame twice, each time with another draw. Which of them this one is
+            # counts among all of the step's frames, whoever takes the others.
             repeats = torch.tensor(augment.earlier(of_step.tolist()))[own].tolist()
-            drawn = frames.tolist(), *drawn_from, seed, index, repeats
-            batch = dataclasses.replace(batch, images=augment.augmented(batch.images, *drawn))
+            images = augment.augmented(
+                batch.images,
+                frames.tolist(),
+                settings.augment,
+                settings.augment_count,
+                seed,
+                index,
+                repeats,
+            )
+            batch = dataclasses.replace(batch, images=images)
         return prepared(run, batch, of_step, index) if waits else batch
 
     return fetch
@@ -521,6 +543,7 @@ def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) ->
     settings, parts = run.recipe.train, run.parts
     size = run.demos.size(frames, settings.chunk)
     sharing = run.ranks, settings.accumulate
+    # A step that reuses an anchor gradient passes no frames of its own for one.
     fraction = 1.0 if parts.reuses(index) else parts.fraction
     return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction, parts.prepare)
 
@@ -595,6 +618,8 @@ def validation_noise(seed: int) -> int:
 
 
 def _seed(seed: int, index: int, stream: int) -> int:
+    # Seeds are 1,000,003 steps apart, and a step has room for four streams. A generator on the CPU
+    # takes the lower 32 bits of this, which differ for all steps of a run below 2^30.
     return (seed * 1_000_003 + index) * 4 + stream
 
 
@@ -631,6 +656,8 @@ def update(
         accumulate=settings.accumulate,
         masters=run.masters,
     )
+    # Over backbone and expert together, and after the projection, which it does not undo: a scaled
+    # gradient is as orthogonal to the anchor gradient as it was.
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
     if not run.unread.deferred:
@@ -644,8 +671,10 @@ def update(
         move = partial(_move, run, factor)
         left, moves = rate_left(index, settings), run.unread.moves
         run.stepper.step(index + 1, move, result.anchor, left, moves)
+        # The backbone's last step is constrained in any case: none after it would be its turn.
         if settle or index + 1 == moving:
             run.stepper.settle()
+    # Weights that wait to be constrained do not enter the average as they are.
     if not run.stepper.pending:
         run.average.follow(run.unread.moved)
 
@@ -661,7 +690,7 @@ def read_figures(run: TrainingRun, window: Window) -> None:
     for step_figures in run.unread.taken():
         index, row = step_figures.index, step_figures.row
         if not step_figures.finite:
-            run.stepper.settle()
+            run.stepper.settle()  # who catches the error saves the weights of the good steps
         check_finite(step_figures.checked, f"at step {index + 1}", LOWER, index)
         window.loss += step_figures.checked["loss"]
         if row is not None:
@@ -675,6 +704,7 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
     With `still`, the backbone's rate is 0.
     """
     shares = {} if still or run.parts.shares is None else run.parts.shares()
+    # `rate` is the schedule's, which the log shows; `lr`, which the optimizer reads, may be less.
     for group in run.rates:
         group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
     for group, rate in zip(run.rates, _rates(run, shares), strict=True):
@@ -688,6 +718,7 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
 def _rates(run: TrainingRun, shares: Mapping[Tensor, float | Tensor]) -> list[float | Tensor]:
     """The learning rate of each group of parameters, of which a method may leave a share."""
     found: list[float | Tensor] = [group["rate"] for group in run.rates]
+    # A method with shares has every parameter of the backbone in a group of its own.
     left = [shares.get(group["params"][0], 1.0) for group in run.rates]
     unread = {index: share for index, share in enumerate(left) if isinstance(share, Tensor)}
     if unread:
@@ -715,6 +746,7 @@ def _log(
         settings, noise = run.recipe.train, validation_noise(run.recipe.seed)
         batches = min(len(run.demos.validation), VALIDATION_FRAMES) / settings.batch_size
         heard = on_event if batches * line["step_s"] > _LONG_S else ignore
+        # Of the weights that a checkpoint holds, seen as training's passes see them.
         with run.average.in_place(), run.masters.rounded():
             loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
@@ -744,13 +776,15 @@ def validation_loss(
     """
     held_out, backbone = len(demos.validation), policy.backbone
     frames = demos.validation[spread.rows(held_out, VALIDATION_FRAMES)]
+    # Steps of all frames' chunks that are no padding. Every batch's loss is divided by it, so that
+    # their sum is the mean over all frames.
     _, shown = demos.size(frames, settings.chunk)
 
     def prepare(part: Tensor) -> tuple[Tensor, RobotBatch, Ranks, int]:
         """This process's frames of a batch, who shares it, and in how many passes."""
         # Where there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
-        passes = getattr(settings, "accumulate", 1)
+        passes = getattr(settings, "accumulate", 1)  # a stream of robot tasks has no such key
         passes = passes if len(part) >= sharing.count * passes else 1
         numbers = step.own_rows(part, sharing, passes)
         own = demos.batch(numbers, settings.chunk)
@@ -766,13 +800,15 @@ def validation_loss(
     ):
         for numbers, own, sharing, passes in ready:
             losses = []
-            each = [batch for batch, _ in step.passes(own, sharing, passes, backbone.device)]
-            shares = numbers.split(list(map(len, each)))
-            for batch, made, mine in zip(each, own.prepared, shares, strict=True):
-                drawn = _draws(mine, settings.flow_samples, batch, noise)
+            batches = [batch for batch, _ in step.passes(own, sharing, passes, backbone.device)]
+            numbers_of_each = numbers.split([len(batch) for batch in batches])
+            each_pass = zip(batches, own.prepared, numbers_of_each, strict=True)
+            for batch, prepared_pass, frame_numbers in each_pass:
+                drawn = _draws(frame_numbers, settings.flow_samples, batch, noise)
                 with devices.autocast(backbone.device, settings.precision):
-                    encoding = backbone.encode(made.inputs.to(backbone.device))
+                    encoding = backbone.encode(prepared_pass.inputs.to(backbone.device))
                     losses.append(policy.flow_loss_at(batch, encoding, *drawn, shown))
+            # `ALONE` sums over nobody: where all pass all frames, each has the whole loss already.
             total += sharing.total(torch.stack(losses).sum()).item()
             done = min(done + settings.batch_size, len(frames))
             on_event(Progress("validation", done, len(frames), "frames"))
@@ -821,7 +857,7 @@ def _report(run: TrainingRun) -> TrainReport:
         loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.parts.dual else None,
-        step_s=times[len(times) // 2],
+        step_s=times[len(times) // 2],  # the median: the first step pays for what is done once
         cameras=list(run.demos.cameras),
         out=str(run.out),
     )

@@ -22,6 +22,7 @@ BEGUN = "begun"  # the stage of a run that has been started, finished or not
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
+    # Canonical JSON: equal keys give equal text, in whatever order they were put together.
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -101,6 +102,7 @@ class StageRecords:
         if self.due(stage, key, outputs) is None:
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
+        # Noted only afterwards: a stage that was interrupted is not up to date.
         make(self.named(stage))
         self.keep(stage, key, outputs)
 
@@ -110,8 +112,8 @@ class StageRecords:
         if before is None:
             return "has not run yet"
         if before != digest(key):
-            changed = ", ".join(self.changed(stage, key))
-            return f"what it reads has changed: {changed or 'keys of the recipe, files or the version'}"
+            changed = self.changed(stage, key) or ["keys of the recipe, files or the version"]
+            return f"what it reads has changed: {', '.join(changed)}"
         # The key first, because outputs may be gigabytes to read.
         kept, found = self._record(stage)["outputs"], self._hashes(outputs)
         for name in sorted(kept.keys() | found.keys()):
@@ -149,6 +151,7 @@ class StageRecords:
             )
 
         if name is None:
+            # A slash, as in `suite/cartpole-swingup`, would be a folder.
             name = f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
         return self.shared(name, key, make)
 
@@ -174,6 +177,7 @@ class StageRecords:
         for path in [self._path(""), *sorted((self.folder / "stages").rglob("*.json"))]:
             if path.is_file():
                 begun = [stage for stage in _load(path) if stage.endswith(f"/{BEGUN}")]
+                # No digest is the empty text, so that the key of no stage is equal to it.
                 files.save_json(path, {stage: {"key": "", "outputs": {}} for stage in begun})
         self._records.clear()
 

@@ -276,6 +276,13 @@ def test_which_tokens_are_drawn_follows_the_seed_alone() -> None:
     assert torch.equal(values(1), values(1)) and not torch.equal(values(1), values(2))
 
 
+def test_every_process_draws_tokens_of_its_own() -> None:
+    rows, drawn = torch.arange(100)[:, None], inputs.Drawn(0.5, 3)
+    chosen = [d.of(rows, d.generator()) for d in map(drawn.of_process, range(3))]
+    assert drawn.of_process(0) == drawn  # one process alone draws as ever
+    assert len({tuple(each.flatten().tolist()) for each in chosen}) == 3
+
+
 @given(count=st.integers(1, 50), share=st.floats(0.01, 1.0))
 def test_of_any_number_of_rows_a_share_is_drawn_once_each(count: int, share: float) -> None:
     rows = torch.arange(count)[:, None]

@@ -34,6 +34,7 @@ def locate(name: str) -> Path:
         AegisError: no such model, or one whose path is no text, which no reader of it takes.
     """
     name = divided(name)[0]
+    # The disk goes before the hub: a folder `models/x` is no id.
     if (here := _on_disk(name)) is not None:
         files.check_utf8(here, files.RENAME)
         return here

@@ -338,11 +338,11 @@ class Backbone(nn.Module, ABC):
         owners, named = owning_modules(self), dict(self.named_parameters())
         owners = {name: m for name, m in owners.items() if not under(name, self.idle)}
         kinds = {name: site_kind(module) for name, module in owners.items()}
-        lone = {
-            name: lone_rows(name, module) or self._held_rows(name, module)
-            for name, module in owners.items()
-            if kinds[name] is None
-        }
+        # What no input describes can still be protected, by holding it still.
+        lone = {}
+        for name, module in owners.items():
+            if kinds[name] is None:
+                lone[name] = lone_rows(name, module) or self._held_rows(name, module)
         without = [name for name, rows in lone.items() if not rows]
         if without:
             unknown = [f"{name} ({type(owners[name]).__name__})" for name in without]

@@ -36,6 +36,7 @@ class _Kept:
 
 def _passed(layer: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
     """What the layer makes of its arguments."""
+    # By its class: the layer's own `forward` is the `CompiledForward` that calls this.
     return type(layer).forward(layer, *arguments, **named)
 
 

@@ -89,5 +89,6 @@ def class_weights(encoder: DualEncoder, classes: Sequence[str], templates: Seque
     Each template holds one "{}", which the class's name takes the place of.
     """
     texts = [template.format(name) for name in classes for template in templates]
-    means = encoder.text_features(texts).view(len(classes), len(templates), -1).mean(1)
+    features = encoder.text_features(texts).view(len(classes), len(templates), -1)
+    means = features.mean(1)  # [C, D], shorter than 1 where templates differ
     return nn.functional.normalize(means, dim=-1)

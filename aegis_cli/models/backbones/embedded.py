@@ -103,10 +103,10 @@ class Layer(nn.Module):
         Returns:
             The output, in the shape of x, and its keys and values [B, h, N*S, d] each.
         """
-        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1))
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1))  # [B, N, S, 3, h, d]
         query, key, value = qkv.permute(3, 0, 4, 1, 2, 5).unbind(0)  # [B, h, N, S, d] each
         mixed = block_attention(query, KeyValue(key, value), own_mask, prefix)
-        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))
+        x = x + self.out(mixed.permute(0, 2, 3, 1, 4).flatten(3))  # of [B, N, S, h * d]
         x = x + self.down(squared_relu(self.up(self.norm2(x))))
         return x, KeyValue(key.flatten(2, 3), value.flatten(2, 3))
 
@@ -161,6 +161,7 @@ class EmbeddedVLM(Backbone):
         """
         x = self.words(ids) + self.text_position(torch.arange(ids.shape[-1], device=ids.device))
         mask = additive(_prefix_causal(ids, prompt_length, self.tokenizer.pad)).unsqueeze(1)
+        # [B, 1, N, S, S], the same for all heads. Layer i reads the image's keys of layer i.
         hidden, keys_values = [], []
         for layer, prefix in zip(self.layers, image, strict=True):
             x, kv = layer(x, mask, prefix)
@@ -183,14 +184,14 @@ class EmbeddedVLM(Backbone):
 
     def encode(self, batch: Batch) -> Encoding:
         image_hidden, image = self.image_pass(batch.pixels)
-        length = batch.mask.sum(-1, keepdim=True)
+        length = batch.mask.sum(-1, keepdim=True)  # [B, 1]: all of the text is prompt
         text_hidden, text = self.text_pass(batch.ids.unsqueeze(1), length, image)
         hidden = []
         for of_image, of_text in zip(image_hidden, text_hidden, strict=True):
             hidden.append(torch.cat([of_image, of_text.squeeze(1)], dim=1))
         joined = []
         for of_image, of_text in zip(image, text, strict=True):
-            key = torch.cat([of_image.key, of_text.key], dim=2)
+            key = torch.cat([of_image.key, of_text.key], dim=2)  # [B, h, image + text tokens, d]
             value = torch.cat([of_image.value, of_text.value], dim=2)
             joined.append(KeyValue(key, value))
         count, device = image_hidden[0].shape[1], batch.mask.device
@@ -227,6 +228,8 @@ class EmbeddedVLM(Backbone):
         rows = [self.tokenizer.prompt(text) for text in questions]
         prompt_length = torch.tensor([[len(row)] for row in rows], device=self.device)
         answers: list[list[int]] = [[] for _ in rows]
+        # Each round passes the whole text anew, of 20 tokens at most; the image is passed once. All
+        # rows go on to the last round, and `decode` cuts each at its first end.
         for _ in range(MAX_ANSWER if most is None else min(most, MAX_ANSWER)):
             ids, mask = self._pad([row + said for row, said in zip(rows, answers, strict=True)])
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, image)
@@ -250,8 +253,9 @@ class EmbeddedVLM(Backbone):
         hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
         scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
         # The scores at a position are those of the token after it.
-        chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)
+        chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)  # [B, S - 1]
         position = torch.arange(ids.shape[1] - 1, device=self.device)
+        # The prompt's last token predicts the answer's first.
         in_answer = (position >= prompt_length - 1) & mask[:, 1:]
         return (chosen * in_answer).sum(-1)
 
@@ -277,8 +281,10 @@ class EmbeddedVLM(Backbone):
             # The backward pass of index_select is several times faster than k[own]'s on a CPU.
             shared = [KeyValue(k.index_select(0, own), v.index_select(0, own)) for k, v in image]
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, shared)
-            scores = self.logits(hidden[-1]).squeeze(1)
+            scores = self.logits(hidden[-1]).squeeze(1)  # [rows, length, V]
             position = torch.arange(length, device=self.device)
+            # From the prompt's last token, which predicts the first word, to the last word, which
+            # predicts the end. Selected row by row, in the order of `question` below.
             found.append(scores[(position >= prompt_length - 1) & (position < length - 1)])
             for i in chosen:
                 question += [i] * len(said[i])
@@ -293,6 +299,7 @@ class EmbeddedVLM(Backbone):
         assert isinstance(images, Tensor)
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
+        # The sum counts the runs up to each row, so that less one it is the number of its own.
         row = send(begins.cumsum(0) - 1, self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
         found = []
@@ -377,10 +384,11 @@ def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
     Tokens of the prompt attend both ways, those after it causally, and none to padding.
     """
     position = torch.arange(ids.shape[-1], device=ids.device)
-    in_prompt = position < prompt_length.unsqueeze(-1)
-    causal = position[:, None] >= position[None, :]
+    in_prompt = position < prompt_length.unsqueeze(-1)  # [B, N, S]
+    # The last dimension is that of the keys: what may be seen, by all or by what comes after it.
+    causal = position[:, None] >= position[None, :]  # [S, S]
     allowed = causal | in_prompt.unsqueeze(-2)
-    is_token = (ids != pad).unsqueeze(-2)
+    is_token = (ids != pad).unsqueeze(-2)  # [B, N, 1, S]
     # The diagonal keeps a padded row from attending to nothing at all.
     itself = torch.eye(len(position), dtype=torch.bool, device=ids.device)
     return (allowed & is_token) | itself

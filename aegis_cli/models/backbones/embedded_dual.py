@@ -54,7 +54,7 @@ class Stem(nn.Module):
     def forward(self, pixels: Tensor) -> Tensor:
         x = self.patch(pixels)
         x = x + self.mix(F.relu(x))
-        tokens = self.token(F.relu(x))  # [B, D, 4, 4]
+        tokens = self.token(F.relu(x))  # [B, D, 4, 4], each of 5 x 5 patches that overlap
         return tokens.flatten(2).transpose(1, 2) + self.position.weight
 
 
@@ -141,10 +141,10 @@ class EmbeddedDual(DualEncoder):
 
     def id_features(self, ids: Tensor) -> Tensor:
         """The hidden state [N, D] at the end of each text of ids [N, T], which has read it all."""
-        mask = additive(ids != self.tokenizer.pad)[:, None, None, None]
+        mask = additive(ids != self.tokenizer.pad)[:, None, None, None]  # [N, 1, 1, 1, T]
         tokens = self.words(ids) + self.position.weight[: ids.shape[1]]  # [N, T, D]
         hidden = self.text(tokens, mask)
-        end = (ids == self.tokenizer.end).int().argmax(1)
+        end = (ids == self.tokenizer.end).int().argmax(1)  # [N]; every text has exactly one
         return self.text.feature(hidden[torch.arange(len(ids), device=ids.device), end])
 
     def scale(self) -> Tensor:

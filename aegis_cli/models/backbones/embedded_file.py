@@ -85,6 +85,7 @@ def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, 
     with outline(path):
         check_heads(shape.width, shape.heads)
         wanted = model_type(shape, vocabulary).state_dict()
+    # Not exact: a file may be in half precision, and the model is float32.
     check_state(f"'{path}'", tensors, wanted, exact=False)
     model = model_type(shape, vocabulary)
     model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})

@@ -42,6 +42,7 @@ def loading(folder: Path, what: str) -> Generator[None]:
     try:
         yield
     except _UNLOADABLE as error:
+        # A Git LFS pointer in the place of weights has an error of its own, with its cure.
         for path in model_folder.weights(folder):
             files.refuse_pointer(path)
         if "torchvision" in str(error).lower():

@@ -103,6 +103,9 @@ class HFBackbone(Backbone):
         self.depth = len(self._layers)
         self.kv_heads, self.head_dim = self._measure_keys()
 
+    # Both are looked up whenever they are needed: a module that is kept as an attribute would be a
+    # part of this one a second time, with further names for its weights.
+
     @property
     def _layers(self) -> nn.ModuleList:
         return self.get_submodule(self._layers_path)  # type: ignore[return-value]
@@ -168,6 +171,7 @@ class HFBackbone(Backbone):
 
     def encode(self, batch: Batch) -> Encoding:
         with recording(self._layers, self._rotary) as seen:
+            # Without its head: an action expert reads no scores of words.
             self.vlm.base_model(**_arguments(batch), use_cache=False)
         return self._encoding(seen, batch)
 
@@ -269,7 +273,7 @@ class HFBackbone(Backbone):
         assert isinstance(self.vlm, transformers.GenerationMixin)
         with _greedy(self.vlm):
             said = self.vlm.generate(**_arguments(batch), max_new_tokens=max(most))
-        rows = said[:, batch.ids.shape[1] :].tolist()
+        rows = said[:, batch.ids.shape[1] :].tolist()  # what is generated follows the prompts
         return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
@@ -323,7 +327,7 @@ class HFBackbone(Backbone):
         batch, lengths, said = answered.batch.to(self.device), answered.lengths, answered.said
         # Each position has as many scores as the vocabulary has words, and where images differ in
         # size a batch has a thousand positions. So none is scored but those that predict an answer.
-        first = min(lengths) - 1
+        first = min(lengths) - 1  # the earliest of them; scores are of the positions from it on
         rows: list[int] = []
         columns: list[int] = []
         for row, (length, words) in enumerate(zip(lengths, said, strict=True)):
@@ -336,7 +340,7 @@ class HFBackbone(Backbone):
         log_shares = scores.log_softmax(-1)
         # What predicts the end has no word; there the first stands for none.
         words = send(torch.tensor([word for own in said for word in (*own, 0)]), self.device)
-        of_words = log_shares.gather(1, words[:, None]).squeeze(1)
+        of_words = log_shares.gather(1, words[:, None]).squeeze(1)  # [sum of words + 1]
         # Any of the end tokens ends the answer, so their probabilities add up.
         ends = send(torch.tensor(self._ends()), self.device)
         of_ends = log_shares.index_select(1, ends).logsumexp(1)
@@ -363,6 +367,7 @@ class HFBackbone(Backbone):
         # The shapes matter because an image of another size may become another number of tokens.
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
+        # Equal sizes need no padding, so that every token that a hook sees is a true one.
         parts: list[list[int]] = []
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]

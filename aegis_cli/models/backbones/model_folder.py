@@ -89,6 +89,7 @@ def stored_type(folder: Path) -> str:
     """Name of the type that all weights in the files are of; float32 where they differ."""
     found = set()
     for path in weights(folder):
+        # Only headers are read: `get_slice` does not load a tensor.
         with safe_open(path, framework="np") as opened:
             for name in sorted(opened.keys()):
                 found.add(opened.get_slice(name).get_dtype())
@@ -185,6 +186,7 @@ def check_path(model: nn.Module, layers: str) -> nn.ModuleList:
     """
     modules = dict(model.named_modules())
     lists = {name: module for name, module in modules.items() if isinstance(module, nn.ModuleList)}
+    # By the `rotary_emb` beside it a language model's list is told from other lists of blocks.
     rotated = []
     for name in lists:
         parent = name.rpartition(".")[0]

@@ -83,7 +83,8 @@ class StandInProcessor:
         **_: Any,
     ) -> dict[str, torch.Tensor]:
         """Each row's images [B, n, 3, H, W] (PaliGemma: [B n, 3, H, W]) and tokens [B, S]."""
-        pixels = torch.stack([torch.stack([self._pixels(i) for i in own]) for own in images])
+        rows_of_pixels = [torch.stack([self._pixels(image) for image in own]) for own in images]
+        pixels = torch.stack(rows_of_pixels)  # [B, n, 3, H, W]
         rows = [self.tokenizer.ids(said) for said in text]
         longest = max(map(len, rows))
         ids = torch.full((len(rows), longest), _PAD)

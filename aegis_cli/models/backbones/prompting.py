@@ -125,7 +125,9 @@ class Prompter:
     def padded(self, batch: Batch, multiple: int) -> Batch:
         """The batch, padded on the right to a multiple of that many tokens where the model can."""
         rows, length = batch.ids.shape
-        room = rows, min(-(-length // multiple) * multiple, max(self._longest, length))
+        rounded_up = -(-length // multiple) * multiple
+        # The model has no positions beyond `_longest`.
+        room = rows, min(rounded_up, max(self._longest, length))
         if room[1] == length:
             return batch
         ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)

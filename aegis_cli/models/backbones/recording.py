@@ -39,6 +39,7 @@ class Seen:
         assert self.positions is not None
         # Qwen2.5-VL counts time, height and width apart: [3, B, T].
         positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
+        # [1, T] for all rows, or [B, T]. Padding is below any position, so that it is no maximum.
         return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
 
 
@@ -86,6 +87,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
         def hook(
             module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
         ) -> tuple[tuple[Any, ...], dict[str, Any]]:
+            # In the place of the layer's own cache, which is None: no answer is generated here.
             return arguments, named | {cache_argument(module): _PassThrough(seen, number)}
 
         return hook
@@ -94,6 +96,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
         return lambda keys_values: seen.keys_values.__setitem__(number, keys_values)
 
     def asks(_: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        # rotary_emb(x, position_ids)
         seen.positions = named["position_ids"] if "position_ids" in named else arguments[1]
 
     with contextlib.ExitStack() as stack:

@@ -36,6 +36,7 @@ class Shape:
     parameters: int
 
 
+# SmolVLM puts 4 x 4 neighbouring patches into one token: (512 / 16 / 4)^2 = 64 of an image.
 _SMOL = {"scale_factor": 4, "tie_word_embeddings": False}
 _SMOL_TEXT = {
     "model_type": "llama",
