@@ -13,7 +13,7 @@ import re
 import sys
 import textwrap
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,7 @@ class ScoresReport:
     Attributes:
         before, after: where the scores were read.
         scores: one for each metric of each task, in the tasks' alphabetical order.
+        left_out: tasks that only one of the two was asked.
         max_drop: points; None without a gate. gate: what of a drop it limits.
         passed: whether every score passes; None without a gate.
     """
@@ -79,6 +80,7 @@ class ScoresReport:
     before: str
     after: str
     scores: list[ScoreDrop]
+    left_out: list[str]
     max_drop: float | None
     gate: str
     passed: bool | None
@@ -120,13 +122,17 @@ def run(
             interval.
 
     Raises:
-        AegisError: no samples, no task or score in common, or questions that differ.
+        AegisError: no samples, no task or score in common, or questions that differ; under a gate
+            also a task of which only the first model has samples.
     """
     if before.exists() and after.exists() and before.samefile(after):
         found = f"'{before}' before and after"
         raise AegisError(found, "the scores of two models", "give the other one's folder")
     first, second = _tasks(before, on_event), _tasks(after, on_event)
-    _warn_of_lone(first.keys() ^ second.keys(), before, after, on_event)
+    lone = sorted(first.keys() ^ second.keys())
+    if max_drop is not None:
+        _refuse_unjudged(first.keys() - second.keys(), before, after)
+    _warn_of_lone(lone, before, after, on_event)
     scores: list[ScoreDrop] = []
     tasks = sorted(first.keys() & second.keys())
     reading = _Reading([path for task in tasks for path in (first[task], second[task])], on_event)
@@ -141,7 +147,7 @@ def run(
             "ask both models the same --tasks",
         )
     passed = None if max_drop is None else all(score.passed for score in scores)
-    return ScoresReport(str(before), str(after), scores, max_drop, gate, passed)
+    return ScoresReport(str(before), str(after), scores, lone, max_drop, gate, passed)
 
 
 def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
@@ -185,9 +191,20 @@ def _named(path: Path) -> tuple[str, str] | None:
     return None
 
 
-def _warn_of_lone(tasks: set[str], before: Path, after: Path, on_event: OnEvent) -> None:
+def _refuse_unjudged(tasks: Set[str], before: Path, after: Path) -> None:
+    """A gate would pass by an evaluation that had ended before it came to these tasks."""
     if tasks:
         names = ", ".join(sorted(tasks))
+        raise AegisError(
+            f"no samples in '{after}' of {names}, of which '{before}' has some",
+            "samples of every task of both models, where --max-drop is to judge",
+            "ask the second model the same --tasks, or take these files out of the first folder",
+        )
+
+
+def _warn_of_lone(tasks: Sequence[str], before: Path, after: Path, on_event: OnEvent) -> None:
+    if tasks:
+        names = ", ".join(tasks)
         on_event(Warned("scores", f"not in both '{before}' and '{after}', and left out: {names}"))
 
 

@@ -197,10 +197,24 @@ def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, 
     lmms(after, "textvqa_val", rows_of({"exact_match": [1.0] * 10}), LATER)
     lmms(after, "pope", rows_of({"pope_accuracy": [1.0]}))
     events: list[Any] = []
-    (found,) = harness_scores.run(before, after, on_event=events.append).scores
+    report = harness_scores.run(before, after, on_event=events.append)
+    (found,) = report.scores
     assert found.after == 1.0 and found.drop_points == pytest.approx(-10)
     assert f"'{LATER}_samples_textvqa_val.jsonl'" in heard(events)
-    assert "left out: pope" in heard(events)
+    assert "left out: pope" in heard(events) and report.left_out == ["pope"]
+
+
+def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
+    two: tuple[Path, Path],
+) -> None:
+    """Its evaluation may have ended before it came to that task."""
+    before, after = two
+    lmms(after, "docvqa", rows_of({"anls": [1.0]}))  # only asked of the second: nothing to judge
+    assert harness_scores.run(before, after, max_drop=50).passed
+    lmms(before, "pope", rows_of({"pope_accuracy": [1.0]}))
+    assert harness_scores.run(before, after).left_out == ["docvqa", "pope"]
+    with pytest.raises(AegisError, match="no samples in '.*after' of pope, of which '.*before'"):
+        harness_scores.run(before, after, max_drop=50)
 
 
 def refused(before: Path, after: Path) -> str:
