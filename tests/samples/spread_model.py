@@ -64,7 +64,7 @@ def guarded(anchors: dict[str, Path], name: str, place: str | None) -> Tensor:
     if method == "kfac":
         _only_maps_learn(model)
     guard = Guard(model, anchors[method], vision="vision", **options)
-    guarded_steps(model, guard)
+    guarded_steps(model, guard, steps=2)
     guard.remove()
     return torch.cat([p.detach().to("cpu").flatten() for p in model.parameters()])
 

@@ -198,9 +198,13 @@ def test_a_finished_study_is_told_from_its_cells_alone(
 
 
 def test_overwrite_measures_every_cell_again(
-    small: StudyRecipe, finished: tuple[Path, StudyReport], tmp_path: Path, trained: list[str]
+    small: StudyRecipe,
+    finished: tuple[Path, StudyReport],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shutil.copytree(finished[0] / "small", tmp_path / "small", symlinks=True)
+    trained = invent(monkeypatch)
     again = stage.run(small, tmp_path, overwrite=True)
     cells = files.load_json(tmp_path / "small" / "cells.json")
     assert (
