@@ -380,7 +380,7 @@ def test_a_failed_gate_ends_the_block_for_ci(tmp_path: Path) -> None:
 
 # Keys below these are names of things: methods, layers, groups, files.
 NAMES_BELOW = {"families", "inputs", "outputs", "seconds", "groups", "memory_mb", "statistics"}
-NAMES_BELOW |= {"trainings"}
+NAMES_BELOW |= {"trainings", "parts"}
 # What lies below these is somebody else's: a recipe's keys, and what a header says of its kind.
 OPAQUE = {"recipe", "facts"}
 

@@ -19,7 +19,7 @@ from aegis_cli.anchors import measure
 from aegis_cli.cli.app import app
 from aegis_cli.common import files, launch, leading, ranks
 from aegis_cli.common.errors import AegisError, Diverged, PeerLost
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import Event, OnEvent, Progress, ignore
 from aegis_cli.evaluation import probe, results
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
@@ -54,8 +54,10 @@ class Job:
     def run(self) -> None:
         """Train here, alone or with the processes that the environment speaks of."""
 
-        def die(event: Progress) -> None:
-            if event.stage == "train" and event.done == self.killed_after:
+        def die(event: Event) -> None:
+            if not isinstance(event, Progress) or event.stage != "train":
+                return
+            if event.done == self.killed_after:
                 os._exit(1)
 
         train.run(
