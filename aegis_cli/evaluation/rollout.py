@@ -15,7 +15,7 @@ import torch
 from aegis_cli import sim
 from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.common.pictures import fit
 from aegis_cli.core import ensemble as temporal
@@ -139,7 +139,8 @@ Sizes = tuple[tuple[int, int], ...]
 class Acting(NamedTuple):
     """A policy ready to act in a task; `replan` actions of each predicted chunk are executed.
 
-    `ensemble` is the decay of its temporal ensemble, which predicts at every step.
+    `ensemble` is the decay of its temporal ensemble, which predicts at every step. `rate` is known
+    of a policy that was trained in no task: the actions per second that it means.
     """
 
     policy: Policy
@@ -148,6 +149,7 @@ class Acting(NamedTuple):
     cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
     ensemble: float | None = None
     sizes: Sizes = ()
+    rate: float | None = None
 
 
 Load = Callable[[Path, str | None], Acting]
@@ -163,7 +165,8 @@ def load_run(run: Path, task: str | None) -> Acting:
     cameras = checkpoint.cameras_of(meta, meta["task"] or task)
     acts_in = _task(policy, meta["task"], task)
     sizes = checkpoint.sizes_of(meta)
-    return Acting(policy, acts_in, meta["replan"], cameras, meta.get("ensemble"), sizes)
+    rate = meta.get("fps") if meta["task"] is None else None
+    return Acting(policy, acts_in, meta["replan"], cameras, meta.get("ensemble"), sizes, rate)
 
 
 def run(
@@ -209,7 +212,9 @@ def run(
         media.check_video(video_out)
     gl.check()
     asked = task
-    policy, task, planned, cameras, own, sizes = (load or load_run)(Path(run_path), asked)
+    policy, task, planned, cameras, own, sizes, rate = (load or load_run)(Path(run_path), asked)
+    if rate is not None:
+        _check_rate(rate, task, on_event)
     # Whoever asks for another number of executed actions does without the policy's own ensemble,
     # which executes one.
     decay = own if ensemble is None and replan is None else ensemble
@@ -402,6 +407,17 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
             found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot"
         )
     return asked
+
+
+def _check_rate(rate: float, task: str, on_event: OnEvent) -> None:
+    """Warn of a task whose steps have another length than those of a policy's training."""
+    own = sim.make(task).spec.control_hz
+    if not math.isclose(own, rate, rel_tol=1e-3):
+        text = (
+            f"'{task}' has {own:g} steps a second, and the policy was trained on {rate:g}: its "
+            "actions are meant for steps of another length"
+        )
+        on_event(Warned("rollout", text))
 
 
 def _begin(

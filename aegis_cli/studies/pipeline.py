@@ -143,6 +143,31 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
         return ""
+    if (unclear := _why_no_loss_is_told(naive)) is not None:
+        return unclear
+    lost = f"{max(_drops(naive)):.1f} points of VQA"
+    most = max(_drops(naive)) * _KEPT_SHARE
+    others = [row for row in rows if row.method != "naive"]
+    kept = [row for row in others if max(_drops(row)) <= most]
+    if not kept:
+        return (
+            f"No method here kept VQA: naive lost {lost}, and each of the others over half of it."
+        )
+
+    def ability(row: PolicyFigures) -> float:
+        acts = _acts(row)
+        return -math.inf if acts is None else acts  # what was not measured is never the best
+
+    best = max(kept, key=ability)
+    of = ", each of the questions that it lost most of" if naive.others else ""
+    return (
+        f"{best.method} lost {max(_drops(best)):.1f} points of VQA where naive lost "
+        f"{max(_drops(naive)):.1f}{of}, at {_at_what(best, naive)} (one seed)."
+    )
+
+
+def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
+    """Why naive's questions do not tell that it has lost anything; None where they do."""
     sets = [naive, *naive.others.values()]
     if all(asked.baseline_accuracy <= asked.majority_accuracy for asked in sets):
         before, common = 100 * naive.baseline_accuracy, 100 * naive.majority_accuracy
@@ -161,32 +186,19 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
             f"naive lost {lost}, or none: its 95 % interval is {low:.1f} to {high:.1f}. So few "
             "questions do not tell who kept VQA; raise probe.questions."
         )
-    most = max(_drops(naive)) * _KEPT_SHARE
-    others = [row for row in rows if row.method != "naive"]
-    kept = [row for row in others if max(_drops(row)) <= most]
-    if not kept:
-        return (
-            f"No method here kept VQA: naive lost {lost}, and each of the others over half of it."
-        )
+    return None
 
-    def ability(row: PolicyFigures) -> float:
-        acts = _acts(row)
-        return -math.inf if acts is None else acts  # what was not measured is never the best
 
-    best = max(kept, key=ability)
-    if naive.success_seen is None:
-        at = f"an open-loop error of {best.open_loop_error:.3f} where naive has "
-        at += f"{naive.open_loop_error:.3f}"
-        if best.hold_error is not None:
-            at += f" and a robot that holds its position {best.hold_error:.3f}"
-    else:
-        at = f"{_percent(best.success_seen):.1f} % success where naive has "
-        at += f"{_percent(naive.success_seen):.1f} %"
-    of = ", each of the questions that it lost most of" if naive.others else ""
-    return (
-        f"{best.method} lost {max(_drops(best)):.1f} points of VQA where naive lost "
-        f"{max(_drops(naive)):.1f}{of}, at {at} (one seed)."
-    )
+def _at_what(best: PolicyFigures, naive: PolicyFigures) -> str:
+    """How the best method acts, beside naive."""
+    if naive.success_seen is not None:
+        ours, its = _percent(best.success_seen), _percent(naive.success_seen)
+        return f"{ours:.1f} % success where naive has {its:.1f} %"
+    error = f"an open-loop error of {best.open_loop_error:.3f} where naive has "
+    error += f"{naive.open_loop_error:.3f}"
+    if best.hold_error is not None:
+        error += f" and a robot that holds its position {best.hold_error:.3f}"
+    return error
 
 
 def _drops(row: PolicyFigures) -> list[float]:

@@ -491,22 +491,8 @@ class PolicyRunner:
         episodes that training has held out. No value is chosen by that, so none is measured for
         tuning.
         """
-        self.train(label, recipe)
-        run_folder.renew_recipe(self.folder / label, recipe)
-        trained = files.load_json(self.folder / label / run_folder.JOBS_REPORT)
-        _remove_misplaced(self.folder / label)
-        if recipe.merge.method is not None:
-            self.merge(label, recipe)
-            run_folder.renew_recipe(self._policy(label, recipe), recipe)
-            merged = files.load_json(self._policy(label, recipe) / run_folder.MERGE_REPORT)
-            trained["validation_loss"] = merged["validation_loss"]
-        asked = {}
-        for number, settings in enumerate(recipe.probe.of_each_set(), start=1):
-            probed = self.probe(label, recipe, settings, number, validation)
-            asked[settings.only_set] = _vqa_figures(probed)
-        if recipe.anchor.source == "demos":
-            # The distance of questions from robot frames is no drift.
-            asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
+        trained = self._trained(label, recipe)
+        asked = self._asked(label, recipe, validation)
         first, *further = asked  # the table's own columns are of the first set
         last = self._policy(label, recipe) / "checkpoints" / "last"
         header = artifacts.read_header(last / checkpoint.EXPERT)
@@ -538,6 +524,31 @@ class PolicyRunner:
             code=version.code(),
             others={name: asked[name] for name in further},
         )
+
+    def _trained(self, label: str, recipe: Recipe) -> dict[str, Any]:
+        """Train and merge; the training's report, with the validation loss of what is measured."""
+        self.train(label, recipe)
+        run_folder.renew_recipe(self.folder / label, recipe)
+        report = files.load_json(self.folder / label / run_folder.JOBS_REPORT)
+        _remove_misplaced(self.folder / label)
+        if recipe.merge.method is not None:
+            self.merge(label, recipe)
+            out = self._policy(label, recipe)
+            run_folder.renew_recipe(out, recipe)
+            merged = files.load_json(out / run_folder.MERGE_REPORT)
+            report["validation_loss"] = merged["validation_loss"]
+        return report
+
+    def _asked(self, label: str, recipe: Recipe, validation: bool) -> dict[str, VqaFigures]:
+        """What was kept of each set of questions, by its name."""
+        asked = {}
+        for number, settings in enumerate(recipe.probe.of_each_set(), start=1):
+            probed = self.probe(label, recipe, settings, number, validation)
+            asked[settings.only_set] = _vqa_figures(probed)
+        if recipe.anchor.source == "demos":
+            # The distance of questions from robot frames is no drift.
+            asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
+        return asked
 
     def train(self, label: str, recipe: Recipe) -> None:
         """Train the cell; its report lies in the run."""

@@ -22,6 +22,7 @@ from samples.small_run import recipe
 from aegis_cli import sim
 from aegis_cli.common import artifacts, media
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
 from aegis_cli.common.palette import HELD_OUT, RGB, SEEN
 from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
@@ -428,6 +429,23 @@ def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[S
     assert timeless(first) == timeless(second) and first.episodes_per_s > 0
     paths = [[s.proprio.tobytes() for s in env.shown] for env in envs]
     assert paths[:3] == paths[3:] and len(set(paths[0])) > 5  # the same steps, and it moves
+
+
+@pytest.mark.parametrize(("rate", "warnings"), [(None, 0), (10.0, 0), (30.0, 1)])
+def test_steps_of_another_length_than_the_trainings_are_warned_of(
+    rate: float | None, warnings: int, run_folder: Path
+) -> None:
+    """Which only a policy can have that was trained in no task."""
+    assert sim.make("reach").spec.control_hz == 10.0
+
+    def load(folder: Path, task: str | None) -> rollout.Acting:
+        return rollout.load_run(folder, task)._replace(rate=rate)
+
+    events: list[Event] = []
+    rollout.run(run_folder, None, 1, "seen", on_event=events.append, load=load)
+    said = [event.text for event in events if isinstance(event, Warned)]
+    assert len(said) == warnings
+    assert all("'reach' has 10 steps a second" in text and "on 30" in text for text in said)
 
 
 def test_a_checkpoint_is_rolled_out_by_its_own_folder(

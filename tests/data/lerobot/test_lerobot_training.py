@@ -643,7 +643,8 @@ def test_a_policy_of_no_simulated_task_plays_one_that_fits(
     assert "--task reach" in refused(aegis("rollout", tmp_path / "run", "--episodes", 1))
     err = refused(aegis("rollout", tmp_path / "run", "--task", "point", "--episodes", 1))
     assert "6 positions and 2 actions for task 'point'" in err
-    code, out, _ = aegis("rollout", tmp_path / "run", "--task", "reach", "--episodes", 1, "--json")
-    assert code == 0 and json.loads(out)["task"] == "reach"
+    played = aegis("rollout", tmp_path / "run", "--task", "reach", "--episodes", 1, "--json")
+    assert played[0] == 0 and json.loads(played[1])["task"] == "reach"
+    assert "warning" not in played[2]  # its steps are as long as the training's
     code, out, _ = aegis("inspect", tmp_path / "run", "--json")
     assert code == 0 and json.loads(out)["facts"]["task"] is None
