@@ -111,6 +111,7 @@ def run(
         AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
     """
     _check(task, episodes, noise, workers, drop_below)
+    noise = abs(noise)  # NumPy takes -0.0 for a negative deviation
     _check_form(Path(out), form, as_video, cameras)
     sim.check_cameras(task, cameras)
     gl.check()

@@ -11,11 +11,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from random import Random
+from typing import Any, get_args, get_type_hints
 
+import typer.main
 from campaign import forks, world
 from campaign.subjects import contents, leftovers, own_copy, wrong_end
+
+from aegis_cli.cli.app import app
+from aegis_cli.recipes import Recipe
 
 _SHORT = ("--set", "train.steps=12", "--set", "train.checkpoint_every=3")
 _TRAIN = ("train", world.RECIPE, *world.TRAIN, *_SHORT)
@@ -41,6 +47,16 @@ _READERS: tuple[tuple[str, ...], ...] = (
     ("train", world.RECIPE, *world.TRAIN, "--out", "run"),  # refused, for it is there
     ("inspect", "nothing"),
 )
+_COUNTING: tuple[tuple[str, ...], ...] = (
+    *_READERS[4:6],
+    *((*command, option, f"new-{command[0]}") for command, option in _WRITERS[1:3]),
+    ("merge", "run", "--method", "factors", "--vqa", world.ASKED, "--out", "new-merge"),
+)
+# The ends of what options and keys take, and past them. Large counts are legal, and take long.
+_ODD: dict[type, tuple[str, ...]] = {
+    int: ("-100000000000000000000", "-1", "0", "1", "2"),
+    float: ("-1", "-0.0", "0", "1e-300", "1e-30", "1", "1e30", "1e300", "inf", "nan"),
+}
 
 
 @dataclass(frozen=True)
@@ -204,6 +220,51 @@ def little_memory(case: Case) -> Outcome:
     return f"{' '.join(command[:2])}, {more >> 10} KB more", ended.code, case.fails(ended)
 
 
+def odd_value(case: Case) -> Outcome:
+    """A number that nobody would think of: it is taken, or refused by its name."""
+    if case.rng.random() < 0.5:
+        name, kind = case.rng.choice(_keys())
+        given = f"--set {name}={case.rng.choice(_ODD[kind])}"
+        command: tuple[str, ...] = (*_TRAIN, "--out", "new", *given.split(maxsplit=1))
+    else:
+        command = case.rng.choice(_COUNTING)
+        option, kind = case.rng.choice(_options(command[0]))
+        given = f"{option}={case.rng.choice(_ODD[kind])}"
+        command = (*command, given)
+    ended = forks.run(command, case.place)
+    return f"{command[0]} {given}", ended.code, case.fails(ended, may=(1,))
+
+
+@cache
+def _keys() -> list[tuple[str, type]]:
+    """The keys of a training with `aegis` that are numbers, and which."""
+    hints = get_type_hints(Recipe)
+    found = []
+    for section in ("train", "expert", "aegis"):
+        for field, hint in get_type_hints(hints[section]).items():
+            if (kind := _number(hint)) is not None:
+                found.append((f"{section}.{field}", kind))
+    return found
+
+
+@cache
+def _options(name: str) -> list[tuple[str, type]]:
+    """The options of a command that are numbers, and which."""
+    command: Any = typer.main.get_command(app)
+    found = []
+    for option in command.commands[name].params:
+        kind = _number(option.type_descriptor.annotation)
+        if option.param_type_name == "option" and kind is not None:
+            found.append((option.opts[0], kind))
+    return found
+
+
+def _number(hint: Any) -> type | None:
+    """int or float, where a value is one of them or may be left out; else None."""
+    kinds = [kind for kind in (hint, *get_args(hint)) if kind in (int, float)]
+    return kinds[0] if kinds else None
+
+
 TROUBLES: dict[str, Callable[[Case], Outcome]] = {
     "two writers": two_writers,
     "an input overwritten": overwritten_input,
@@ -213,6 +274,7 @@ TROUBLES: dict[str, Callable[[Case], Outcome]] = {
     "an odd output": odd_output,
     "closed streams": closed_streams,
     "little memory": little_memory,
+    "an odd value": odd_value,
 }
 
 

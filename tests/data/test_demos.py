@@ -124,6 +124,13 @@ def test_same_bytes_from_one_worker_and_two(recorded: Recorded, tmp_path: Path) 
     assert two.workers == 2 and two.sha256 == recorded[0].sha256
 
 
+def test_no_noise_is_none_with_either_sign(tmp_path: Path) -> None:
+    """NumPy takes -0.0 for a negative deviation."""
+    for name, noise in (("plus", 0.0), ("minus", -0.0)):
+        demos.run("point", 1, 0, tmp_path / name, noise=noise, workers=1)
+    assert (tmp_path / "plus").read_bytes() == (tmp_path / "minus").read_bytes()
+
+
 def test_another_seed_gives_other_bytes(recorded: Recorded, tmp_path: Path) -> None:
     assert (
         demos.run("reach", 12, 4, tmp_path / "other.safetensors", workers=1).sha256
