@@ -3,8 +3,8 @@
     python docs/checkpoint_time.py --backbone random:smolvlm2-256m
 
 One step of `stop-gradient` on frames of noise is taken, and the checkpoint after it saved. Then as
-many bytes are written to one file of the same disk, which is waited for. What is printed: MB, and the
-seconds of both.
+many bytes are written to one file of the same disk, which is waited for. What is printed: MB, and
+the seconds of both.
 """
 
 from __future__ import annotations
