@@ -34,6 +34,11 @@ def canonical(obj: Any) -> str:
     return json.dumps(obj, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
+def sha256_value(obj: Any) -> str:
+    """Hex digest of a value's `canonical` text; equal values have equal ones."""
+    return hashlib.sha256(canonical(obj).encode()).hexdigest()
+
+
 def sha256_file(path: str | Path) -> str:
     """Hex digest of a file's bytes."""
     with reading(path, "check the path"), open(path, "rb") as file:

@@ -7,7 +7,6 @@ own classes, and what is measured is the accuracy on every task, with the task t
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.common.files import canonical
+from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.learners.base import Learner
 from aegis_cli.continual.report import ImageStreamReport, StreamReport, as_rows
@@ -270,7 +269,7 @@ def image_set(recipe: StreamRecipe) -> str:
         found: Any = streams.edition(recipe.stream)
     else:
         found = {name: folders.contents(Path(recipe.path) / name) for name in _folder_names(recipe)}
-    return hashlib.sha256(canonical(found).encode()).hexdigest()
+    return sha256_value(found)
 
 
 def _folder_tasks(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:

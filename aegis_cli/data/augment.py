@@ -57,10 +57,11 @@ def augmented(
 
     if isinstance(images, Tensor):
         return torch.stack([changed(image, place, 0) for place, image in enumerate(images)])
-    return [
-        tuple(changed(image, place, camera) for camera, image in enumerate(several))
-        for place, several in enumerate(images)
-    ]
+    found = []
+    for place, several in enumerate(images):
+        # Each camera draws for itself, as LeRobot's do.
+        found.append(tuple(changed(image, place, n) for n, image in enumerate(several)))
+    return found
 
 
 def earlier(frames: Sequence[int]) -> list[int]:
@@ -75,7 +76,9 @@ def earlier(frames: Sequence[int]) -> list[int]:
 
 def _augmented(image: Tensor, names: Sequence[str], count: int, draw: Draw) -> Tensor:
     """One image [H, W, 3] uint8; it is rounded once, after the last transformation."""
-    drawn = sorted(draw.choice(len(names), min(count, len(names)), replace=False).tolist())
+    count = min(count, len(names))
+    # Sorted, because they do not commute, and LeRobot applies them in their order.
+    drawn = sorted(draw.choice(len(names), count, replace=False).tolist())
     changed = image.permute(2, 0, 1).float() / 255
     for number in drawn:
         changed = TRANSFORMATIONS[names[number]](changed, draw)
@@ -105,7 +108,7 @@ def sharpness(image: Tensor, factor: float) -> Tensor:
         return image
     kernel = torch.ones(3, 3)
     kernel[1, 1] = 5
-    kernel = (kernel / kernel.sum()).expand(3, 1, 3, 3)
+    kernel = (kernel / kernel.sum()).expand(3, 1, 3, 3)  # one for each channel by itself
     smooth = image.clone()
     smooth[:, 1:-1, 1:-1] = F.conv2d(image[None], kernel, groups=3)[0]
     return _blend(image, smooth, factor)
@@ -116,7 +119,8 @@ def hue(image: Tensor, turn: float) -> Tensor:
     red, green, blue = image
     high, low = image.max(0).values, image.min(0).values
     spread = high - low
-    divisor = torch.where(spread == 0, 1.0, spread)
+    divisor = torch.where(spread == 0, 1.0, spread)  # greys have no hue, and any will do
+    # Which colour is strongest says in which third of the circle the hue lies.
     by_red = (green - blue) / divisor
     by_green = (blue - red) / divisor + 2
     by_blue = (red - green) / divisor + 4
@@ -134,7 +138,9 @@ def affine(image: Tensor, degrees: float, right: int, down: int) -> Tensor:
     # Where each new pixel comes from, in pixels from the centre: the inverse of the movement.
     x = torch.arange(width) - (width - 1) / 2 - right
     y = (torch.arange(height) - (height - 1) / 2 - down)[:, None]
-    source = torch.stack([(cos * x + sin * y) * 2 / width, (cos * y - sin * x) * 2 / height], -1)
+    # `grid_sample` wants both from -1 to 1, from one border of the image to the other.
+    across, along = (cos * x + sin * y) * 2 / width, (cos * y - sin * x) * 2 / height
+    source = torch.stack([across, along], -1)  # [H, W, 2]
     return F.grid_sample(image[None], source[None], "nearest", "zeros", align_corners=False)[0]
 
 
@@ -143,7 +149,7 @@ def _blend(image: Tensor, other: Tensor, factor: float) -> Tensor:
 
 
 def _grey(image: Tensor) -> Tensor:
-    """[H, W]."""
+    """The grey levels [H, W] of an image [3, H, W]."""
     return torch.einsum("chw,c->hw", image, torch.tensor(_GREY))
 
 

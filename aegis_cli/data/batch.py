@@ -56,6 +56,7 @@ class Normalizer(nn.Module):
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
         """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
         x = rows.double()
+        # NumPy's, since `torch.quantile` refuses more than 2**24 numbers.
         low, high = torch.from_numpy(np.quantile(x.numpy(), (0.01, 0.99), axis=0))
         return cls.scaled((low + high) / 2, (high - low) / 2, _never_varies(x))
 
@@ -73,7 +74,9 @@ class Normalizer(nn.Module):
         return cls(middle.float(), std.float())
 
     def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) / torch.where(self.std == 0, 1.0, self.std)
+        """Normalised values of raw x [..., D]."""
+        scale = torch.where(self.std == 0, 1.0, self.std)  # a fixed dimension is centred alone
+        return (x - self.mean) / scale
 
     def invert(self, x: Tensor) -> Tensor:
         """The raw values behind normalised x [..., D]."""

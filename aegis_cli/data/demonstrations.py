@@ -106,12 +106,14 @@ class Demonstrations:
             "action_names": (self.action_names, self.tensors["actions"]),
             "proprio_names": (self.proprio_names, self.tensors["proprio"]),
         }
-        found: dict[str, Any] = {
-            key: list(names)
-            for key, (names, rows) in told.items()
-            if all(names) and len(names) == rows.shape[1] > 0
-        }
-        return found if self.fps is None else {**found, "fps": self.fps}
+        found: dict[str, Any] = {}
+        for key, (names, values) in told.items():
+            # Datasets may leave single numbers without a name, which is then an empty text.
+            if all(names) and len(names) == values.shape[1] > 0:
+                found[key] = list(names)
+        if self.fps is not None:
+            found["fps"] = self.fps
+        return found
 
     def fitted(self, sizes: Sequence[tuple[int, int]]) -> Demonstrations:
         """The same demonstrations, whose frames are shown in one (height, width) per camera."""
@@ -142,13 +144,17 @@ class Demonstrations:
     @cached_property
     def without_instruction(self) -> Tensor:
         """Numbers of the episodes that were read in which an instruction is empty or blank."""
-        blank = torch.tensor([not text.strip() for text in self.instructions])
-        return self.episode_of[self.read[blank[self.instruction_of[self.read]]]].unique()
+        is_blank = torch.tensor([not text.strip() for text in self.instructions])
+        without = self.read[is_blank[self.instruction_of[self.read]]]  # frame numbers
+        return self.episode_of[without].unique()
 
     def images(self, frame: Tensor) -> Images:
         """What a policy sees at frames [B]: [B, H, W, 3], or B tuples of one image per camera."""
-        seen = [frames[frame] for frames in self.frames]
-        return seen[0] if len(seen) == 1 else list(zip(*seen, strict=True))
+        seen = [frames[frame] for frames in self.frames]  # [B, H, W, 3] of each camera
+        if len(seen) == 1:
+            return seen[0]
+        # Cameras may have different sizes, so that their images cannot be one tensor.
+        return list(zip(*seen, strict=True))
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
         """Frames [B] with the `chunk` actions of the expert that begin there.
@@ -167,10 +173,11 @@ class Demonstrations:
 
     def chunks(self, frame: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
         """The actions [B, chunk, A] of `batch` at frames [B], and what is padding [B, chunk]."""
-        end = self.tensors["episode_starts"][self.episode_of[frame] + 1]
-        ahead = frame[:, None] + torch.arange(chunk)
-        actions = self.tensors["actions"][torch.minimum(ahead, end[:, None] - 1)]
-        return actions, ahead >= end[:, None]
+        end = self.tensors["episode_starts"][self.episode_of[frame] + 1][:, None]  # [B, 1]
+        ahead = frame[:, None] + torch.arange(chunk)  # [B, chunk]
+        # Beyond the end lies the next episode, of another instruction and another start.
+        within = torch.minimum(ahead, end - 1)
+        return self.tensors["actions"][within], ahead >= end
 
     def size(self, frame: Tensor, chunk: int) -> tuple[int, int]:
         """How many frames [B] there are, and how many of their chunks' actions are no padding."""
@@ -208,10 +215,11 @@ class Demonstrations:
 
         Beyond `_MOST_ROWS` they are of evenly spaced frames alone.
         """
-        every = -(-len(self.train) * chunk // _MOST_ROWS)
+        every = -(-len(self.train) * chunk // _MOST_ROWS)  # rounded up
         frames = self.train[:: max(1, every)]
         actions, is_pad = self.chunks(frames, chunk)
         origins = relative.Origins(places)(self.tensors["proprio"][frames])
+        # Padding repeats an episode's last action, which nobody has to predict there.
         return (actions - origins)[~is_pad]
 
 
@@ -227,7 +235,9 @@ def _held(frames: Frames) -> Iterator[Tensor]:
     elif isinstance(frames, FittedFrames):
         yield from _held(frames.frames)
     elif isinstance(frames, JoinedFrames):
-        yield from itertools.chain(*map(_held, frames.parts))
+        for part in frames.parts:
+            yield from _held(part)
+    # `FramesOnDemand` holds no tensor: its frames are decoded anew each time.
 
 
 def at(path: str | Path) -> Path:
@@ -249,9 +259,11 @@ def at(path: str | Path) -> Path:
 
 def _refuse_inside(path: Path) -> None:
     """Raise AegisError for one of the files that a LeRobot dataset consists of."""
+    # A file of `aegis demos` may well have been put into a dataset's folder.
     if path.is_dir() or path.suffix == ".safetensors":
         return
-    if (folder := next(filter(layout.is_dataset, path.absolute().parents), None)) is not None:
+    folder = next(filter(layout.is_dataset, path.absolute().parents), None)
+    if folder is not None:
         raise AegisError(
             f"'{path}', a file of a LeRobot dataset", "the dataset's folder", f"give '{folder}'"
         )
@@ -315,7 +327,10 @@ def load(
         found = _load_folder(
             here, split, selection, image_size, workers, cache, on_event, check_text
         )
-        return found if here == path else replace(found, datasets=(str(path),))
+        if here == path:
+            return found
+        # The copy lies in the hub's cache, whose path says nothing to somebody else.
+        return replace(found, datasets=(str(path),))
     artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
     selection.check_file(here)
     return _load_file(here, split, selection.rename)
@@ -327,8 +342,9 @@ def digest(path: Path, selection: Selection = ALL) -> str:
     if not path.is_dir():
         return artifacts.sha256_file(path)
     found = dataset.load(path, selection.rename)
-    cameras = found.cameras(selection.camera)
-    return sources.joined_digest(sources.digests(_source(found, selection.only), cameras))
+    source = _source(found, selection.only)
+    of_cameras = sources.digests(source, found.cameras(selection.camera))
+    return sources.joined_digest(of_cameras, "cameras")
 
 
 def _source(found: dataset.Dataset, only: str | None) -> Source:
@@ -347,6 +363,7 @@ def is_one_of(path: Path, selection: Selection, sha256: Collection[str]) -> bool
     here = locate(path)
     if here.is_dir() and selection.only is not None:
         info = layout.read_info(here)
+        # Other data may have fewer episodes or no such split, which is no error here.
         if not episodes_of.are_there(selection.only, info.episodes, info.splits):
             return False
     return digest(path, selection) in sha256
@@ -371,16 +388,20 @@ def playable_task(
     if not path.is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = dataset.load(path, rename)
-    task, names = found.info.task, [*map(found.called, found.cameras(camera))]
+    task = found.info.task
+    names = [layout.short(found.called(own)) for own in found.cameras(camera)]
+    # A single picture needs no name: the task's own camera takes its place.
     if task is None or len(names) == 1:
         return task
-    return task if {layout.short(name) for name in names} <= {*sim.cameras(task)} else None
+    return task if {*names} <= {*sim.cameras(task)} else None
 
 
 def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:
+    # Watched from before it is read, so that nobody writes into it unnoticed meanwhile.
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
+    # What has a field of its own below is popped: `tensors` keeps what has none.
     episode_of, train, validation = _split(path, tensors["episode_starts"], split)
     return Demonstrations(
         task=meta["task"],
@@ -409,9 +430,12 @@ def _load_folder(
     on_event: OnEvent,
     check_text: Callable[[str], None] | None,
 ) -> Demonstrations:
+    # What is wrong with the dataset is found in the order of what it costs: the meta folder, the
+    # rows and the instructions are read before any video is decoded.
     found = dataset.load(path, selection.rename)
     cameras = found.cameras(selection.camera)
-    starts = torch.tensor([0, *(episode.length for episode in found.episodes)]).cumsum(0)
+    lengths = [episode.length for episode in found.episodes]
+    starts = torch.tensor([0, *lengths]).cumsum(0)  # [E + 1]
     episode_of, train, validation = _split(path, starts, split, found.info.splits)
     source = _source(found, selection.only)
     index = rows.read_index(source)
@@ -419,12 +443,15 @@ def _load_folder(
     actions, action_names = _vectors(source, selection.action)
     digests = sources.digests(source, cameras)
     if check_text is not None:
-        for number in np.unique(index.task[torch.cat([train, validation]).numpy()]).tolist():
+        # Frames that are not read have the task 0, whose text may be another episode's.
+        read = torch.cat([train, validation]).numpy()
+        for number in np.unique(index.task[read]).tolist():
             check_text(found.tasks[number])
     frames: list[Frames] = []
     mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):
         is_video = found.info.features[name].dtype != "image"
+        # Frames that an earlier run has decoded are read faster than they are decoded anew.
         if is_video and not cache and not camera_frames.are_kept(source, name, image_size, own):
             parts = list(camera_frames.video_parts(source, index, name))
             frames.append(FramesOnDemand(parts, found.info.frames, image_size))
@@ -442,7 +469,7 @@ def _load_folder(
         episode_of=episode_of,
         train=train,
         validation=validation,
-        sha256=sources.joined_digest(digests),
+        sha256=sources.joined_digest(digests, "cameras"),
         cameras=tuple(map(found.called, cameras)),
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
         watched=(WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
@@ -459,7 +486,8 @@ def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, t
     """
     chosen = listed(features)
     read = [rows.read_vectors(source, name) for name in chosen]
-    joined = np.concatenate([np.zeros((source.dataset.info.frames, 0), np.float32), *read], axis=1)
+    none = np.zeros((source.dataset.info.frames, 0), np.float32)  # if no feature is chosen
+    joined = np.concatenate([none, *read], axis=1)
     return torch.from_numpy(joined), source.dataset.names(chosen)
 
 
@@ -478,8 +506,9 @@ def _split(
             "at least one" if needed == 1 else "2 or more: one is held out",
             "choose more with demos.only" if only else "record more with aegis demos",
         )
+    # `held_out` counts the chosen episodes alone, so that each choice has some to validate on.
     validated = episodes[held_out(len(episodes), validation_share, seed)]
-    episode_of = torch.repeat_interleave(torch.arange(count), starts.diff())
+    episode_of = torch.repeat_interleave(torch.arange(count), starts.diff())  # [N]
     is_chosen = torch.isin(episode_of, torch.from_numpy(episodes))
     is_validation = torch.isin(episode_of, torch.from_numpy(validated))
     train, validation = is_chosen & ~is_validation, is_validation
@@ -497,8 +526,10 @@ def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
         AegisError: episodes that are not there.
     """
     path = locate(path)
-    folder = only is not None and path.is_dir()
-    return _chosen(path, count, only, layout.read_info(path).splits if folder else {})
+    splits: Mapping[str, str] = {}  # a file of `aegis demos` has none
+    if only is not None and path.is_dir():
+        splits = layout.read_info(path).splits
+    return _chosen(path, count, only, splits)
 
 
 def _chosen(path: Path, count: int, only: str | None, splits: Mapping[str, str]) -> np.ndarray:

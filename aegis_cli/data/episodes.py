@@ -19,18 +19,20 @@ def listed(text: str) -> list[int]:
     found: list[int] = []
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
-        if not (first.isdecimal() and (last or first).isdecimal()):
+        last = last or first  # a number alone is a range of one
+        if not (first.isdecimal() and last.isdecimal()):
             raise ValueError(part)
-        ends = int(first), int(last or first)
-        if not 0 <= ends[1] - ends[0] < _MOST:
+        start, end = int(first), int(last)
+        # The bound keeps a mistyped number from filling the memory.
+        if not 0 <= end - start < _MOST:
             raise ValueError(part)
-        found += range(ends[0], ends[1] + 1)
+        found += range(start, end + 1)
     return found
 
 
 def as_text(numbers: Sequence[int]) -> str:
     """The list that `listed` reads as these rising numbers: `0,4,7-9`."""
-    parts = list[list[int]]()
+    parts = list[list[int]]()  # a number alone, or the first and last of a range
     for number in numbers:
         if parts and number == parts[-1][-1] + 1:
             parts[-1] = [parts[-1][0], number]
@@ -82,10 +84,16 @@ def _named(text: str, splits: Mapping[str, str]) -> list[int]:
     Raises:
         ValueError: it is neither.
     """
+    # A split comes first, whose name may be a number as well.
     return _of_split(splits[text]) if text in splits else listed(text)
 
 
 def _of_split(said: str) -> list[int]:
+    """The numbers of `FIRST:END`, which ends before END.
+
+    Raises:
+        ValueError: something else, which other tools than LeRobot may have written.
+    """
     first, colon, end = said.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal()):
         raise ValueError(said)

@@ -37,6 +37,6 @@ class FittedFrames:
         """Frames [B, H, W, 3] by their numbers [B] int64."""
         _, height, width, _ = self.shape
         found = np.empty((len(numbers), height, width, 3), np.uint8)
-        for row, frame in zip(found, self.frames[numbers], strict=True):
+        for row, frame in zip(found, self.frames[numbers], strict=True):  # views of `found`
             row[:] = pictures.fit(frame.numpy(), height, width)
         return torch.from_numpy(found)

@@ -34,8 +34,10 @@ class JoinedFrames:
     def __getitem__(self, numbers: Tensor) -> Tensor:
         """Frames [B, H, W, 3] by their numbers [B] int64."""
         found = torch.empty((len(numbers), *self.shape[1:]), dtype=torch.uint8)
+        # "right", since a number that equals the end of one part is the first of the next.
         of_part = np.searchsorted(self._ends, numbers.numpy(), side="right")
-        for index in np.unique(of_part).tolist():
+        for index in np.unique(of_part).tolist():  # each part is asked once, for all of its frames
             part, own = self.parts[index], torch.from_numpy(of_part == index)
-            found[own] = part[numbers[own] - (int(self._ends[index]) - len(part))]
+            begins_at = int(self._ends[index]) - len(part)
+            found[own] = part[numbers[own] - begins_at]
         return found

@@ -44,6 +44,7 @@ def differences(known: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[
     """
     for key, what in _TOLD.items():
         one, other = known.get(key), found.get(key)
+        # Lists, since a file's header has lists where the demonstrations have tuples.
         if one is not None and other is not None and list(one) != list(other):
             yield Difference(what, one, other)
 
@@ -53,10 +54,12 @@ def told_apart(known: Mapping[str, Any], found: Mapping[str, Any]) -> str:
 
     It reads as ", without the actions pan"; '' where a name is not known, or none differs.
     """
-    said = []
+    said = list[str]()
     for other in differences(known, found):
         missing = [name for name in other.known if name not in other.found]
         more = [name for name in other.found if name not in other.known]
-        said += [f"without the {other.what} {', '.join(missing)}"] if missing else []
-        said += [f"with the {other.what} {', '.join(more)} besides"] if more else []
+        if missing:
+            said.append(f"without the {other.what} {', '.join(missing)}")
+        if more:
+            said.append(f"with the {other.what} {', '.join(more)} besides")
     return f", {', '.join(said)}" if said else ""

@@ -46,7 +46,8 @@ class Seen:
     def keep(self, episode: RecordedEpisode) -> RecordedEpisode:
         """Count an episode as kept, and hand it on."""
         self.frames += len(episode.actions)
-        self.first += [episode][: media.SHEET_EPISODES - len(self.first)]
+        if len(self.first) < media.SHEET_EPISODES:  # more would hold all pictures in memory
+            self.first.append(episode)
         if episode.total_reward is not None:
             self.kept_returns.append(episode.total_reward)
         return episode
@@ -74,6 +75,7 @@ def successes(
         AegisError: an expert that keeps failing.
     """
     left = shares(tasks, episodes)
+    # An expert may fail half of the time, and a few episodes may have worse luck than that.
     limit = 2 * episodes + 20 * len(tasks)
     with mapped(record, range(limit), workers, "a recording process", _FIX, chunk=4) as results:
         for number, episode in enumerate(results):
@@ -81,7 +83,7 @@ def successes(
             seen.attempts = number + 1
             if not episode.success:
                 seen.failures[task] += 1
-            elif left[task]:
+            elif left[task]:  # else the task has its share, and this is one too many
                 left[task] -= 1
                 kept = episodes - sum(left.values())
                 figures = {"success": seen.success}
@@ -125,11 +127,11 @@ def best(
             seen.returns.append(float(episode.total_reward))
             heapq.heappush(kept, (seen.returns[-1], -number, episode))
             if len(kept) > episodes:
-                heapq.heappop(kept)
+                heapq.heappop(kept)  # the worst so far
             figures = {"return": float(np.mean(seen.returns))}
             on_event(Progress("demos", seen.attempts, total, "episodes", figures))
-    kept.sort(key=lambda entry: entry[1])
-    while kept:
+    kept.sort(key=lambda entry: entry[1])  # numbers are negative: the first one is the last entry
+    while kept:  # popped, so that what was written away is held no longer
         yield seen.keep(kept.pop()[2])
 
 

@@ -7,7 +7,7 @@ that of all training frames.
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -15,13 +15,14 @@ from pathlib import Path
 
 import torch
 
-from aegis_cli.common import artifacts, files
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.data import demonstrations, joints, renaming
 from aegis_cli.data.demonstrations import Demonstrations, Member
 from aegis_cli.data.joined_frames import JoinedFrames
 from aegis_cli.data.lerobot import dataset, layout
+from aegis_cli.data.lerobot import source as sources
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import ALL, Paths, Selection, listed
 
@@ -63,6 +64,7 @@ def load(
             twice, episodes that are chosen of several, or a renaming of what no set has.
     """
     chosen = each(paths)
+    # All that can be told of the meta folders comes first: decoding one set can take hours.
     _check_each_once(chosen)
     check_rename(chosen, selection.rename)
     if len(chosen) > 1:
@@ -99,18 +101,21 @@ def joined(
     first, *others = found
     if not others:
         return first
-    sizes = [(frames.shape[1], frames.shape[2]) for frames in first.frames]
+    sizes = [(frames.shape[1], frames.shape[2]) for frames in first.frames]  # of each camera
     _warn_of_other_sizes(paths, found, on_event)
     shown = [first, *(other.fitted(sizes) for other in others)]
-    counts = [len(own.episode_of) for own in shown]
-    starts = torch.tensor([0, *counts]).cumsum(0)[:-1].tolist()
-    episodes = [len(own.tensors["episode_starts"]) - 1 for own in shown]
-    first_episodes = torch.tensor([0, *episodes]).cumsum(0)[:-1].tolist()
-    texts = list(dict.fromkeys(text for own in shown for text in own.instructions))
+    # Frames and episodes are numbered through: each set's own numbers begin where the set before
+    # has ended.
+    starts = _begin_at([len(own.episode_of) for own in shown])
     numbered = list(zip(shown, starts, strict=True))
+    first_episodes = _begin_at([len(own.tensors["episode_starts"]) - 1 for own in shown])
+    episode_of = [own.episode_of + n for own, n in zip(shown, first_episodes, strict=True)]
     ends = [own.tensors["episode_starts"][1:] + start for own, start in numbered]
+    # An instruction that several sets have is one.
+    texts = list(dict.fromkeys(text for own in shown for text in own.instructions))
     of_camera = zip(*(own.frames for own in shown), strict=True)
     members = zip(paths, shown, strict=True)
+    # `_check_alike` has compared what several sets say: the first that says something says it all.
     return Demonstrations(
         task=next((own.task for own in shown if own.task is not None), None),
         frames=tuple(map(JoinedFrames, of_camera)),
@@ -121,12 +126,10 @@ def joined(
         },
         instructions=texts,
         instruction_of=torch.cat([_renumbered(own, texts) for own in shown]),
-        episode_of=torch.cat(
-            [own.episode_of + e for own, e in zip(shown, first_episodes, strict=True)]
-        ),
+        episode_of=torch.cat(episode_of),
         train=torch.cat([own.train + start for own, start in numbered]),
         validation=torch.cat([own.validation + start for own, start in numbered]),
-        sha256=joined_digest([own.sha256 for own in shown]),
+        sha256=sources.joined_digest([own.sha256 for own in shown], "sets"),
         cameras=next((own.cameras for own in shown if own.cameras), ()),
         watched=tuple(watched for own in shown for watched in own.watched),
         action_names=next((own.action_names for own in shown if any(own.action_names)), ()),
@@ -137,10 +140,16 @@ def joined(
     )
 
 
+def _begin_at(counts: Sequence[int]) -> list[int]:
+    """The number at which each of several runs of so many begins, the first at 0."""
+    return [0, *itertools.accumulate(counts[:-1])]
+
+
 def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
     """The text of each of a set's frames, by its place among all sets' texts."""
     places = {text: place for place, text in enumerate(texts)}
-    return torch.tensor([places[text] for text in own.instructions])[own.instruction_of]
+    of_own = torch.tensor([places[text] for text in own.instructions])
+    return of_own[own.instruction_of]
 
 
 def playable_task(
@@ -156,25 +165,22 @@ def playable_task(
 
 def digest(paths: Paths, selection: Selection = ALL) -> str:
     """sha256 of everything that `load` would read."""
-    return joined_digest([demonstrations.digest(path, selection) for path in each(paths)])
-
-
-def joined_digest(digests: Sequence[str]) -> str:
-    """sha256 of several sets together; a single set's own."""
-    if len(digests) == 1:
-        return digests[0]
-    return hashlib.sha256(files.canonical({"sets": list(digests)}).encode()).hexdigest()
+    of_sets = [demonstrations.digest(path, selection) for path in each(paths)]
+    return sources.joined_digest(of_sets, "sets")
 
 
 def inputs(found: Demonstrations) -> dict[str, str]:
     """The digests that an artifact's header has: of all together, and of each of several sets."""
-    members = enumerate(found.members, start=1)
-    return {_INPUT: found.sha256} | {f"{_INPUT} {n}": member.sha256 for n, member in members}
+    named = {_INPUT: found.sha256}
+    for number, member in enumerate(found.members, start=1):
+        named[f"{_INPUT} {number}"] = member.sha256
+    return named
 
 
 def digests(inputs: Mapping[str, str]) -> frozenset[str]:
     """The digests of the demonstrations that a header's inputs name, each set's among them."""
-    return frozenset(x for name, x in inputs.items() if name.split(" ")[0] == _INPUT)
+    own = [name for name in inputs if name.split(" ")[0] == _INPUT]  # `demos 2` is the second set
+    return frozenset(inputs[name] for name in own)
 
 
 def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
@@ -185,6 +191,7 @@ def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
         return f"another {', '.join(names)}"
     if {there.get(name) for name in sets} == {here.get(name) for name in sets}:
         return "the sets of demonstrations in another order"
+    # Where a set differs, so does the digest of all together, which would say no more.
     others = [name for name in names if name not in (_INPUT, *sets)]
     numbered = [f"set {name.removeprefix(f'{_INPUT} ')} of the demonstrations" for name in sets]
     return f"another {', '.join([*others, *numbered])}"
@@ -219,7 +226,8 @@ def drawn(found: Demonstrations, weights: Sequence[float] | None) -> list[int]:
     total, exactly = sum(sizes), list(map(Fraction, weights))
     whole = sum(exactly)  # exactly, for the sum of large weights is more than a float holds
     exact = [total * weight / whole for weight in exactly]
-    counts = [int(count) for count in exact]
+    counts = [int(count) for count in exact]  # rounded down
+    # Sorting is stable, so that of equal remainders the first comes first.
     by_rest = sorted(range(len(counts)), key=lambda i: counts[i] - exact[i])
     for i in by_rest[: total - sum(counts)]:
         counts[i] += 1
@@ -246,7 +254,7 @@ def _counted(sets: int) -> str:
 
 
 def _check_each_once(paths: Sequence[Path]) -> None:
-    found = [path.resolve() for path in paths]
+    found = [path.resolve() for path in paths]  # a link and its target are one set
     for place, path in enumerate(paths):
         if found[place] in found[:place]:
             raise AegisError(
@@ -293,10 +301,9 @@ def robot_of(path: Path, selection: Selection) -> Robot:
         selection.check_file(here)  # a file of another kind has no option to leave out
         meta = artifact.header.meta
         sizes = artifact.tensors["proprio"].shape[1], artifact.tensors["actions"].shape[1]
-        names = {
-            name: renaming.joints(selection.rename, meta.get(name, ()), f"'{path}'")
-            for name in ("action_names", "proprio_names")
-        }
+        names = {}
+        for name in ("action_names", "proprio_names"):
+            names[name] = renaming.joints(selection.rename, meta.get(name, ()), f"'{path}'")
         fps = float(meta["control_hz"]) if "control_hz" in meta else None
         return Robot((), sizes, _complete(names, sizes), fps, meta["task"])
     found = dataset.load(here, selection.rename)
@@ -320,6 +327,7 @@ def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
     """Raise AegisError for a name of the renaming that occurs in none of these sets."""
     if not rename:
         return
+    # One set may have the policy's names already, and another need the renaming.
     names = set[str]()
     for path in paths:
         here = demonstrations.locate(path)
@@ -333,10 +341,10 @@ def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
 
 def _check_alike(paths: Sequence[Path], selection: Selection) -> None:
     """Raise AegisError unless all sets are of one robot, before anything large is read."""
-    robots = [robot_of(path, selection) for path in paths]
-    for place, (path, robot) in enumerate(zip(paths, robots, strict=True)):
-        for known_path, known in zip(paths[:place], robots[:place], strict=True):
-            _check_robot(path, robot, known_path, known)
+    robots = [(path, robot_of(path, selection)) for path in paths]
+    # Every pair, since the first set may not say what two others disagree about.
+    for known, other in itertools.combinations(robots, 2):
+        _check_robot(*other, *known)
 
 
 def _check_robot(path: Path, robot: Robot, known_path: Path, known: Robot) -> None:

@@ -112,6 +112,7 @@ def run(
     """
     _check(task, episodes, noise, workers, drop_below)
     noise = abs(noise)  # NumPy takes -0.0 for a negative deviation
+    # All that can be wrong is found before hours of recording.
     _check_form(Path(out), form, as_video, cameras)
     sim.check_cameras(task, cameras)
     gl.check()
@@ -120,6 +121,7 @@ def run(
         files.check_apart("--preview", Path(preview), [Path(out)])
     spec = sim.make(task).spec
     started = time.perf_counter()
+    # The generators below fill `seen` while they are read, so that it is whole only afterwards.
     share = keeping.DROP_BELOW if drop_below is None else drop_below
     seen = keeping.Seen()
     workers = workers or _workers(spec, episodes, share)
@@ -139,17 +141,17 @@ def run(
     else:
         good = keeping.successes(record, episodes, workers, seen, on_event, sim.members(task))
     with closing(good) as recorded:  # whatever happens, its processes end
-        if form == "lerobot":
+        if form == "lerobot":  # written as they come: one episode is held at a time
             _save_folder(Path(out), spec, recorded, as_video, tuple(cameras) or (spec.camera,))
         else:
             kept = list(recorded)
             _save(Path(out), spec, kept, seed, {"noise": noise, **_passed(seen, share)})
     seconds = time.perf_counter() - started
     if preview is not None:
-        shown = [
-            (f"{e.instruction}  ({len(e.actions)} steps)", (e.frames[0], e.frames[-1]))
-            for e in seen.first
-        ]
+        shown = []
+        for episode in seen.first:
+            caption = f"{episode.instruction}  ({len(episode.actions)} steps)"
+            shown.append((caption, (episode.frames[0], episode.frames[-1])))
         media.save_sheet(Path(preview), shown)
     return _report(spec, episodes, seen, seconds, workers, out, preview, cameras or None)
 
@@ -189,7 +191,7 @@ def _counts(task: str, episodes: int, seen: keeping.Seen) -> dict[str, TaskCount
     tasks = sim.members(task)
     if tasks == (task,):
         return None
-    kept = keeping.shares(tasks, episodes)
+    kept = keeping.shares(tasks, episodes)  # every task has got its share
     return {name: TaskCount(kept[name], seen.failures[name]) for name in tasks}
 
 
@@ -278,26 +280,30 @@ def _save_folder(
     as_video: bool,
     cameras: Sequence[str],
 ) -> None:
-    episodes = (
-        write.NewEpisode(
-            dict(zip(cameras, (e.frames, *e.more_frames), strict=True)),
-            e.proprio,
-            e.actions,
-            e.instruction,
-        )
-        for e in recorded
-    )
     common = write.Spec(
         spec.control_hz, spec.proprio_names, spec.action_names, layout.ROBOT + spec.name, as_video
     )
+    # Lazily: each episode is written before the next one is asked for.
+    episodes = (_new_episode(episode, cameras) for episode in recorded)
     write.write(folder, episodes, common)
+
+
+def _new_episode(recorded: RecordedEpisode, cameras: Sequence[str]) -> write.NewEpisode:
+    """A recorded episode as the dataset has it, its pictures by their cameras' names."""
+    pictures = (recorded.frames, *recorded.more_frames)
+    return write.NewEpisode(
+        dict(zip(cameras, pictures, strict=True)),
+        recorded.proprio,
+        recorded.actions,
+        recorded.instruction,
+    )
 
 
 def _save(
     path: Path, spec: TaskSpec, kept: list[RecordedEpisode], seed: int, meta: dict[str, Any]
 ) -> None:
-    instructions = sorted({e.instruction for e in kept})
-    starts = np.cumsum([0, *(len(e.actions) for e in kept)])
+    instructions = sorted({e.instruction for e in kept})  # sorted, so that equal runs are equal
+    starts = np.cumsum([0, *(len(e.actions) for e in kept)])  # [E + 1]
     tensors = {
         "proprio": np.concatenate([e.proprio for e in kept]),
         "actions": np.concatenate([e.actions for e in kept]),
@@ -313,6 +319,7 @@ def _save(
         tasks = sim.members(spec.name)
         tensors["task"] = np.array([tasks.index(e.task) for e in kept], np.int64)
         meta = {"tasks": list(tasks), **meta}
+    # Last, because it empties `kept`.
     tensors["frames"] = _join_frames(kept, int(starts[-1]))
     artifacts.save(
         path,
@@ -334,7 +341,7 @@ def _save(
 def _join_frames(kept: list[RecordedEpisode], total: int) -> np.ndarray:
     """All frames [N, 64, 64, 3]; `kept` is emptied on the way, so that no picture is held twice."""
     frames = np.empty((total, *kept[0].frames.shape[1:]), np.uint8)
-    kept.reverse()
+    kept.reverse()  # `pop` takes from the end
     start = 0
     while kept:
         part = kept.pop().frames

@@ -29,7 +29,8 @@ class Origins(nn.Module):
         super().__init__()
         self.places = tuple(places)
         self._columns: Tensor
-        # The last of P + 1 columns is 0. The header of a policy's file names the places.
+        # Absolute actions take the last of P + 1 columns, which is 0. It is not saved with the
+        # weights: the header of a policy's file names the places.
         columns = torch.tensor([-1 if place is None else place for place in places]).long()
         self.register_buffer("_columns", columns, persistent=False)
 
@@ -37,7 +38,8 @@ class Origins(nn.Module):
         """The origins [B, 1, A] of chunks that begin at positions [B, P]; 0 if all are absolute."""
         if not self.places:
             return 0.0
-        return nn.functional.pad(proprio, (0, 1))[:, None, self._columns]
+        with_zero = nn.functional.pad(proprio, (0, 1))  # [B, P + 1]
+        return with_zero[:, None, self._columns]
 
 
 def places(
@@ -70,15 +72,17 @@ def places(
             "train.relative_exclude",
             "delete train.relative_actions, or name the features' components in info.json",
         )
-    for word in absolute:
-        if not any(word.lower() in name.lower() for name in actions):
+    lowered = [name.lower() for name in actions]
+    words = [word.lower() for word in absolute]
+    for word, as_found in zip(absolute, words, strict=True):
+        # A word that excludes nothing is a slip, and the gripper would be relative by it.
+        if not any(as_found in name for name in lowered):
             raise AegisError(
                 f"train.relative_exclude: '{word}', which no action's name has",
                 f"a word of {', '.join(actions)}",
                 "correct it, or delete it",
             )
-    words = [word.lower() for word in absolute]
-    stays = [any(word in name.lower() for word in words) for name in actions]
+    stays = [any(word in name for word in words) for name in lowered]
     moved = [name for name, stay in zip(actions, stays, strict=True) if not stay]
     lacking = [name for name in moved if name not in positions]
     if lacking:
@@ -95,9 +99,10 @@ def places(
             "give each its own name in the feature's names in info.json, or delete "
             "train.relative_actions",
         )
-    return tuple(
-        None if stay else positions.index(name) for name, stay in zip(actions, stays, strict=True)
-    )
+    found = list[int | None]()
+    for name, stay in zip(actions, stays, strict=True):
+        found.append(None if stay else positions.index(name))
+    return tuple(found)
 
 
 def of_meta(meta: Mapping[str, Any], actions: int, positions: int) -> tuple[int | None, ...]:
@@ -109,6 +114,7 @@ def of_meta(meta: Mapping[str, Any], actions: int, positions: int) -> tuple[int 
     told = meta.get("relative", [])
     known = [None, *range(positions)]
     fits = isinstance(told, list) and len(told) in (0, actions)
+    # Python takes True for the number 1.
     if not fits or not all(place in known and type(place) is not bool for place in told):
         raise ValueError(f"'relative' is {told!r}")
     return tuple(told)

@@ -22,7 +22,9 @@ def of(named: Mapping[str, str] | None) -> Renaming:
 def feature(rename: Renaming, name: str) -> str:
     """What the policy calls a feature; a camera goes with and without `observation.images.`."""
     known = dict(rename)
-    own = next((known[n] for n in (name, layout.short(name)) if n in known), name)
+    own = name
+    for spelt in (layout.short(name), name):  # the full name decides, where both are renamed
+        own = known.get(spelt, own)
     is_short = name.startswith(layout.CAMERA) and not own.startswith("observation.")
     return layout.CAMERA + own if is_short else own
 
@@ -48,6 +50,7 @@ def check_apart(rename: Renaming, names: Sequence[str], renamed: Sequence[str], 
         return
     for place, name in enumerate(renamed):
         first = renamed.index(name)
+        # Names that were alike before are the dataset's own affair.
         if first != place and names[first] != names[place]:
             raise AegisError(
                 f"'{names[first]}' and '{names[place]}' in {where}, which both become '{name}'",
@@ -63,7 +66,7 @@ def check_known(rename: Renaming, names: Iterable[str], where: str) -> None:
         names: all that occur, of cameras with and without `observation.images.`.
         where: the demonstrations' names in a sentence.
     """
-    known = sorted({*names} - {""})
+    known = sorted({*names} - {""})  # numbers without a name have an empty one
     for name, _ in rename:
         if name not in known:
             raise AegisError(

@@ -47,7 +47,7 @@ class Selection:
         of_anchor = {"camera": " (of aegis anchor: --camera)"}
         for name, what in (("camera", "a camera"), ("state", "features"), ("action", "features")):
             chosen = getattr(self, name)
-            if chosen in (getattr(ALL, name), ()):
+            if chosen in (getattr(ALL, name), ()):  # what nobody chose, or nothing
                 continue
             named = chosen if isinstance(chosen, str) else ", ".join(chosen)
             raise AegisError(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.files import canonical, refuse_special
+from aegis_cli.common.files import refuse_special, sha256_value
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
@@ -164,7 +163,7 @@ def digest(recipe: AnyRecipe) -> str:
         later = changed(recipe)
         for name in {"easy_vqa", "start"} - later.keys():
             del values[name]
-    return hashlib.sha256(canonical(values).encode()).hexdigest()
+    return sha256_value(values)
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:

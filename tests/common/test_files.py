@@ -61,6 +61,14 @@ def test_sha256_is_of_the_bytes(tmp_path: Path) -> None:
     assert files.sha256_file(tmp_path / "a") == hashlib.sha256(b"aegis").hexdigest()
 
 
+def test_equal_values_have_equal_digests_and_others_have_not() -> None:
+    known = hashlib.sha256(b'{"a":1,"b":[2]}').hexdigest()
+    assert files.sha256_value({"b": [2], "a": 1}) == known
+    assert files.sha256_value({"b": [2], "a": 2}) != known
+    with pytest.raises(ValueError, match="JSON compliant"):
+        files.sha256_value(float("nan"))
+
+
 WRITE_AND_DIE = """
 import os, signal, sys
 from pathlib import Path

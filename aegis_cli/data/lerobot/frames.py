@@ -10,7 +10,6 @@ deleting it costs the decoding.
 from __future__ import annotations
 
 import bisect
-import hashlib
 import math
 import mmap
 import os
@@ -67,12 +66,10 @@ class ImagePart:
 
     def _cells(self) -> Any:
         with layout.reading_parquet(self.path):
-            return (
-                layout.open_parquet(self.path)
-                .read_row_groups(list(self.groups), columns=[self.camera])
-                .column(self.camera)
-                .slice(self.skip, self.count)
-            )
+            file = layout.open_parquet(self.path)
+            # Row groups are the smallest piece of a file that can be read alone.
+            groups = file.read_row_groups(list(self.groups), columns=[self.camera])
+            return groups.column(self.camera).slice(self.skip, self.count)
 
     def _picture(self, cells: Any, i: int) -> np.ndarray:
         entry = cells[i].as_py()
@@ -139,7 +136,8 @@ def load(
     if not kept:
         parts = list(split(source, index, camera))
         _make_cache(path.parent, parts)
-        height, width = (side, side) if side is not None else next(parts[0].decode()).shape[:2]
+        # Without a side the first frame tells the size, which others are fitted to.
+        height, width = (side, side) if side is not None else parts[0].at(0).shape[:2]
         _write(path, parts, (count, height, width, 3), workers, camera, on_event)
     frames = _open(path, count)
     if kept:
@@ -175,6 +173,7 @@ def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:
 
     Those of some episodes are a file of their own, unless all episodes of the same files are there.
     """
+    # Another decoder or filter makes other pixels of the same files.
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
     key = {"dataset": digest, "camera": camera, "side": side, **made}
     whole = cache_folder() / _name(key)
@@ -184,17 +183,16 @@ def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:
 
 
 def _name(key: Mapping[str, Any]) -> str:
-    return f"{hashlib.sha256(files.canonical(key).encode()).hexdigest()[:32]}.npy"
+    return f"{files.sha256_value(key)[:32]}.npy"
 
 
 def pick(source: Source, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
     """Some of a camera's frames as they are, by their rising numbers."""
-    return [
-        part.at(number - part.first_frame)
-        for part in split(source, index, camera)
-        for number in numbers
-        if part.first_frame <= number < part.first_frame + part.count
-    ]
+    found = []
+    for part in split(source, index, camera):
+        of_part = range(part.first_frame, part.first_frame + part.count)
+        found += [part.at(number - part.first_frame) for number in numbers if number in of_part]
+    return found
 
 
 def cache_folder() -> Path:
@@ -223,12 +221,14 @@ def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
                 "every feature that meta/info.json lists",
                 layout.AGAIN,
             )
-        sizes = [found.metadata.row_group(i).num_rows for i in range(found.metadata.num_row_groups)]
-    ends = np.cumsum(sizes)
+        meta = found.metadata
+        sizes = [meta.row_group(number).num_rows for number in range(meta.num_row_groups)]
+    ends = np.cumsum(sizes)  # the row at which each row group ends
     for rows in file.rows:
         first, last = rows.first, rows.first + rows.count
         for end in ends[np.searchsorted(ends, first, side="right") :].tolist():
             stop = min(end, last)
+            # A part begins where one ends: groups of few rows are put together.
             if stop - first >= _PART or stop == last:
                 groups = np.searchsorted(ends, [first, stop - 1], side="right")
                 chosen = tuple(range(groups[0], groups[1] + 1))
@@ -253,6 +253,7 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
         own = clip.start_s + index.timestamp[frame : starts[number + 1]]
         _check_within_clip(own, ends[number], number, source, camera)
         goes_on = clip.file == path and frame == first + len(times)
+        # `video.read` wants rising times: an episode may lie before the one with a lower number.
         if times and (not goes_on or own[0] <= times[-1] or len(times) >= _PART):
             yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
             times = []
@@ -267,6 +268,7 @@ def _clip_ends(dataset: Dataset, camera: str) -> list[float]:
 
     Infinity for the last one of a file of which the meta folder does not tell the end.
     """
+    # All episodes, also those that are not read: a neighbour's frames begin where one's own end.
     clips = [episode.clips[camera] for episode in dataset.episodes]
     begun: dict[Path, list[float]] = {}
     for clip in clips:
@@ -288,6 +290,7 @@ def _check_within_clip(
 
     So they are where its timestamps have a gap, or the camera has lost frames.
     """
+    # Later than this, a time is nearer to the next episode's first frame.
     last_s = end_s - 0.5 / source.dataset.info.fps
     past = int((times > last_s).sum())
     if past:
@@ -310,7 +313,7 @@ def _write(
     on_event: OnEvent,
 ) -> None:
     """Decode a camera's frames into a file beside `path`, then rename it."""
-    files.sweep_all(path.parent)
+    files.sweep_all(path.parent)  # what decodings have left that were killed
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
@@ -321,6 +324,7 @@ def _write(
         )
     try:
         with files.aside(path) as (aside, file):
+            # The file gets its whole size at once; each process writes its parts to their places.
             offset = npy.open_memmap(aside, "w+", np.uint8, shape).offset
             done, stage = 0, f"decode {layout.short(camera)}"
             workers = workers or worker_count(len(parts) // _PER_WORKER)
@@ -332,7 +336,7 @@ def _write(
                 for decoded in counts:
                     done += decoded
                     on_event(Progress(stage, done, count, "frames"))
-            os.fsync(file.fileno())
+            os.fsync(file.fileno())  # else the name could outlive the frames in a power failure
             os.replace(aside, path)
     except OSError as error:
         raise AegisError(
@@ -363,13 +367,11 @@ def _check_some(path: Path, frames: np.ndarray, source: Source, index: Index, ca
         AegisError: the file holds other frames.
     """
     parts = list(split(source, index, camera))
-    middle = parts[len(parts) // 2]
-    chosen = {
-        parts[0].first_frame: (parts[0], 0),
-        middle.first_frame + middle.count // 2: (middle, middle.count // 2),
-        parts[-1].first_frame + parts[-1].count - 1: (parts[-1], parts[-1].count - 1),
-    }
-    for number, (part, place) in chosen.items():
+    first, middle, last = parts[0], parts[len(parts) // 2], parts[-1]
+    chosen = [(first, 0), (middle, middle.count // 2), (last, last.count - 1)]
+    for part, place in chosen:
+        number = part.first_frame + place
+        # In floats, because the difference of two uint8 wraps around.
         wanted = fitting.fit(part.at(place), *frames.shape[1:3]).astype(float)
         if np.abs(frames[number] - wanted).mean() > _SAME:
             raise AegisError(

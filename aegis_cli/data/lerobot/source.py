@@ -8,7 +8,6 @@ episodes it holds, and LeRobot itself reads all the files there are.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -86,6 +85,7 @@ def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
             folder speaks.
     """
     wanted = range(len(dataset.episodes)) if episodes is None else sorted(episodes)
+    # [E + 1] of the whole dataset: frames keep their numbers, whatever is read.
     starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)])
     asked, seen = set(wanted), dict[int, Path]()
     found = []
@@ -104,6 +104,7 @@ def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
     for number in wanted:
         if number not in seen:
             raise _missing(dataset, number)
+    # Files that are found need not lie in the order of their episodes.
     found.sort(key=lambda file: file.rows[0].first_frame)
     return Source(dataset, tuple(wanted), tuple(found))
 
@@ -120,9 +121,9 @@ def _file(dataset: Dataset, path: Path, asked: set[int], starts: np.ndarray) -> 
     """The episodes that a file holds, as far as they are asked for."""
     episode_of = _episode_of_rows(path)
     changes = np.flatnonzero(np.diff(episode_of)) + 1
-    ends = [*changes.tolist(), len(episode_of)]
+    ends = [*changes.tolist(), len(episode_of)]  # of each run of rows that are of one episode
     numbers, rows, first = list[int](), list[Rows](), 0
-    for end in ends if len(episode_of) else []:
+    for end in ends if len(episode_of) else []:  # a file may be empty
         number = int(episode_of[first])
         if number in asked:
             _check_length(dataset, path, number, end - first)
@@ -193,6 +194,7 @@ def _together(rows: Sequence[Rows]) -> tuple[Rows, ...]:
         if joined:
             last = joined[-1]
             goes_on = (last.first + last.count, last.first_frame + last.count)
+            # In both: a file may skip an episode of the dataset, or hold one that is not read.
             if goes_on == (own.first, own.first_frame):
                 joined[-1] = Rows(last.first, last.first_frame, last.count + own.count)
                 continue
@@ -222,11 +224,11 @@ def digests(source: Source, cameras: Sequence[str]) -> list[str]:
     hashes = {path: _sha256(dataset.folder / path) for path in shared}
     found = []
     for camera in cameras:
+        # A camera of embedded images has no clips: its pictures are in the files of rows.
         clips = {episode.clips[camera].file for episode in read if camera in episode.clips}
         hashes |= {path: _sha256(dataset.folder / path) for path in clips if path not in hashes}
         own = {str(path): hashes[path] for path in shared | clips}
-        text = files.canonical({"camera": camera, "files": own})
-        found.append(hashlib.sha256(text.encode()).hexdigest())
+        found.append(files.sha256_value({"camera": camera, "files": own}))
     return found
 
 
@@ -238,6 +240,7 @@ def _sha256(path: Path) -> str:
     if not path.is_file():
         return files.sha256_file(path)  # which says what is wrong
     state = path.stat()
+    # Size and time alone would miss a file that took another's place with its time.
     changes = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
     return _hashed(path.resolve(), changes)
 
@@ -248,9 +251,12 @@ def _hashed(path: Path, changes: tuple[int, ...]) -> str:
     return files.sha256_file(path)
 
 
-def joined_digest(digests: Sequence[str]) -> str:
-    """sha256 of what is learned from several cameras together; a single camera's own digest."""
+def joined_digest(digests: Sequence[str], of: str) -> str:
+    """sha256 of several things that are learned from together; a single one's own digest.
+
+    Args:
+        of: what they are, `cameras` or `sets`; so that two of either never have one digest.
+    """
     if len(digests) == 1:
         return digests[0]
-    text = files.canonical({"cameras": list(digests)})
-    return hashlib.sha256(text.encode()).hexdigest()
+    return files.sha256_value({of: list(digests)})
