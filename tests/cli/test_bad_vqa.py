@@ -330,6 +330,16 @@ PAIRS: dict[str, tuple[Callable[[list[Any], list[Any]], object], tuple[str, ...]
         2,
     ),
     "no object": (lambda q, a: a.__setitem__(3, 5), ("annotation 4 of", "no question_id"), 2),
+    "a question_id that is no name": (
+        lambda q, a: q[3].update(question_id=1.5),
+        ("question 4 of", "question_id 1.5"),
+        2,
+    ),
+    "an annotation's question_id that is no name": (
+        lambda q, a: a[3].update(question_id=[1]),
+        ("annotation 4 of", "question_id [1]"),
+        2,
+    ),
     "an image that is not there": (
         lambda q, a: [x[3].update(image_id=77) for x in (q, a)],
         ("COCO_val2014_000000000077.jpg", "val2014.zip"),

@@ -77,7 +77,9 @@ class Dataset:
             return self.info.cameras
         listed = (names,) if isinstance(names, str) else names
         found = tuple(self._camera(name) for name in listed)
-        if twice := [camera for i, camera in enumerate(found) if camera in found[:i]]:
+        # Compared as they are found: one camera may be named in short, and by its feature.
+        twice = [camera for i, camera in enumerate(found) if camera in found[:i]]
+        if twice:
             raise AegisError(
                 f"the camera '{twice[0]}' twice",
                 "each camera once",
@@ -128,25 +130,29 @@ class Dataset:
             AegisError: a renaming would give two of them one name.
         """
         named = [self.info.features[self.own(feature)].components for feature in features]
-        if not all(map(any, named)):
+        if not all(map(any, named)):  # a feature none of whose numbers has a name
             return ()
         where = f"'{self.folder}'"
         own = [renaming.joints(self.rename, components, where) for components in named]
         alone = tuple(itertools.chain(*own))
         if len({*alone}) == len(alone) or len(own) == 1:
+            # Each feature was checked by itself; two of them may have been given one name.
             renaming.check_apart(self.rename, tuple(itertools.chain(*named)), alone, where)
             return alone
         within = [_within(*pair) for pair in zip(features, own, strict=True)]
+        # A second time: a renaming may speak of `left_arm.gripper`, or of `gripper`.
         return renaming.joints(self.rename, tuple(itertools.chain(*within)), where)
 
     @property
     def all_names(self) -> set[str]:
         """The dataset's own names of its features, its cameras in short, and its numbers."""
         features = self.info.features
-        numbers = {name: f for name, f in features.items() if name not in self.info.cameras}
-        plain = itertools.chain(*(f.components for f in numbers.values()))
-        within = itertools.chain(*(_within(name, f.components) for name, f in numbers.items()))
-        return {*features, *map(layout.short, self.info.cameras), *plain, *within}
+        found = {*features, *map(layout.short, self.info.cameras)}
+        for name, feature in features.items():
+            if name in self.info.cameras:  # whose components are red, green and blue
+                continue
+            found.update(feature.components, _within(name, feature.components))
+        return found
 
 
 def _within(feature: str, components: Sequence[str]) -> tuple[str, ...]:
@@ -183,7 +189,7 @@ def load(folder: Path, rename: Renaming = ()) -> Dataset:
             agree, or two features that would be called alike.
     """
     folder = Path(folder)
-    info = layout.read_info(folder)
+    info = layout.read_info(folder)  # JSON: what is no dataset is said without the package, too
     layout.require_pyarrow()
     reader = version_2 if info.has_episode_files else version_3
     tasks, episodes = reader.read_tasks(folder), reader.read_episodes(folder, info)

@@ -76,10 +76,12 @@ class Feature:
         eight positions `["state"]`.
         """
         if self.dtype in ("image", "video"):
+            # Datasets name a picture's axes instead: height, width and channels.
             return ("red", "green", "blue")
         names = self.names
         if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
-            names = next((list(value) for value in names.values() if isinstance(value, list)), None)
+            lists = (value for value in names.values() if isinstance(value, list))
+            names = next(lists, None)
         count = math.prod(self.shape)
         if isinstance(names, list) and len(names) == count:
             return tuple(map(str, names))
@@ -108,9 +110,11 @@ class Info:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The features that are colour pictures, as images or video."""
-        return tuple(
-            k for k, f in self.features.items() if f.dtype in ("image", "video") and not f.is_depth
-        )
+        found = list[str]()
+        for name, feature in self.features.items():
+            if feature.dtype in ("image", "video") and not feature.is_depth:
+                found.append(name)
+        return tuple(found)
 
     @property
     def videos(self) -> tuple[str, ...]:
@@ -212,8 +216,9 @@ def _numbers_of(version: str) -> tuple[int, int]:
     Raises:
         ValueError: it is none.
     """
-    major, minor = (int(part) for part in f"{version.lstrip('v')}.0".split(".")[:2])
-    return major, minor
+    padded = f"{version.lstrip('v')}.0"  # `v3` alone is version 3.0
+    major, minor = padded.split(".")[:2]
+    return int(major), int(minor)
 
 
 def _parse(raw: Mapping[str, Any]) -> Info:
@@ -236,6 +241,7 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         raise ValueError(f"robot_type is {info.robot_type}")
     if info.chunk_episodes < 1:
         raise ValueError(f"chunks_size is {info.chunk_episodes}")
+    # The first paths are made to see that the templates are sound, before anything is read by them.
     first = episode_place(info, 0) if info.has_episode_files else file_place(0, 0)
     data_file(info, first)
     for name in info.videos:
@@ -275,12 +281,16 @@ def data_file(info: Info, place: Place) -> Path:
 
 def data_files(info: Info, folder: Path) -> list[Path]:
     """The parquet files below `folder` whose names the dataset's template can give."""
-    pattern, name = [], []
+    pattern, name = "", ""
     for text, field_name, _, _ in string.Formatter().parse(info.data_path):
-        pattern.append(glob.escape(text) + ("" if field_name is None else "*"))
-        name.append(re.escape(text) + ("" if field_name is None else r"\d+"))
-    fits = re.compile("".join(name))
-    found = sorted(folder.glob("".join(pattern)))
+        pattern += glob.escape(text)
+        name += re.escape(text)
+        if field_name is not None:
+            pattern += "*"
+            name += r"\d+"
+    # A glob knows no numbers: it would also find a copy such as `file-000 (1).parquet`.
+    fits = re.compile(name)
+    found = sorted(folder.glob(pattern))
     return [path for path in found if fits.fullmatch(path.relative_to(folder).as_posix())]
 
 
@@ -307,7 +317,8 @@ def _filled(template: str, values: Mapping[str, str | int]) -> Path:
         if name is None or form is None:
             continue  # text alone
         value = values[name]
-        if conversion or not (_NUMBER.fullmatch(form) if isinstance(value, int) else not form):
+        plain = _NUMBER.fullmatch(form) if isinstance(value, int) else not form
+        if conversion or not plain:
             raise ValueError(f"the path {template}, in which '{name}' has a format of its own")
     path = Path(template.format(**values))
     if path.is_absolute() or ".." in path.parts or "\0" in str(path):
@@ -316,11 +327,11 @@ def _filled(template: str, values: Mapping[str, str | int]) -> Path:
 
 
 def _feature(entry: Mapping[str, Any]) -> Feature:
+    # Versions differ in where they say it, and under which key.
     notes = [entry.get("info") or {}, entry.get("video_info") or {}]
     depth = any(note.get("is_depth_map") or note.get("video.is_depth_map") for note in notes)
-    return Feature(
-        str(entry["dtype"]), tuple(int(n) for n in entry["shape"]), entry.get("names"), depth
-    )
+    shape = tuple(int(side) for side in entry["shape"])
+    return Feature(str(entry["dtype"]), shape, entry.get("names"), depth)
 
 
 def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
@@ -381,7 +392,8 @@ def damaged(path: Path) -> Generator[None]:
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        files.refuse_pointer(path)
+        files.refuse_pointer(path)  # of Git LFS, in place of the file: that has a cure of its own
+        # What Python says of a missing key is the key alone.
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(
             f"'{path}' is damaged: {what}", "a file of LeRobot's dataset format", AGAIN
@@ -401,7 +413,7 @@ def reading_parquet(path: Path) -> Generator[None]:
         ) from error
     except (ArrowException, OSError, ValueError, MemoryError) as error:
         files.refuse_pointer(path)
-        what = (str(error).splitlines() or ["it cannot be read"])[0]
+        what = (str(error).splitlines() or ["it cannot be read"])[0]  # pyarrow may say pages
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error
 
 

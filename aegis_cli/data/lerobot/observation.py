@@ -78,6 +78,7 @@ def read(
     read_from = state if all(name in observation for name in state) else (layout.STATE,)
     if all(name in observation for name in read_from):
         parts = [_unbatched(_array(observation[name]), 1) for name in read_from]
+        # A single one keeps its shape, of which the policy tells what is wrong.
         positions = parts[0] if len(parts) == 1 else np.concatenate([p.reshape(-1) for p in parts])
         shown = {name: v for name, v in observation.items() if _is_picture(name, cameras)}
         shown = _known(shown, cameras)
@@ -91,14 +92,17 @@ def read(
                 f"put the positions there, in the demonstrations' order, and the pictures at "
                 f"'{layout.CAMERA}NAME'",
             )
+        # A robot's own keys do not say what they are: pictures are what has several dimensions.
         kinds = {name: _dimensions(value) for name, value in observation.items()}
         shown = {name: observation[name] for name, count in kinds.items() if count > 1}
         shown = _known(shown, cameras)
         told = [name for name, count in kinds.items() if 0 <= count < 2 and name != TASK]
         _check(shown, cameras, told, state_names)
         positions = np.array([_number(name, observation[name]) for name in state_names], np.float32)
-    own = {layout.short(name): name for name in cameras}
-    named = {own.get(layout.short(n), n): picture(n, value) for n, value in shown.items()}
+    own = {layout.short(name): name for name in cameras}  # as the policy calls them
+    named = {}
+    for name, value in shown.items():
+        named[own.get(layout.short(name), name)] = picture(name, value)
     pictures = named if cameras else next(iter(named.values()))
     return Observed(pictures, positions, _task(observation))
 
@@ -115,6 +119,7 @@ def picture(name: str, given: Any) -> np.ndarray:
     """
     found = _unbatched(_array(given), 3)
     if found.dtype.kind != "f":
+        # Three by both ends could be either: a camera's own order is the likelier.
         first = found.ndim == 3 and found.shape[0] == 3 != found.shape[2]
         return np.ascontiguousarray(found.transpose(1, 2, 0)) if first else found
     # A comparison with NaN is false, too.
@@ -143,7 +148,9 @@ def _known(shown: dict[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
 def _array(given: Any) -> np.ndarray:
     if isinstance(given, torch.Tensor):
         held = given.detach().cpu()
-        return (held.float() if held.is_floating_point() else held).numpy()
+        if held.is_floating_point():
+            held = held.float()  # NumPy has no bfloat16
+        return held.numpy()
     try:
         return np.asarray(given)
     except ValueError as error:  # lists of several lengths

@@ -54,13 +54,17 @@ class FramesOnDemand:
         return torch.from_numpy(fitted)
 
     def _decoded(self, number: int) -> np.ndarray:
+        # Of the parts that begin at this frame or before it, the last.
         part = self._parts[bisect_right(self._begin_at, number) - 1]
         time = part.times[number - part.first_frame]
         return self._readers.own.frame(part.path, time, part.tolerance)
 
 
 class _Readers(threading.local):
-    """A reader of each thread's own."""
+    """A reader of each thread's own, since none is for several at once.
+
+    Python calls `__init__` anew in each thread that asks.
+    """
 
     def __init__(self) -> None:
         self.own = video.Reader()

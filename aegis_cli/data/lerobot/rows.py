@@ -41,9 +41,9 @@ def read_index(source: Source) -> Index:
     index = Index(np.zeros(frames), np.zeros(frames, np.int64))
     steps = [np.zeros(0)]
     for file in source.data:
-        time, frame, task = (
-            _numbers(file, name) for name in ("timestamp", "frame_index", "task_index")
-        )
+        time = _numbers(file, "timestamp")
+        frame = _numbers(file, "frame_index")
+        task = _numbers(file, "task_index")
         _check_order(source, file, frame)
         if ((task < 0) | (task >= texts)).any():
             tasks, *_ = source.dataset.table_files
@@ -66,6 +66,7 @@ def read_vectors(source: Source, feature: str) -> np.ndarray:
     """
     size, feature = source.dataset.size(feature), source.dataset.own(feature)
     vectors = np.zeros((source.dataset.info.frames, size), np.float32)
+    # All files are read before anything is said, so that the error can name every bad episode.
     bad = list[tuple[DataFile, np.ndarray]]()
     for file in source.data:
         rows = _matrix(_read(file, feature), size, feature, file.path)
@@ -104,9 +105,10 @@ def _not_finite(
 
 def _put(target: np.ndarray, file: DataFile, values: np.ndarray) -> None:
     """Write what was read of a file's rows to the places of their frames."""
-    done = 0
+    done = 0  # values that have been written
     for rows in file.rows:
-        target[rows.first_frame : rows.first_frame + rows.count] = values[done : done + rows.count]
+        places = slice(rows.first_frame, rows.first_frame + rows.count)
+        target[places] = values[done : done + rows.count]
         done += rows.count
 
 
@@ -118,14 +120,16 @@ def _rows_of(file: DataFile) -> np.ndarray:
 def _episodes_at(source: Source, file: DataFile, places: np.ndarray) -> set[int]:
     """The episodes of a file's rows, by their places [n] among those that are read."""
     ends = np.cumsum([source.dataset.episodes[number].length for number in file.episodes])
-    return {file.episodes[i] for i in np.unique(np.searchsorted(ends, places, side="right"))}
+    # "right", since a place that equals the end of one episode is the first of the next.
+    within = np.searchsorted(ends, places, side="right")
+    return {file.episodes[i] for i in np.unique(within)}
 
 
 def _read(file: DataFile, name: str) -> Any:
     """The rows of a column that are read."""
     with layout.reading_parquet(file.path):
         cells = column(layout.open_parquet(file.path), file.path, name)
-    if len(file.rows) == 1:
+    if len(file.rows) == 1:  # a slice is no copy
         return cells.slice(file.rows[0].first, file.rows[0].count)
     return cells.take(_rows_of(file))
 
@@ -157,6 +161,7 @@ def _check_rate(source: Source, steps: np.ndarray) -> None:
     """
     if not len(steps):
         return
+    # The median, because single gaps are no other rate.
     fps, step = source.dataset.info.fps, float(np.median(steps))
     if abs(step - 1 / fps) > _RATE_TOLERANCE / fps:
         folder = source.dataset.folder
@@ -194,5 +199,6 @@ def _flat(array: Any, size: int, feature: str, path: Path) -> np.ndarray:
             f"{size}, as {layout.INFO} and the files before say",
             "give a dataset of one robot: features keep their size",
         )
+    # Not `.values`, which also has what lies before and behind a slice.
     flat = array.flatten() if pa.types.is_nested(kind) else array
-    return flat.to_numpy(zero_copy_only=False)
+    return flat.to_numpy(zero_copy_only=False)  # truth values are bits, and have to be copied

@@ -69,8 +69,9 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
 
 
 def _sum(figures: Iterable[np.ndarray]) -> np.ndarray:
+    """The sum of arrays, of which there is at least one."""
     first, *others = figures
-    return sum(others, 0 + first)
+    return sum(others, 0 + first)  # `sum` would begin with the number 0, which is no array
 
 
 def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:
@@ -83,9 +84,10 @@ def _of_values(values: np.ndarray, weights: np.ndarray) -> dict[str, float]:
     if total < 2:
         return figures | dict.fromkeys(QUANTILES, mean)
     counts, edges = np.histogram(values, _BINS, (least - 1e-10, most + 1e-10), weights=weights)
-    return figures | {
-        name: _quantile(counts.cumsum(), edges, share * total) for name, share in QUANTILES.items()
-    }
+    below = counts.cumsum()
+    for name, share in QUANTILES.items():
+        figures[name] = _quantile(below, edges, share * total)
+    return figures
 
 
 def _quantile(below: np.ndarray, edges: np.ndarray, target: float) -> float:
@@ -107,6 +109,7 @@ def _sample(length: int) -> np.ndarray:
 
 
 def _thinned(frames: np.ndarray) -> np.ndarray:
+    """Every so many pixels of frames [T, H, W, 3]; small ones as they are."""
     larger = max(frames.shape[1:3])
     step = 1 if larger < _LARGE else int(larger / _SMALL)
     return frames[:, ::step, ::step]

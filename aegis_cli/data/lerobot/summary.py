@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,29 +52,26 @@ def dataset_facts(found: Dataset) -> dict[str, Any]:
 def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
     """Every feature with its statistics."""
     stats = found.stats or {}
-    return tuple(
-        FeatureInfo(
-            name,
-            feature.dtype,
-            feature.shape,
-            feature.components,
-            _figures(found, stats.get(name, {})),
-        )
-        for name, feature in found.info.features.items()
-    )
+    features = []
+    for name, own in found.info.features.items():
+        figures = _figures(found, stats.get(name, {}))
+        features.append(FeatureInfo(name, own.dtype, own.shape, own.components, figures))
+    return tuple(features)
 
 
 def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    """Each statistic's numbers in a row: a camera's have the shape [3, 1, 1]."""
+    figures = {}
     with layout.damaged(found.folder / layout.STATS):
-        return {
-            name: tuple(np.asarray(value, np.float64).ravel().tolist())
-            for name, value in stats.items()
-        }
+        for name, value in stats.items():
+            figures[name] = tuple(np.asarray(value, np.float64).ravel().tolist())
+    return figures
 
 
 def on_sheet(found: Dataset) -> list[int]:
     """The numbers of the episodes that `save_sheet` shows, spread over the dataset."""
     spread = np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES)
+    # Of fewer episodes than there is room for, each is found several times.
     return np.unique(spread.round().astype(int)).tolist()
 
 
@@ -99,16 +97,16 @@ def save_sheet(folder: Path, out: Path) -> None:
     read = source.find(found, shown)
     index = rows.read_index(read)
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
-    ends = sorted({int(n) for e in shown for n in (starts[e], starts[e + 1] - 1)})
-    pictures = {
-        camera: dict(zip(ends, frames.pick(read, index, camera, ends), strict=True))
-        for camera in found.info.cameras
-    }
+    spans = [(int(starts[e]), int(starts[e + 1]) - 1) for e in shown]  # first and last frame
+    # A set, because an episode of one frame begins and ends with it; `pick` wants them to rise.
+    ends = sorted({*itertools.chain(*spans)})
+    pictures = {}
+    for camera in found.info.cameras:
+        picked = frames.pick(read, index, camera, ends)
+        pictures[camera] = dict(zip(ends, picked, strict=True))
     entries = []
-    for e in shown:
-        first, last = int(starts[e]), int(starts[e + 1]) - 1
+    for first, last in spans:
         caption = f"{found.tasks[index.task[first]]}  ({last - first + 1} steps)"
-        entries.append(
-            (caption, [pictures[camera][n] for camera in pictures for n in (first, last)])
-        )
+        shots = [of_camera[n] for of_camera in pictures.values() for n in (first, last)]
+        entries.append((caption, shots))
     media.save_sheet(out, entries)

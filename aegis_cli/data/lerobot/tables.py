@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Sink:
     def __init__(self, path: Path) -> None:
         import pyarrow as pa
 
+        # The file is opened here and not by the writer, so that `size` can ask where it is.
         self._file, self._writer = pa.OSFile(str(path), "wb"), None
 
     def write(self, table: Any) -> None:
@@ -39,6 +40,7 @@ class Sink:
         return self._file.tell()
 
     def close(self) -> None:
+        """Write the footer, without which a parquet file cannot be read, and close the file."""
         if self._writer is not None:
             self._writer.close()
         self._file.close()
@@ -48,6 +50,7 @@ def of_frames(vectors: Mapping[str, np.ndarray], pictures: Mapping[str, Sequence
     """An episode's table: vectors [T, D] as lists, [T] and [T, 1] as numbers, pictures as bytes."""
     import pyarrow as pa
 
+    # What every dataset has comes last, as in LeRobot's own files.
     columns = {
         name: _vector(rows) for name, rows in vectors.items() if name not in layout.INDEX_FEATURES
     }
@@ -55,17 +58,17 @@ def of_frames(vectors: Mapping[str, np.ndarray], pictures: Mapping[str, Sequence
         names = [f"frame-{i:06d}.png" for i in range(len(images))]
         parts = [pa.array(images, pa.binary()), pa.array(names, pa.string())]
         columns[camera] = pa.StructArray.from_arrays(parts, ["bytes", "path"])
-    columns |= {
-        name: pa.array(vectors[name].astype(kind)) for name, kind in layout.INDEX_FEATURES.items()
-    }
+    for name, kind in layout.INDEX_FEATURES.items():
+        columns[name] = pa.array(vectors[name].astype(kind))
     table = pa.table(columns)
+    # By this `datasets` knows which columns are images; Arrow's own types do not tell.
     features = {field.name: _hf_feature(field.type) for field in table.schema}
-    return table.replace_schema_metadata(
-        {"huggingface": json.dumps({"info": {"features": features}})}
-    )
+    described = json.dumps({"info": {"features": features}})
+    return table.replace_schema_metadata({"huggingface": described})
 
 
 def _vector(rows: np.ndarray) -> Any:
+    """Rows [T, D] as lists of D numbers, or as numbers where D is 1, as LeRobot has them."""
     import pyarrow as pa
 
     flat, width = pa.array(rows.astype(np.float32).ravel()), rows.shape[1]
@@ -84,7 +87,8 @@ def _hf_feature(kind: Any) -> dict[str, Any]:
             "length": kind.list_size,
             "_type": "Sequence",
         }
-    return {"dtype": {"float": "float32"}.get(str(kind), str(kind)), "_type": "Value"}
+    name = "float32" if str(kind) == "float" else str(kind)  # Arrow's own name of that one
+    return {"dtype": name, "_type": "Value"}
 
 
 def of_rows(rows: Sequence[Mapping[str, Any]]) -> Any:
@@ -109,6 +113,7 @@ def save_tasks(path: Path, tasks: Sequence[str]) -> None:
         _pandas_column("task_index", "int64", "int64"),
         _pandas_column("task", "unicode", "object"),
     ]
+    # What pandas itself puts into the file of such a frame: it reads its index back by it.
     header = {
         **_pandas_column("", "unicode", "object"),
         "name": None,
@@ -122,12 +127,15 @@ def save_tasks(path: Path, tasks: Sequence[str]) -> None:
         "pandas_version": "2.0.0",
     }
     described_table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-    files.write_atomically(
-        path, lambda file: parquet.write_table(described_table, file, write_page_checksum=True)
-    )
+
+    def write(file: BinaryIO) -> None:
+        parquet.write_table(described_table, file, write_page_checksum=True)
+
+    files.write_atomically(path, write)
 
 
 def _pandas_column(name: str, kind: str, numpy_type: str) -> dict[str, Any]:
+    """How pandas describes a column."""
     return {
         "name": name,
         "field_name": name,

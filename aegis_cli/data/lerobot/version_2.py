@@ -57,6 +57,7 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
     with layout.damaged(folder / _STATS):
         for row in _lines(folder / _STATS):
             for feature, figures in row["stats"].items():
+                # Episode by episode: all of them at once would be held in memory.
                 own = {name: np.asarray(value, np.float64) for name, value in figures.items()}
                 known = [joined[feature], own] if feature in joined else [own]
                 joined[feature] = statistics.merge(known)
@@ -68,6 +69,7 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     if length < 1:
         raise ValueError(f"episode {row['episode_index']} has {length} frames")
     place = layout.episode_place(info, int(row["episode_index"]))
+    # Each video is of one episode alone, and ends with its file.
     clips = {key: Clip(layout.video_file(info, key, place), 0.0) for key in info.videos}
     return EpisodeIndex(length, layout.data_file(info, place), clips)
 

@@ -47,6 +47,7 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     for path in paths:
         with layout.reading_parquet(path):
             file = layout.open_parquet(path)
+            # Each episode's statistics are most of the file, and nobody asks for them here.
             names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             rows += file.read(columns=names).to_pylist()
     with layout.damaged(where):
@@ -64,6 +65,7 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
 
 
 def _episode_files(folder: Path) -> list[Path]:
+    """The tables of episodes, in the order of their names."""
     return sorted((folder / _EPISODES).glob("*/*.parquet"))
 
 
@@ -78,11 +80,12 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
 
 
 def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
-    chunk, file = (int(row[f"videos/{key}/{name}"]) for name in ("chunk_index", "file_index"))
+    chunk, file = int(row[f"videos/{key}/chunk_index"]), int(row[f"videos/{key}/file_index"])
     path = layout.video_file(info, key, layout.file_place(chunk, file))
     start_s = float(row[f"videos/{key}/from_timestamp"])
     if not math.isfinite(start_s):
         raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
+    # The end is a help alone (`Clip`): a dataset without one, or with a wrong one, can be read.
     end_s = row.get(f"videos/{key}/to_timestamp")
     told = isinstance(end_s, int | float) and math.isfinite(end_s) and end_s > start_s
     return Clip(path, start_s, float(end_s) if told else math.inf)

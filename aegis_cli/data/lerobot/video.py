@@ -45,7 +45,8 @@ class Reader:
             container = self._containers.pop(path, None) or self._opened(path)
             self._containers[path] = container  # the last one in the order
             if len(self._containers) > _KEPT_OPEN:
-                self._containers.pop(next(iter(self._containers))).close()
+                longest_unread = next(iter(self._containers))
+                self._containers.pop(longest_unread).close()
             return next(_closest(container, path, (time,), tolerance))
 
     @staticmethod
@@ -84,18 +85,19 @@ def _reading(path: Path) -> Generator[None]:
 def _closest(
     container: Any, path: Path, times: Sequence[float], tolerance: float
 ) -> Iterator[np.ndarray]:
+    """The frames [H, W, 3] uint8 at rising times; see `read`.
+
+    The video is decoded once, from front to back: of all its frames no more than two are held.
+    """
     if not container.streams.video:
         raise AegisError(f"no video in '{path}'", "a file with a video stream", layout.AGAIN)
     decoded = _decoded(container, times[0], tolerance)
-    before = after = next(decoded, None)
+    before = after = next(decoded, None)  # the frames on both sides of a time, each with its own
     for time in times:
         while after is not None and after[0] < time:
             before, after = after, next(decoded, None)
-        found = min(
-            (f for f in (before, after) if f is not None),
-            key=lambda f: abs(f[0] - time),
-            default=None,
-        )
+        both = [each for each in (before, after) if each is not None]
+        found = min(both, key=lambda each: abs(each[0] - time), default=None)
         if found is None or abs(found[0] - time) > tolerance:
             nearest = "it has none" if found is None else f"the closest is at {found[0]:.3f} s"
             raise AegisError(
@@ -117,11 +119,7 @@ def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[f
     while True:
         start = max(0, round((first - back) / stream.time_base) - 1)  # a frame's room for rounding
         container.seek(start, stream=stream)
-        decoded = (
-            (float(f.pts * stream.time_base), f)
-            for f in container.decode(stream)
-            if f.pts is not None
-        )
+        decoded = _timed(container, stream)
         begun = next(decoded, None)
         if begun is None or begun[0] <= first + tolerance or start == 0:
             break
@@ -129,3 +127,10 @@ def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[f
     if begun is not None:
         yield begun
         yield from decoded
+
+
+def _timed(container: Any, stream: Any) -> Iterator[tuple[float, Any]]:
+    """The frames from where the container stands, with their times in seconds."""
+    for frame in container.decode(stream):
+        if frame.pts is not None:  # one that has none belongs to no time
+            yield float(frame.pts * stream.time_base), frame

@@ -142,12 +142,15 @@ class _Files:
 
         Their size is estimated by the mean size of the rows before them.
         """
-        if self._sink is not None and self._sink.size() * (1 + rows / self._rows) >= self._limit:
-            self.close()
-            self.place = layout.next_file(*self.place, self._per_chunk)
+        if self._sink is not None:
+            expected = self._sink.size() * (1 + rows / self._rows)
+            if expected >= self._limit:
+                self.close()
+                self.place = layout.next_file(*self.place, self._per_chunk)
         return self.place
 
     def write(self, content: Any, rows: int) -> None:
+        """Append what has so many rows; `make_room` is asked before."""
         if self._sink is None:
             path = self._path(*self.place)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -156,12 +159,15 @@ class _Files:
         self._rows += rows
 
     def close(self) -> None:
+        """Close the open file; what is written afterwards begins the next one."""
         if self._sink is not None:
             self._sink.close()
             self._sink = None
 
 
 class _Writer:
+    """Writes the episodes of one dataset, and the meta folder when all are written."""
+
     def __init__(self, folder: Path, spec: Spec, limits: Limits) -> None:
         self._folder, self._spec, self._limits = folder, spec, limits
         self._data = self._parquet(layout.DATA)
@@ -196,6 +202,7 @@ class _Writer:
                 self._add(episode)
             self._flush()
         finally:
+            # Also after an error, after which `folder_aside` removes what is here.
             for files in (self._data, self._episodes, *self._videos.values()):
                 files.close()
         self._save_meta()
@@ -209,6 +216,7 @@ class _Writer:
         vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
         stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
         stats |= {camera: statistics.of_images(frames) for camera, frames in pictured.items()}
+        # A row of the table of episodes: where the parts of this one are, and its statistics.
         row: dict[str, Any] = {
             "episode_index": self._count,
             "tasks": [episode.instruction],
@@ -224,9 +232,11 @@ class _Writer:
                 embedded[camera] = [pictures.to_png(frame) for frame in frames]
         self._data.write(tables.of_frames(vectors, embedded), length)
         for name, own in stats.items():
-            row |= {f"stats/{name}/{figure}": value.tolist() for figure, value in own.items()}
-            known = [self._stats[name], own] if name in self._stats else [own]
-            self._stats[name] = statistics.merge(known) if len(known) > 1 else own
+            for figure, value in own.items():
+                row[f"stats/{name}/{figure}"] = value.tolist()
+            # Merged as they come: the whole dataset's statistics hold no episode in memory.
+            known = self._stats.get(name)
+            self._stats[name] = own if known is None else statistics.merge([known, own])
         self._count, self._frames = self._count + 1, self._frames + length
         self._rows.append(row)
         if len(self._rows) == _BUFFERED:
@@ -261,19 +271,17 @@ class _Writer:
         if not self._rows:
             return
         chunk, file = self._episodes.make_room(len(self._rows))
-        rows = [
-            {**row, "meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-            for row in self._rows
-        ]
+        # A row says in which table it stands itself, as LeRobot's do.
+        own_place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+        rows = [row | own_place for row in self._rows]
         self._episodes.write(tables.of_rows(rows), len(rows))
         self._rows = []
 
     def _save_meta(self) -> None:
         tables.save_tasks(self._folder / version_3.TASKS, list(self._tasks))
-        stats = {
-            name: {figure: x.tolist() for figure, x in own.items()}
-            for name, own in self._stats.items()
-        }
+        stats = {}
+        for name, own in self._stats.items():
+            stats[name] = {figure: value.tolist() for figure, value in own.items()}
         layout.save_json(self._folder / layout.STATS, stats)
         layout.save_json(self._folder / layout.INFO, self._info())
 
@@ -281,6 +289,7 @@ class _Writer:
         spec, limits = self._spec, self._limits
         return {
             "codebase_version": layout.VERSION,
+            # LeRobot's own datasets have whole numbers, and are read by others than us.
             "fps": int(spec.fps) if spec.fps == int(spec.fps) else spec.fps,
             "features": self._features(),
             "total_episodes": self._count,
@@ -318,6 +327,7 @@ class _Writer:
 
 
 def _video_info(shape: tuple[int, ...], fps: float) -> dict[str, Any]:
+    """What LeRobot notes of the videos of a camera whose frames have the shape (H, W, 3)."""
     return {
         "video.height": shape[0],
         "video.width": shape[1],

@@ -28,7 +28,7 @@ def load(
         AegisError: no such stream, what its pictures are made with is missing, or the cache lacks
             some and cannot be written to.
     """
-    from aegis_cli.data.streams import embedded
+    from aegis_cli.data.streams import embedded  # loads torch
 
     tasks = _tasks(name)
     if not all(embedded.file(cache, task).exists() for task in tasks):
@@ -37,6 +37,7 @@ def load(
 
 
 def _make_cache(folder: Path) -> None:
+    """Make the folder of pictures, or say that another can be chosen."""
     try:
         files.make_folder(folder)
         files.check_writable(folder / "pictures")
@@ -59,6 +60,7 @@ def edition(name: str) -> list[dict[str, object]]:
 
 
 def _tasks(name: str) -> tuple[str, ...]:
+    """The names of a stream's tasks, in the order in which they are learned."""
     if name not in STREAMS:
         raise AegisError(f"no stream '{name}'", f"one of {', '.join(STREAMS)}", "check the name")
     return STREAMS[name]

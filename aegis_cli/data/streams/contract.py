@@ -49,6 +49,7 @@ class StreamTask:
     test: Part
 
     def __post_init__(self) -> None:
+        # Of two classes with one name, no image could be told to be the other's.
         if len(set(self.classes)) < max(2, len(self.classes)):
             found = f"task '{self.name}' with classes {list(self.classes)}"
             raise AegisError(found, "two or more, all different", "rename them")

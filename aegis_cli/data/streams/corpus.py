@@ -110,7 +110,7 @@ def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
         choices = [range(len(kind.attributes[slot])) for slot in slots]
         for values in product(*choices):
             says = [number, *[UNSAID] * ATTRIBUTES]
-            words = []
+            words = []  # of the phrase's gaps, which need not be in the attributes' order
             for slot, value in zip(slots, values, strict=True):
                 says[1 + slot] = value
                 words.append(kind.attributes[slot][value])
@@ -120,6 +120,7 @@ def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
 def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
     """Whether a caption is true of a picture: captions [N, A], pictures [B, A] -> [B, N] bool."""
     agrees = says[None] == facts[:, None]  # [B, N, A]
+    # The kind is always stated, so that no caption is true of another kind's picture.
     return (agrees | (says[None] == UNSAID)).all(-1)
 
 
@@ -135,7 +136,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
     Raises:
         AegisError: a Pillow without FreeType, or no OpenGL.
     """
-    masks.need_freetype()
+    masks.need_freetype()  # before minutes of drawing
     paint, kinds = _painters(), list(KINDS.values())
     shares = np.array([kind.weight for kind in kinds])
     images = np.empty((count, SIZE, SIZE, 3), np.uint8)
@@ -145,7 +146,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
         rng = np.random.default_rng([seed, SPLITS[split], i])
         number = rng.choice(len(kinds), p=shares / shares.sum())
         values = [int(rng.integers(len(words))) for words in kinds[number].attributes]
-        facts[i, : 1 + len(values)] = number, *values
+        facts[i, : 1 + len(values)] = number, *values  # kinds of one attribute leave the last one
         images[i] = paint[number](*values, rng)
         if (i + 1) % REPORT_EVERY == 0 or i + 1 == count:
             on_event(Progress(f"{split} pictures", i + 1, count, "pictures"))

@@ -47,6 +47,7 @@ def _current(path: Path, name: str) -> bool:
     if not path.exists():
         return False
     try:
+        # Words belong to it: a task whose classes are called otherwise is made again.
         return artifacts.load(path, "stream-task").header.meta == meta(name)
     except AegisError as error:
         raise AegisError(
@@ -57,6 +58,7 @@ def _current(path: Path, name: str) -> bool:
 def meta(name: str) -> dict[str, object]:
     """Everything that a task's pictures follow from."""
     words, counts = TASKS[name], COUNTS
+    # There are no more real digits than those that were scanned.
     if name.startswith("digits"):
         counts = COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]}
     return {
@@ -92,7 +94,7 @@ def read(path: Path, image_size: int) -> StreamTask:
     parts: dict[str, Part] = {}
     start = 0
     for name in PARTS:
-        rows = slice(start, start + meta["parts"][name])
+        rows = slice(start, start + meta["parts"][name])  # as `save` has joined them
         parts[name] = _part(tensors["images"][rows], tensors["labels"][rows], image_size)
         start = rows.stop
     return StreamTask(meta["name"], tuple(meta["classes"]), tuple(meta["templates"]), **parts)

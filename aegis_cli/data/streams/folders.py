@@ -63,12 +63,8 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     words = _words(folder, classes)
     if (folder / TEMPLATES).is_file():
         templates = _sentences(folder / TEMPLATES)
-    return StreamTask(
-        name,
-        words,
-        tuple(templates),
-        *(listed[part].part(size) for part in ("train", "validation", "test")),
-    )
+    parts = {part: listed[part].part(size) for part in ("train", "validation", "test")}
+    return StreamTask(name, words, tuple(templates), **parts)
 
 
 def contents(folder: Path) -> dict[str, object]:
@@ -82,7 +78,8 @@ def contents(folder: Path) -> dict[str, object]:
     """
     classes, parts = _parts(folder)
     used = [file for listed in parts.values() for file in listed.files]
-    used += [path for name in (CLASSES, TEMPLATES) if (path := folder / name).is_file()]
+    # Words are a part of it: other classes or sentences make another task of the same images.
+    used += filter(Path.is_file, (folder / CLASSES, folder / TEMPLATES))
     with ThreadPoolExecutor(_THREADS) as pool:
         digests = list(pool.map(sha256_file, used))
     names = [path.relative_to(folder).as_posix() for path in used]
@@ -115,6 +112,7 @@ def _square(file: Path, size: int) -> np.ndarray:
         ) from error
     shorter = min(image.size)
     # The longer side is truncated to whole pixels, as CLIP's processor does; rounding would differ.
+    # The shorter one is given, for a quotient of floats may fall a pixel short.
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
     left, top = (width - size) // 2, (height - size) // 2
     scaled = image.resize((width, height), Image.Resampling.BICUBIC)
@@ -124,24 +122,26 @@ def _square(file: Path, size: int) -> np.ndarray:
 def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
     """The class folders of a task, and the images of the parts that it has."""
     parts = {part: folder / part for part in ("train", "validation", "test")}
-    if missing := [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]:
+    missing = [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]
+    if missing:
         raise AegisError(
             f"no folder {' and no folder '.join(missing)}",
             f"{folder}/train/CLASS/IMAGE and …/test/CLASS/IMAGE",
             "unpack the dataset there, a folder for each class",
         )
     classes = _class_folders(parts["train"])
-    return classes, {part: _list(path, classes) for part, path in parts.items() if path.is_dir()}
+    there = {part: path for part, path in parts.items() if path.is_dir()}
+    return classes, {part: _list(path, classes) for part, path in there.items()}
 
 
 def _visible_folders(folder: Path) -> list[str]:
     """Names of the folders in it, without hidden ones, in alphabetical order."""
-    return sorted(
-        path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")
-    )
+    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return sorted(name for name in names if not name.startswith("."))
 
 
 def _class_folders(train: Path) -> list[str]:
+    """Names of the class folders, whose order is that of the labels."""
     found = _visible_folders(train)
     if len(found) < 2:
         expected = "a folder for each of two classes or more"
@@ -152,6 +152,7 @@ def _class_folders(train: Path) -> list[str]:
 
 
 def _list(part: Path, classes: Sequence[str]) -> Listing:
+    """The images of a part by their classes; a part need not have all of them."""
     folders = _visible_folders(part)
     if unknown := [name for name in folders if name not in classes]:
         raise AegisError(
@@ -195,13 +196,14 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
     """
     names = [file.relative_to(folder).as_posix() for file in train.files]
     hashed = [hashlib.sha256(name.encode()).digest() for name in names]
+    numbers = [int.from_bytes(digest[:8], "big") for digest in hashed]
     rising = sorted(range(len(hashed)), key=hashed.__getitem__)
-    last = {train.labels[i]: i for i in rising}  # of each class
-    held = {i for i in rising if int.from_bytes(hashed[i][:8], "big") % VALIDATION == 0}
+    last = {train.labels[i]: i for i in rising}  # of each class the image of the largest hash
+    held = {i for i in rising if numbers[i] % VALIDATION == 0}
     held.add(rising[0])  # at least one image is held out, also in a small task
     learned = {label for i, label in enumerate(train.labels) if i not in held}
     held -= {i for label, i in last.items() if label not in learned}
-    if not held:
+    if not held:  # the only one went back to its class
         spare = [i for i in rising if i not in last.values()]
         if not spare:
             raise AegisError(
@@ -210,9 +212,8 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
                 f"put some into {folder}/validation/CLASS",
             )
         held.add(spare[0])
-    return train.where([i not in held for i in range(len(names))]), train.where(
-        [i in held for i in range(len(names))]
-    )
+    is_held = [i in held for i in range(len(names))]
+    return train.where([not each for each in is_held]), train.where(is_held)
 
 
 def _sentences(path: Path) -> list[str]:
@@ -238,6 +239,11 @@ def _sentences(path: Path) -> list[str]:
 
 
 def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
+    """What each class is called in a sentence.
+
+    Raises:
+        AegisError: a `classes.json` that is no mapping of class folders to words.
+    """
     path = folder / CLASSES
     named: dict[str, str] = {}
     if path.is_file():
@@ -247,9 +253,8 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
             raise AegisError(
                 f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"
             ) from error
-        if not isinstance(named, dict) or not all(
-            isinstance(word, str) and word for word in named.values()
-        ):
+        words = list(named.values()) if isinstance(named, dict) else [None]
+        if not all(isinstance(word, str) and word for word in words):
             raise AegisError(
                 f"'{path}' with something else than words", '{"folder": "words", …}', "correct it"
             )

@@ -14,7 +14,7 @@ from aegis_cli.data.streams.names import SIZE
 if TYPE_CHECKING:
     from PIL import ImageFont
 
-FINER = 3
+FINER = 3  # times as many pixels per side are drawn as the mask has
 _CANVAS = SIZE * FINER
 Points = np.ndarray  # [n, 2], x to the right and y down, the shape within [-1, 1]
 
@@ -61,6 +61,7 @@ def shape(
 ) -> np.ndarray:
     """One of `names.SHAPES`, filled, or as a line of that share of its radius."""
     outer = OUTLINES[name]()
+    # Each layer covers a part of the one before: filled, cut out, filled again.
     layers = [(place(outer, center, radius, angle_rad), True)]
     if name == "ring":
         layers.append((place(outer * 0.55, center, radius, angle_rad), False))
@@ -97,23 +98,23 @@ def _normals(sides: np.ndarray) -> np.ndarray:
 
 
 def _circle() -> Points:
-    t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    return np.stack([np.cos(t), np.sin(t)], 1)
+    return _regular(48, 0.0)  # more corners than can be seen
 
 
 def _regular(corners: int, first_rad: float) -> Points:
+    """A regular polygon of radius 1, whose first corner is at this angle from the x axis."""
     t = first_rad + np.linspace(0, 2 * np.pi, corners, endpoint=False)
     return np.stack([np.cos(t), np.sin(t)], 1)
 
 
 def _star() -> Points:
     points = _regular(10, -np.pi / 2)
-    points[1::2] *= 0.42
+    points[1::2] *= 0.42  # every other corner is pulled inwards
     return points
 
 
 def _cross() -> Points:
-    a, b = 0.95, 0.32
+    a, b = 0.95, 0.32  # half of an arm's reach, and half of its width
     quarter = np.array([(-b, -a), (b, -a), (b, -b)])
     turns = [
         np.array([[1, 0], [0, 1]]),
@@ -182,6 +183,7 @@ def glyph(
     # PIL asks where each pixel of the result comes from. So this is the way back: from turned to
     # straight, and from slanted to upright.
     back = np.array([[1, slant], [0, 1]]) @ np.array([[c, -s], [s, c]])
+    # The middle of what was drawn goes to `center`, and not the font's own middle.
     start = np.array([(left + right) / 2, (top + bottom) / 2]) - back @ (center * FINER)
     numbers = (back[0, 0], back[0, 1], start[0], back[1, 0], back[1, 1], start[1])
     turned = letter.transform(
@@ -199,7 +201,7 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: float) -> np.ndarray:
     """One of `names.TEXTURES` over the whole picture, at a random phase -> [S, S] in [0, 1]."""
-    at = (np.arange(_CANVAS) + 0.5) / FINER - SIZE / 2
+    at = (np.arange(_CANVAS) + 0.5) / FINER - SIZE / 2  # pixels from the picture's middle
     x, y = np.meshgrid(at, at)
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = 2 * np.pi / period_px
@@ -211,12 +213,14 @@ def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: fl
 
 def _rings(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """About a point near the picture's middle, whatever the phase."""
-    middle = np.array([a[_CANVAS // 2, _CANVAS // 2] for a in (u, v)]) + rng.uniform(-2, 2, 2)
+    at = _CANVAS // 2
+    middle = np.array([u[at, at], v[at, at]]) + rng.uniform(-2, 2, 2)
     return np.sin(np.hypot(u - middle[0], v - middle[1])) > 0
 
 
 def _bricks(u: np.ndarray, v: np.ndarray, _: np.random.Generator) -> np.ndarray:
     row = np.floor(v / np.pi)
+    # Every other row is shifted by half a brick.
     along = (u / 2 + row * np.pi / 2) % np.pi
     return (v % np.pi > 0.6) & (along > 0.35)
 
@@ -224,7 +228,7 @@ def _bricks(u: np.ndarray, v: np.ndarray, _: np.random.Generator) -> np.ndarray:
 def _speckles(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Blots of random places."""
     found = np.zeros(u.shape, bool)
-    reach = u.max() - u.min()
+    reach = u.max() - u.min()  # that of v as well, because the picture is square
     across, down = rng.uniform(0, 1, (2, 40))
     radii = rng.uniform(0.5, 1.5, 40)
     for a, b, radius in zip(across, down, radii, strict=True):

@@ -35,6 +35,8 @@ class Photo:
 
     def take(self, picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The picture [S, S, 3] uint8 that this makes of one in [0, 1]."""
+        # The noise comes last, so that nothing smooths it. Every effect draws, also where its span
+        # is empty: another span leaves the other effects' draws as they are.
         picture = blurred(picture, rng.uniform(*self.blur_px))
         picture = 0.5 + (picture - 0.5) * rng.uniform(*self.contrast)
         picture = picture * (1 + rng.uniform(-self.cast, self.cast, 3))

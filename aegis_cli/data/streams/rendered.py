@@ -30,6 +30,7 @@ def _solid(rng: np.random.Generator, color: str, solid: str) -> np.ndarray:
     """The part of a scene around its one thing, enlarged: [S, S, 3] in [0, 1]."""
     scene = renderer_of_thread().render(rng, only=(color, solid))
     at = np.array([scene.things[0].x_px, scene.things[0].y_px])
+    # Nearly in the middle, and never beyond the border.
     corner = np.clip(at - _CROP_PX / 2 + rng.uniform(-3, 3, 2), 0, IMAGE_SIZE - _CROP_PX)
     left, top = np.rint(corner).astype(int)
     return enlarged(scene.image[top : top + _CROP_PX, left : left + _CROP_PX] / 255)
@@ -59,7 +60,7 @@ def night_target(color: int, rng: np.random.Generator) -> np.ndarray:
 def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
     """The point mass and a pad that is `direction` of the middle."""
     stage = point.stage()
-    stage.physics.reset()
+    stage.physics.reset()  # the stage is shared: nothing of the picture before may stay
     stage.physics.data.qpos[:] = rng.uniform(-0.25, 0.25, 2)
     distance = rng.uniform(0.09, 0.22)
     pad = _off_middle(direction, 16, distance, rng)
@@ -71,6 +72,7 @@ def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
+    """The arm in any pose, and a disc `direction` of the middle: [S, S, 3] in [0, 1]."""
     stage = reach.stage()
     stage.physics.reset()
     stage.physics.data.qpos[:] = rng.uniform(-math.pi, math.pi), rng.uniform(-2.5, 2.5)
@@ -84,6 +86,7 @@ def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray
 def _off_middle(
     direction: int, off_deg: float, distance_m: float, rng: np.random.Generator
 ) -> np.ndarray:
+    """The point [2] in metres that lies in a direction of the middle, up to `off_deg` off it."""
     # Directions are 45 degrees apart: less than half of that off, and each can still be told.
     angle = math.radians(direction * 45 + rng.uniform(-off_deg, off_deg))
     return distance_m * np.array([math.cos(angle), math.sin(angle)])

@@ -53,8 +53,10 @@ def normalise(answer: str) -> str:
     restored. An answer of articles and punctuation alone keeps them.
     """
     spaced = " ".join(answer.split())
+    # The official order: marks, number words, articles, and apostrophes at last.
     words = [_NUMBERS.get(word, word) for word in _strip_marks(spaced).lower().split()]
-    said = " ".join(_CONTRACTIONS.get(word, word) for word in words if word not in _ARTICLES)
+    kept = [word for word in words if word not in _ARTICLES]
+    said = " ".join(_CONTRACTIONS.get(word, word) for word in kept)
     return said or spaced.lower()
 
 
@@ -94,4 +96,6 @@ def soft_accuracy(said: str, answers: Sequence[str]) -> float:
     matches = [normalise(answer) == normalise(said) for answer in answers]
     if len(matches) == 1:
         return float(matches[0])
-    return sum(min(1.0, (sum(matches) - match) / 3) for match in matches) / len(matches)
+    # Without one person, those who said it are one fewer if that person did.
+    without_each = [min(1.0, (sum(matches) - match) / 3) for match in matches]
+    return sum(without_each) / len(matches)

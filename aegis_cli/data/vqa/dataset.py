@@ -31,9 +31,12 @@ TRAINING_MIX: dict[str, int] = {
 _CHUNK = 250  # scenes a worker renders at a time
 
 
-def _name(key: str) -> str:
-    """A short digest of an image's name, which need not be UTF-8."""
-    return hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
+def digest_of(text: str) -> str:
+    """sha256 of a text such as an image's name, which need not be UTF-8.
+
+    Python holds what is not with halves of characters (surrogates).
+    """
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class VQASet:
         """A digest of each image's name; None of scenes, which every seed has drawn for itself."""
         if isinstance(self.images, np.ndarray):
             return None
-        return [_name(picture.key) for picture in self.images.pictures]
+        return [digest_of(picture.key)[:10] for picture in self.images.pictures]
 
     def sized(self, size: int | None) -> VQASet:
         """The same set for a backbone that needs images of `size` pixels per side.
@@ -106,6 +109,7 @@ def render_training(
 ) -> Rendered:
     """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
     gl.check()
+    # Chunks of one size, whatever the workers: the balance of answers is kept within a chunk.
     jobs = [
         (seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX)
         for start in range(0, scenes, _CHUNK)
@@ -132,7 +136,7 @@ def load_scenes(
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
     for family in FAMILIES[: questions % len(FAMILIES)]:
         quota[family] += 1
-    missing = Counter(quota)
+    missing = Counter(quota)  # questions of each family that are still to be found
     images: list[np.ndarray] = []
     image_of: list[int] = []
     kept: list[Question] = []
@@ -140,15 +144,13 @@ def load_scenes(
     start = 0
     chunk = min(_CHUNK, max(8, questions // 10))  # a small set starts no worker process
     while missing.total():
-        jobs = [
-            (seed, split, start + i * chunk, chunk, mix)
-            for i in range(workers if chunk == _CHUNK else 1)
-        ]
+        at_once = workers if chunk == _CHUNK else 1
+        jobs = [(seed, split, start + i * chunk, chunk, mix) for i in range(at_once)]
         start += len(jobs) * chunk
         for part in _map(jobs, workers):
             for image, scene_questions in zip(part.images, part.questions, strict=True):
                 wanted = [q for q in scene_questions if missing[q.family] > 0]
-                if wanted:
+                if wanted:  # at most one of each family, so that no quota is exceeded
                     missing.subtract(q.family for q in wanted)
                     image_of += [len(images)] * len(wanted)
                     images.append(image)

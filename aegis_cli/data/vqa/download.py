@@ -27,6 +27,7 @@ def fetch(name: str, split: str | None) -> Path:
             "a local set, or the package that downloads one",
             "check the path, or pip install 'aegis-vla[hf]'",
         )
+    # What there is has to be asked for first: the names of the files say which are of the split.
     try:
         there = hub.list_files(name, "dataset")
     except (OSError, ValueError) as error:
@@ -40,8 +41,9 @@ def fetch(name: str, split: str | None) -> Path:
 
 def _cached(name: str, split: str | None, why: Exception) -> Path:
     """The folder of a split that was downloaded before, where the hub cannot be asked."""
-    names = ["*.parquet"]
+    names = ["*.parquet"]  # in any folder, as the hub's client matches
     if split is not None:
+        # The names that `saved.of_split` takes for the split's.
         names = [f"{split}.parquet", f"{split}-[0-9]*.parquet", f"{split}_[0-9]*.parquet"]
         names += [f"data/{own}" for own in names]
     try:
@@ -63,8 +65,10 @@ def _missing(name: str, error: Exception) -> AegisError:
 def _of_split(name: str, there: Sequence[str], split: str | None) -> list[PurePosixPath]:
     """The parquet files of a split, or of the only one."""
     parquet = [PurePosixPath(path) for path in there if path.endswith(".parquet")]
+    # Where the reader looks too: other folders would be downloaded for nothing.
     for folder in (PurePosixPath("."), PurePosixPath("data")):
-        if files := [path for path in parquet if path.parent == folder]:
+        files = [path for path in parquet if path.parent == folder]
+        if files:
             return saved.of_split(name, files, split)
     found = f"no parquet file at the top of '{name}' on the hub, nor in its data/"
     expected = "a data set of images, questions and answers as parquet"

@@ -55,6 +55,7 @@ def _read() -> Iterator[Entry]:
     }
     for split, (questions, image_paths) in sources.items():
         paths = {image: Path(path) for image, path in image_paths().items()}
+        # Both splits number their images from 0: a key needs the split.
         for number, (text, answer, image) in enumerate(zip(*questions(), strict=True)):
             where = f"{NAME} {split}, question {number}"
             question = make_question(where, text, [answer], f"{split}-{number}", family(text))

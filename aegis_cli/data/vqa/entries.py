@@ -84,6 +84,7 @@ def _texts(answers: Any) -> list[Any]:
         return []
     listed = answers if isinstance(answers, list) else [answers]
     said = [a.get("answer") if isinstance(a, dict) else a for a in listed]
+    # Python takes True for a number, but no person answers with it.
     return [str(a) if isinstance(a, int) and not isinstance(a, bool) else a for a in said]
 
 
@@ -92,6 +93,7 @@ class Inside:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        # It ends with a separator: `a/bc` is not below `a/b`.
         self._root = os.path.join(os.path.realpath(folder), "")
         self._found: dict[str, Path | None] = {}  # a name -> its file; None leads out of the folder
 
@@ -112,7 +114,7 @@ class Inside:
         Raises:
             AegisError: it leads out of the folder, or there is no such file.
         """
-        if name not in self._found:
+        if name not in self._found:  # many questions are about one image
             self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
@@ -139,7 +141,7 @@ def unique(read: Iterable[Read]) -> Iterator[Read]:
     first: dict[str, str] = {}
     for entry in read:
         if isinstance(entry, Entry):
-            name = str(entry.question.id)
+            name = str(entry.question.id)  # in predictions, 7 and "7" would be one
             if name in first:
                 entry = bad(
                     entry.where,

@@ -52,6 +52,7 @@ class Pictures:
         """
         numbers = np.arange(len(self))[rows].tolist()
         # Only the last look's images are kept: questions about one image lie side by side.
+        # A copy, because another thread may look at the same time.
         held = dict(self._last)
         fresh = {}
         for row in dict.fromkeys(numbers):
@@ -79,7 +80,7 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
     source = picture.source
     try:
         pixels = decoded(source.read_bytes() if isinstance(source, Path) else source())
-    except AegisError:
+    except AegisError:  # the reader knows better what is wrong
         raise
     except Exception as error:  # a damaged data set makes pyarrow raise nearly anything
         raise AegisError(

@@ -35,7 +35,7 @@ def _read(path: Path) -> Iterator[Read]:
 
 def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
     try:
-        raw = files.parse_json(line.decode("utf-8-sig"))
+        raw = files.parse_json(line.decode("utf-8-sig"))  # some editors put a mark at the start
     except ValueError as error:
         raise bad(
             where,
@@ -50,14 +50,16 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
             "an object with image, question and answers",
             "correct that line",
         )
-    if isinstance(several := raw.get("image", raw.get("images")), list):
+    several = raw.get("image", raw.get("images"))
+    if isinstance(several, list):
         raise bad(
             where,
             f"a list of {len(several)} images",
             "one image of each question, as a path",
             "name the one that is asked about, or join them into one picture",
         )
-    if missing := [key for key in ("image", "question", "answers") if key not in raw]:
+    missing = [key for key in ("image", "question", "answers") if key not in raw]
+    if missing:
         raise bad(
             where,
             f"no {' and no '.join(missing)}",
@@ -72,7 +74,9 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
             "correct the path",
         )
     name = raw.get("id")
+    # Without an id the line is the name by which predictions tell the question.
     own = f"line {number}" if name is None else name
     question = make_question(where, raw["question"], raw["answers"], own, "all")
     path = images.find(where, raw["image"])
+    # Not as it is spelt: two spellings of one image would put it into two parts.
     return Entry(where, question, Picture(images.name(path), where, path))

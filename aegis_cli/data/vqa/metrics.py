@@ -77,7 +77,7 @@ def alike_interval(value: float, samples: int) -> Interval:
     Their spread is then 0 and says nothing. The share of samples with another value is at most
     Wilson's bound for a share that was never seen, and these lie as far away as there is room.
     """
-    share = wilson_interval(0, samples)[1]
+    _, share = wilson_interval(0, samples)
     return value - share * value, value + share * (1 - value)
 
 
@@ -110,12 +110,13 @@ def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[floa
     told: infinity.
     """
     _, cluster = np.unique(np.asarray(cluster_of), return_inverse=True)
-    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
+    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)  # of each cluster
     count = len(sums)
     if count == 1:
         return math.inf, 1
     apart = sums - sizes * values.mean()
-    return math.sqrt(count / (count - 1) * float(np.square(apart).sum())) / len(values), count
+    of_total = math.sqrt(count / (count - 1) * float(np.square(apart).sum()))
+    return of_total / len(values), count
 
 
 def score(graded: Sequence[Graded]) -> Score:
@@ -167,13 +168,16 @@ def mean_loss_interval(losses: np.ndarray, cluster_of: Sequence[int]) -> Interva
     count = len(losses) / _design_effect(losses, cluster_of)
     lost = float(losses.clip(min=0).mean())
     won = float((-losses).clip(min=0).mean())
+    # Shares of as many questions as would tell as much if they were independent.
     least_lost, most_lost = wilson_interval(lost * count, count)
     least_won, most_won = wilson_interval(won * count, count)
     # A question that was lost cannot have been won: of two shares, one is small where the other is
     # large.
     alike = math.sqrt(lost * won / ((1 - lost) * (1 - won))) if lost < 1 and won < 1 else 0.0
+    # The mean is least where little was lost and much was won, and the other way round.
     below = _together(lost - least_lost, most_won - won, alike)
-    return lost - won - below, lost - won + _together(most_lost - lost, won - least_won, alike)
+    above = _together(most_lost - lost, won - least_won, alike)
+    return lost - won - below, lost - won + above
 
 
 def _together(a: float, b: float, alike: float) -> float:
@@ -189,7 +193,7 @@ def _design_effect(values: np.ndarray, cluster_of: Sequence[int]) -> float:
     if np.ptp(values) == 0:
         return 1.0
     error, clusters = clustered_error(values, cluster_of)
-    if clusters == 1:
+    if clusters == 1:  # all that is known is of one image: it counts as one question
         return float(len(values))
     return max(1.0, error**2 * len(values) / float(values.var(ddof=1)))
 
@@ -220,6 +224,7 @@ def grade(
     on_event(Progress("probe", 0, len(questions.questions), "questions"))
     for said, likelihood in answers(_asked(questions, batch_size)):
         rows = slice(len(graded), len(graded) + len(said))
+        # Answers come in the questions' order, and a batch of them at a time.
         surprise, numbers = (-likelihood).tolist(), questions.image_of[rows].tolist()
         for row in zip(questions.questions[rows], said, surprise, numbers, strict=True):
             graded.append(_graded(*row))

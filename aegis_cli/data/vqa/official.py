@@ -53,19 +53,19 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
     whole = _load(path)
     questions = _rows(path, whole, "questions")
     images = _Images(path, whole.get("data_subtype"))
-    told: dict[Any, Any] = {}
+    told: dict[Any, Any] = {}  # annotations by their question; `_entry` takes out what it uses
     for number, row in enumerate(_rows(annotations, _load(annotations), "annotations"), start=1):
-        name = row.get("question_id") if isinstance(row, dict) else None
-        if not isinstance(name, (str, int)) or name in told:
-            found = "no question_id" if name is None else f"a second annotation of question {name}"
-            yield bad(
-                f"annotation {number} of '{annotations}'",
-                found,
-                "one annotation per question",
-                "correct the file",
-            )
-        else:
+        name = _id(row)
+        if name is not None and name not in told:
             told[name] = row
+            continue
+        found = _no_id(row) if name is None else f"a second annotation of question {name}"
+        yield bad(
+            f"annotation {number} of '{annotations}'",
+            found,
+            "one annotation per question",
+            "correct the file",
+        )
     for number, row in enumerate(questions, start=1):
         try:
             yield _entry(f"question {number} of '{path}'", row, told, annotations, images)
@@ -82,14 +82,15 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
 
 def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images: _Images) -> Entry:
     """One question; its annotation is taken out of `told`."""
-    if not isinstance(row, dict) or not isinstance(row.get("question_id"), (str, int)):
+    name = _id(row)
+    if name is None:
         raise bad(
             where,
-            "no question_id",
+            _no_id(row),
             "an object with question_id, image_id and question",
             "correct the file",
         )
-    name = row["question_id"]
+    # From here on the id says which question is meant: both files have it.
     where = f"question_id {name} of {where.partition(' of ')[2]}"
     annotation = told.pop(name, None)
     if annotation is None:
@@ -111,6 +112,18 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
     family = kind if isinstance(kind, str) and kind else "all"
     question = make_question(where, row.get("question"), answers, name, family)
     return Entry(where, question, images.picture(where, row.get("image_id")))
+
+
+def _id(row: Any) -> str | int | None:
+    """The question that a row of either file is of; None where it does not say so."""
+    name = row.get("question_id") if isinstance(row, dict) else None
+    return name if isinstance(name, (str, int)) else None
+
+
+def _no_id(row: Any) -> str:
+    """What a row has in place of a question's id."""
+    name = row.get("question_id") if isinstance(row, dict) else None
+    return "no question_id" if name is None else f"question_id {name!r}"
 
 
 class _Images:
@@ -135,7 +148,7 @@ class _Images:
         if type(number) is not int or number < 0:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"
-        if number not in self._found:
+        if number not in self._found:  # several questions are about one image
             places = [folder / name for folder in self._folders]
             path = next((place for place in places if os.path.isfile(place)), None)
             if path is None:

@@ -28,7 +28,7 @@ class Packed:
 
         These are ids [B, Q', S'] and prompt_length [B, Q'].
         """
-        ids = self.ids[rows, share]
+        ids = self.ids[rows, share]  # [B, Q', S]
         longest = int((ids != 0).sum(-1).max())
         return ids[..., :longest].astype(np.int64), self.prompt_length[rows, share].astype(np.int64)
 
@@ -49,7 +49,9 @@ def pack(
     prompt_length = np.zeros((len(questions), blocks), np.uint8)
     for n, asked in enumerate(questions):
         rows = [(encode(q.text), encode(q.answer)) for q in asked]
+        # By length: a share of the blocks, cut to its longest, then has little padding.
         rows.sort(key=lambda row: len(row[0]) + len(row[1]))
+        # Empty blocks come first, as the shortest.
         for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
             tokens = [*question, 1, *answer, 2]
             ids[n, b, : len(tokens)] = tokens
@@ -77,7 +79,7 @@ def mirror(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mirror the images [B, H, W, 3] where `flip` [B] holds, with the words of location."""
     images, blocks = images.copy(), blocks.copy()
-    images[flip] = images[flip][:, :, ::-1]
+    images[flip] = images[flip][:, :, ::-1]  # the third axis is the width
     turned = blocks[flip]
     # "left or right" in a question lists what may be answered; in an answer the words change place.
     answer = np.arange(blocks.shape[-1]) >= prompt_length[flip][..., None]
@@ -87,5 +89,6 @@ def mirror(
 
 def mirror_cells(cells: np.ndarray, flip: np.ndarray) -> np.ndarray:
     """Cell labels [B, 64] of images mirrored where `flip` [B] holds."""
-    grid = cells.reshape(-1, GRID, GRID)
-    return np.where(flip[:, None, None], grid[:, :, ::-1], grid).reshape(len(cells), -1)
+    grid = cells.reshape(-1, GRID, GRID)  # rows from top to bottom
+    mirrored = np.where(flip[:, None, None], grid[:, :, ::-1], grid)
+    return mirrored.reshape(len(cells), -1)

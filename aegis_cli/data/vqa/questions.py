@@ -88,6 +88,7 @@ def cell_labels(scene: Scene) -> np.ndarray:
 
 def vocabulary() -> tuple[str, ...]:
     """Every word that a question, an answer or an instruction may use, in a fixed order."""
+    # The places in this list are the tokens of a pre-trained model: another order is another model.
     templates = " ".join((*_WHERE, *_COLOR, *_SHAPE, *_COUNT, *_EXISTS, *_SIDE)).replace("{}", "")
     plural = [f"{shape}s" for shape in SHAPES]
     words = (
@@ -122,6 +123,7 @@ def _names(thing: Thing, things: tuple[Thing, ...], hide: str = "") -> list[str]
     same_shape = sum(t.shape == thing.shape for t in things) == 1
     same_both = sum((t.color, t.shape) == (thing.color, thing.shape) for t in things) == 1
     names = []
+    # A phrase may neither fit another thing nor give the answer away.
     if same_color and hide != "color":
         names += [f"{thing.color} {noun}" for noun in _NOUNS]
     if same_shape and hide != "shape":
@@ -153,6 +155,7 @@ def _ask_shape(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 
 def _ask_count(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     plural = _pick(rng, ("objects", "things"))
+    # NUMBERS ends with the most things that a scene has.
     yield Question("count", _pick(rng, _COUNT).format(plural), NUMBERS[len(scene.things)])
 
 
@@ -186,7 +189,7 @@ def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 def _ask_side(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     for one in scene.things:
         for other in scene.things:
-            gap = one.x_px - other.x_px
+            gap = one.x_px - other.x_px  # below 0 where `one` is on the left
             names, others = _names(one, scene.things), _names(other, scene.things)
             if one is not other and abs(gap) >= _MIN_SIDE_GAP_PX and names and others:
                 text = _SIDE[0].format(_pick(rng, names), _pick(rng, others))
@@ -227,7 +230,7 @@ class Balancer:
         self, scene: Scene, family: str, count: int, rng: np.random.Generator
     ) -> list[Question]:
         """Up to `count` questions of one family; fewer where the scene admits fewer."""
-        candidates = list(dict.fromkeys(_ASK[family](scene, rng)))
+        candidates = list(dict.fromkeys(_ASK[family](scene, rng)))  # equal questions once
         # `min` below takes the first of equally rare answers, which would be the scene's first.
         rng.shuffle(candidates)  # type: ignore[arg-type]
         chosen = []

@@ -47,13 +47,14 @@ def reader(path: Path, split: str | None = None) -> Reader:
     _check_package()
     if (path / _SPLITS).is_file():
         path = _folder_of_split(path, split)
-        split = None
+        split = None  # that folder is one split
     if (path / _SAVED).is_file():
         files = sorted(path.glob("*.arrow"))
         if split is not None:
             raise _no_split(path, split, [])
     else:
         files = list(of_split(str(path), _parquet(path), split))
+    # `datasets` would wait for a pipe for ever.
     for file in (*files, *path.glob("*.json")):
         refuse_special(file)
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
@@ -80,9 +81,9 @@ def of_split(where: str, files: Sequence[Stem], split: str | None) -> list[Stem]
     Raises:
         AegisError: several splits, or none of that name.
     """
-    of = [_split(file) for file in files]
-    chosen = _chosen(where, of, split)
-    return [file for file, own in zip(files, of, strict=True) if own == chosen]
+    splits = [_split(file) for file in files]
+    chosen = _chosen(where, splits, split)
+    return [file for file, own in zip(files, splits, strict=True) if own == chosen]
 
 
 def _split(file: PurePath) -> str:
@@ -142,15 +143,19 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     keyed = "image_id" in columns  # then no image has to be read to tell which images are the same
     name = next((c for c in _NAMES if c in columns), None)
     folder, outside = Inside(path if path.is_dir() else path.parent), _outside(rows)
-    for number, row in enumerate(_each(rows.remove_columns("image") if keyed else rows, path)):
+    told = rows.remove_columns("image") if keyed else rows
+    for number, row in enumerate(_each(told, path)):
         where = f"row {number} of '{path}'"
         try:
             apart = outside[number]
             file = folder.find(where, apart) if apart else None
-            own, kind = number if name is None else row[name], row.get("answer_type")
+            own = number if name is None else row[name]
+            kind = row.get("answer_type")
             family = kind if isinstance(kind, str) and kind else "all"
             question = make_question(where, row["question"], row[answers], own, family)
-            source, image_id = file or _InRow(stored, number, where), row.get("image_id")
+            source = file or _InRow(stored, number, where)
+            image_id = row.get("image_id")
+            # Rows repeat their images: equal bytes are one image, which belongs to one part.
             key = _digest(source) if image_id is None else f"image {image_id}"
             yield Entry(where, question, Picture(key, where, source))
         except AegisError as error:
@@ -168,6 +173,7 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
         else:
             rows = datasets.load_from_disk(str(path))
         several = _has_lists_of_images(rows)
+        # As bytes: to decode every image would take hours before the first question.
         if "image" in rows.column_names and not several:
             rows = rows.cast_column("image", datasets.Image(decode=False))
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
@@ -204,6 +210,7 @@ def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _unreadable(path: Path, error: Exception) -> AegisError:
+    # `datasets` says that a file could not be read, and its cause says why.
     why = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
     expected = "a folder that datasets saved, or whole parquet files"
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
@@ -215,7 +222,9 @@ def _outside(rows: Any) -> list[str | None]:
 
     images = rows.data.column("image")
     stored, paths = pc.struct_field(images, "bytes"), pc.struct_field(images, "path")
-    missing = pc.equal(pc.fill_null(pc.binary_length(stored), 0), 0)
+    size = pc.fill_null(pc.binary_length(stored), 0)
+    # Where a row has both, its path is the one that the image had on somebody's disk.
+    missing = pc.equal(size, 0)
     return pc.if_else(missing, paths, None).to_pylist()
 
 
@@ -251,4 +260,5 @@ class _InRow:
 
 
 def _digest(source: Path | Callable[[], bytes]) -> str:
+    """sha256 of an image's bytes, wherever they lie."""
     return sha256_file(source) if isinstance(source, Path) else hashlib.sha256(source()).hexdigest()

@@ -78,6 +78,7 @@ class _Camera:
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The unit vectors [3] to its right, upwards and forward."""
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         forward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         up = np.array([-math.sin(e) * math.cos(a), -math.sin(e) * math.sin(a), math.cos(e)])
@@ -85,6 +86,7 @@ class _Camera:
 
     @property
     def position(self) -> np.ndarray:
+        """Where it stands [3], in metres."""
         return self.lookat - self.distance * self.axes[2]
 
     def depth(self, point: np.ndarray) -> float:
@@ -95,7 +97,9 @@ class _Camera:
         """The point of the floor (z = 0) seen at a pixel."""
         right, up, forward = self.axes
         half = IMAGE_SIZE / 2
+        # Pixels count downwards, and `up` is upwards.
         ray = forward + right * (x_px - half) / _FOCAL_PX + up * (half - y_px) / _FOCAL_PX
+        # As far along the ray as takes the camera's height to 0; the ray points downwards.
         return self.position - ray * self.position[2] / ray[2]
 
 
@@ -169,6 +173,7 @@ class SceneRenderer:
         return Scene(self._renderer.render(), things)
 
     def close(self) -> None:
+        """Give the OpenGL context back."""
         self._renderer.close()
 
     def _set_light(self, rng: np.random.Generator) -> None:
@@ -189,8 +194,10 @@ class SceneRenderer:
     def _place(
         self, name: str, position: np.ndarray, rng: np.random.Generator, flat: bool = True
     ) -> None:
+        """Put a body's centre at a position [3], turned at random about the vertical axis."""
         body = self._model.body(name).mocapid[0]
         self._data.mocap_pos[body] = position
+        # Half the angle, as a quaternion of a turn has it; half a circle does for such shapes.
         half_turn = rng.uniform(0, math.pi) / 2
         quat = np.array([math.cos(half_turn), 0, 0, math.sin(half_turn)])
         if not flat:  # lie down: turn the capsule's axis from z into the floor first
@@ -206,7 +213,7 @@ class SceneRenderer:
                 self._place(name, np.array([0.0, 0.0, -9.0]), rng)
                 continue
             x_px, y_px = rng.uniform(0, IMAGE_SIZE, 2)
-            metres_per_px = camera.distance / _FOCAL_PX
+            metres_per_px = camera.distance / _FOCAL_PX  # in the middle of the picture
             geom = self._model.geom(name).id
             radius = metres_per_px * rng.uniform(0.7, 1.8)
             self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
@@ -223,7 +230,7 @@ class SceneRenderer:
         placed: list[tuple[float, float, float]] = []
         things = []
         for i in range(MAX_OBJECTS):
-            if i >= count:
+            if i >= count:  # of a scene before, it would still be where it was
                 self._place(f"thing{i}", np.array([0.0, 0.0, -9.0]), rng)
                 continue
             x_px, y_px, radius_px = _draw_free_place(rng, placed)
@@ -244,15 +251,16 @@ class SceneRenderer:
         camera: _Camera,
         rng: np.random.Generator,
     ) -> Thing:
+        """Give body `i` its shape, size and colour, so that its centre is seen at a pixel."""
         floor = camera.floor_point(x_px, y_px)
-        radius = radius_px * camera.depth(floor) / _FOCAL_PX
+        radius = radius_px * camera.depth(floor) / _FOCAL_PX  # in metres, as large as it is to look
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
         # So a cube's face covers about the area of a ball.
         side = radius * 0.85 if shape == "cube" else radius
         geom = self._model.geom(f"thing{i}").id
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
         self._model.geom_size[geom] = side, half_height if shape == "cylinder" else side, side
-        self._model.geom_rbound[geom] = 2 * radius
+        self._model.geom_rbound[geom] = 2 * radius  # the compiled one is of another size
         tone = np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1)
         self._model.geom_rgba[geom, :3] = np.clip(tone, 0, 1)
         height = half_height if shape == "cylinder" else side
@@ -285,6 +293,7 @@ def _lift(camera: _Camera, x_px: float, y_px: float, height: float) -> np.ndarra
 
 
 def _draw_camera(rng: np.random.Generator) -> _Camera:
+    """A camera that looks about the scene's middle; a third of them from nearly above."""
     overhead = rng.random() < 0.35
     return _Camera(
         lookat=np.array([*rng.uniform(-0.3, 0.3, 2), 0.0]),

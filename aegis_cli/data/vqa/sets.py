@@ -5,7 +5,6 @@ They are split by image into parts that no two purposes share.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,9 +20,9 @@ from torch import Tensor
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.common.files import canonical, sha256_file
+from aegis_cli.common.files import sha256_file, sha256_value
 from aegis_cli.data.vqa import download, easy, jsonl, official, saved
-from aegis_cli.data.vqa.dataset import VQASet, load_scenes
+from aegis_cli.data.vqa.dataset import VQASet, digest_of, load_scenes
 from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Pictures, decode
 
@@ -120,12 +119,13 @@ class Listed:
         for entry in self.entries:
             by_image.setdefault(entry.picture.key, []).append(entry)
         mine = [key for key in by_image if self.holds(part, key)]
-        mine.sort(key=lambda key: _digest(f"{seed} {key}"))
+        mine.sort(key=lambda key: digest_of(f"{seed} {key}"))
         most = min(questions, sum(len(by_image[key]) for key in mine))
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
             wanted = by_image[key][: questions - count]
+            # Checked as far as they are needed: to look at every image would take hours.
             sound = self._sound(wanted, checks)
             skipped += len(wanted) - len(sound)
             if sound:
@@ -136,7 +136,7 @@ class Listed:
                 break
         if not kept:
             raise self._nothing(part, len(by_image), skipped)
-        if count < questions:
+        if count < questions:  # some were left out, and the progress has not reached its end
             on_event(Progress("questions", count, count, "questions"))
         return _assemble(kept, skipped).asked(self.ask)
 
@@ -199,6 +199,7 @@ class Listed:
         where somebody copies a folder, and everything would be trained anew.
         """
         images = {entry.picture.key: entry.picture.source for entry in self.entries}
+        # Images that lie in rows are in the question files, whose digests are here anyway.
         digests: dict[str, str | None] = {}
         for key, source in images.items():
             if isinstance(source, Path):
@@ -206,7 +207,7 @@ class Listed:
                     digests[key] = sha256_file(source)
                 except AegisError:  # whoever looks at the image says so, or leaves it out
                     digests[key] = None
-        return {"question_files": self.sha256, "image_files": _digest(canonical(digests))}
+        return {"question_files": self.sha256, "image_files": sha256_value(digests)}
 
 
 class EasyVqa(Listed):
@@ -247,7 +248,6 @@ def read(
     """
     if vqa == SCENES:
         return Scenes(ask=ask)
-    path = Path(vqa)
     source = easy.reader() if vqa == easy.NAME else _reader(*_located(vqa))
     entries: list[Entry] = []
     skipped: list[AegisError] = []
@@ -262,16 +262,19 @@ def read(
     if not entries:
         first = f": {len(skipped)} are bad, the first: {skipped[0].found}" if skipped else ""
         raise AegisError(
-            f"no usable question in '{path}'{first}",
+            f"no usable question in '{vqa}'{first}",
             "one or more",
             "correct the file, or give another --vqa",
         )
-    kind, name = EasyVqa if vqa == easy.NAME else Listed, path.name.replace("#", "-")
+    kind = EasyVqa if vqa == easy.NAME else Listed
+    # The set has one name wherever it is named from: `.` is its folder.
+    name = os.path.basename(os.path.abspath(vqa)).replace("#", "-")
     return kind(name, source.files, tuple(entries), skip_bad, len(skipped), ask)
 
 
 def _located(vqa: str) -> tuple[Path, str | None]:
     """The path of a set, for one on the hub that of its copy here, and the split after a #."""
+    # A file's own name may have a # in it, and is meant where it is there.
     if os.path.exists(vqa):
         return Path(vqa), None
     name, _, split = vqa.rpartition("#") if "#" in vqa else (vqa, "", None)
@@ -301,6 +304,7 @@ def _reader(path: Path, split: str | None) -> Reader:
         )
     if path.is_file() and path.suffix == ".jsonl":
         return jsonl.reader(path)
+    # Before any other .json, and before a folder whose parquet files lie beside the pair.
     if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
         return official.reader(pairs[0] if pairs else path)
     if saved.is_dataset(path):
@@ -320,16 +324,12 @@ def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> Ae
 
 def share(key: str) -> int:
     """The tenth, 0 to 9, that an image belongs to."""
-    return int(_digest(key)[:12], 16) % 10
+    return int(digest_of(key)[:12], 16) % 10
 
 
 def _assemble(kept: Iterable[Sequence[Entry]], skipped: int) -> VQASet:
+    """The set of these questions, which are listed by their images."""
     groups = list(kept)
-    image_of = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    image_of = np.repeat(np.arange(len(groups)), [len(group) for group in groups])  # [M]
     questions = tuple(entry.question for entry in chain.from_iterable(groups))
     return VQASet(Pictures([group[0].picture for group in groups]), image_of, questions, skipped)
-
-
-def _digest(text: str) -> str:
-    # A file's name need not be UTF-8; Python then holds it with halves of characters.
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()

@@ -94,6 +94,17 @@ def test_lines_of_json(lines: Path) -> None:
     )
 
 
+def test_a_set_has_one_name_also_from_within_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "asked").mkdir()
+    datasets.Dataset.from_dict(hub_rows(6)).save_to_disk(tmp_path / "asked")
+    known = sets.read(str(tmp_path / "asked")).name
+    assert known == "asked"
+    monkeypatch.chdir(tmp_path / "asked")
+    assert sets.read(".").name == sets.read("../asked").name == known
+
+
 def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
     """Another spelling of a path is no other image: it must not fall into another part."""
     write_jsonl(tmp_path, 2)
