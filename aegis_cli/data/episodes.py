@@ -61,7 +61,14 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
             f"numbers from 0 and ranges, with commas between{names}",
             f"e.g. 0-{max(0, count - 1)}",
         ) from None
-    if beyond := [number for number in numbers if number >= count]:
+    beyond = [number for number in numbers if number >= count]
+    if beyond and not count:
+        raise AegisError(
+            f"demos.only: {text} of '{path}', which has no episode",
+            "recorded episodes to choose of",
+            "record some, or give other demonstrations",
+        )
+    if beyond:
         raise AegisError(
             f"demos.only: episode {beyond[0]} of '{path}', which has {count}",
             f"numbers from 0 to {count - 1}",

@@ -64,6 +64,13 @@ def test_numbers_are_written_as_they_are_read(seed: int) -> None:
     assert text.count(",") == runs - 1  # each run of numbers is one range
 
 
+def test_of_no_episodes_none_can_be_chosen() -> None:
+    with pytest.raises(AegisError, match="which has no episode") as caught:
+        episodes.chosen("0", 0, {}, Path("arm"))
+    assert "-1" not in str(caught.value)
+    assert episodes.chosen("train", 0, {"train": "0:0"}, Path("arm")) == []
+
+
 def test_a_split_of_more_than_a_million_episodes_is_no_list_of_them() -> None:
     with pytest.raises(AegisError, match="demos.only: all"):
         episodes.chosen("all", 5, {"all": f"0:{10**15}"}, Path("x"))
