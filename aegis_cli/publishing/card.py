@@ -120,6 +120,7 @@ def text(
     Raises:
         AegisError: a run that is damaged.
     """
+    # Of the checkpoint, what is measured; of its run, what it was asked to do.
     recipe = recipes.load(run / "recipe.yaml")
     found = _measured(run, at)
     facts = found.facts
@@ -164,7 +165,9 @@ def _looks_by(at: Path, task: str | None) -> Sequence[str]:
     """
     meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
     several = len(meta.get("cameras", ())) > 1
-    return () if task is None or several else checkpoint.cameras_of(meta, task)
+    if task is None or several:
+        return ()
+    return checkpoint.cameras_of(meta, task)
 
 
 def _use(
@@ -177,7 +180,9 @@ def _use(
 ) -> str:
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
     act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
-    plugins = ["lerobot_policy_aegis", *(["lerobot_env_aegis"] if task else [])]
+    plugins = ["lerobot_policy_aegis"]
+    if task:  # a robot of somebody's own needs no simulation
+        plugins.append("lerobot_env_aegis")
     return _USE[form].format(
         repo=repo,
         probe=_probe_command(repo, recipe),
@@ -190,8 +195,9 @@ def _use(
 def _probe_command(repo: str, recipe: Recipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
+    # Nobody else has this machine's folders: of a path, only the last part is said.
     words = [*map(without_folders, (recipe.backbone, *probe.asking))]
-    usual = recipes.Probe()
+    usual = recipes.Probe()  # what the command does by itself need not be said
     if probe.questions != usual.questions:
         words += ["--questions", str(probe.questions)]
     if probe.seed != usual.seed:
@@ -211,7 +217,7 @@ def _lerobot_command(
     if len(cameras) > 1:
         return f"# lerobot-eval cannot: our tasks have one camera there, the policy {len(cameras)}"
     command = f"lerobot-eval --policy.path={repo} --env.type=aegis --env.task={task}"
-    own = sim.cameras(task)[0]
+    own = sim.cameras(task)[0]  # which LeRobot's environment shows without being asked
     named = [name.removeprefix(lerobot_folder.IMAGES) for name in cameras] or [own]
     if looks_by and named != [*looks_by]:  # another name would be what the own camera is called
         names = {lerobot_folder.picture_key(looks_by[0]): lerobot_folder.picture_key(named[0])}
@@ -256,10 +262,11 @@ def _knowledge(found: InspectReport, recipe: Recipe) -> Iterator[str]:
 
 
 def _probe_row(result: Result, recipe: Recipe) -> str:
+    """The table's row of one set of questions."""
     figures = result.figures
     asked = question_set(result, recipe)
     drop = "not measured"
-    if figures.get("drop_points") is not None:
+    if figures.get("drop_points") is not None:  # a probe without --baseline knows none
         low, high = figures["drop_interval"]
         drop = f"{figures['drop_points']:.2f} points ({low:.2f} to {high:.2f})"
     before = figures.get("baseline_accuracy")
@@ -274,8 +281,10 @@ def _probe_row(result: Result, recipe: Recipe) -> str:
 
 
 def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> str:
+    """Whether the gate was passed, and what it allowed."""
     if gate is None:
         return "No gate was set."
+    # A probe may have had a limit of its own, which is not the recipe's.
     limits = [found.settings.get("max_drop", recipe.probe.max_drop) for found in probed]
     limit = next((limit for limit in limits if limit is not None), None)
     allowed = "" if limit is None else f" (a drop of at most {limit:g} points)"
@@ -319,6 +328,7 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
     """A table of rollouts."""
     yield "| task | colours | episodes | success, with its 95 % interval |"
     yield "|---|---|---|---|"
+    # In which settings they differ, where two of them have one task and the same colours.
     apart = told_apart([result.played for result in rollouts])
     for result, otherwise in zip(rollouts, apart, strict=True):
         figures = result.figures
@@ -328,6 +338,7 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
 
 
 def _success(figures: Mapping[str, Any]) -> str:
+    """A rollout's success, or its mean return on a task that is measured by it."""
     if figures.get("success") is not None:
         return _share(figures["success"], figures["interval"])
     said, interval = f"mean return {figures['mean_return']:.4g}", figures.get("return_interval")
@@ -338,6 +349,7 @@ def _success(figures: Mapping[str, Any]) -> str:
 
 
 def _share(share: float, interval: tuple[float, float]) -> str:
+    """A share of 1 with its interval, in percent."""
     return f"{_percent(share)} ({100 * interval[0]:.1f} to {100 * interval[1]:.1f})"
 
 

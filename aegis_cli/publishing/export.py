@@ -91,6 +91,7 @@ def run(
         AegisError: no policy, the run of a stream, a folder that is there already, a camera's
             name where none is to be given, or a type that the backbone cannot have.
     """
+    # All that can be refused by looking is, before a model of gigabytes is loaded.
     refuse_stream(run_path)
     if os.path.lexists(out):  # a link that leads nowhere too
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
@@ -109,6 +110,7 @@ def run(
     cameras = _cameras(camera, meta)
     if camera is not None:
         meta = _renamed(meta, camera)
+    # Written beside it under another name, so that an export that fails leaves nothing.
     make_folder(out.parent)
     with checkpoint.writing(out), folder_aside(out) as aside:
         if form == card.LEROBOT:
@@ -181,6 +183,7 @@ def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
     Raises:
         AegisError: a name where the policy has several cameras, or one that no feature can have.
     """
+    # Without a name of its own the only picture has the one that LeRobot's folder gives it.
     named = list(meta.get("cameras", ())) or [lerobot_folder.CAMERA]
     if camera is None:
         return named
@@ -210,6 +213,7 @@ def _renamed(meta: PolicyMeta, camera: str) -> PolicyMeta:
         return meta
     now = layout.short(named[0])
     known = meta.get("rename", {})
+    # A renaming is from the demonstrations' name to the policy's: this camera's is replaced.
     others = {own: new for own, new in known.items() if layout.short(new) != now}
     # Of a camera that was renamed already, the name that it had at first.
     first = next((layout.short(own) for own in known if own not in others), now)
@@ -249,6 +253,7 @@ def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMe
             "a policy with a Hugging Face backbone",
             f"leave --dtype out, or give --dtype {FLOAT32}",
         )
+    # References do for the weights of before: rounding gives each parameter new ones.
     before = [p.detach() for p in backbone.parameters()]
     backbone.round_weights(STORED_TYPES[chosen])
     after = backbone.parameters()
@@ -259,6 +264,7 @@ def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMe
 
 def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: PolicyMeta) -> None:
     """Write a policy as our checkpoints are, without what a training needs to go on."""
+    # A folder in LeRobot's layout keeps no record of what its policy was made from.
     inputs: Mapping[str, str] = {}
     seed, about = None, ""
     if not lerobot_folder.is_policy(run):

@@ -118,6 +118,7 @@ def run(
         )
     export.warn_of_steps_left(run_path, "push", on_event)
     export.warn_of_a_merge(run_path, "push", on_event)
+    # Before the export, which takes minutes: without a token nothing could be sent.
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
         folder = Path(aside) / "policy"
@@ -179,6 +180,7 @@ def _send(
     with _reaching(repo):
         # None leaves it to the organisation, which may want all of its repositories private.
         api.create_repo(repo, private=private or None, exist_ok=True)
+        # `exist_ok` takes a public one for the repository that was asked for.
         if private and not api.repo_info(repo).private:
             raise AegisError(
                 f"--private for '{repo}', which is there and public",
@@ -187,6 +189,7 @@ def _send(
             )
         removed = _of_an_earlier_push(api, repo, contents)
         changes = [*added, *(CommitOperationDelete(path) for path in removed)]
+        # One commit: nobody ever loads the new policy beside a part of the old one.
         message = f"A policy of Aegis {__version__}"
         commit = api.create_commit(repo, changes, commit_message=message)
     return commit.commit_url, removed
@@ -203,9 +206,9 @@ def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> 
         if lerobot_folder.is_own_config(config.read_bytes()):
             left |= {lerobot_folder.CONFIG, lerobot_folder.MODEL}
             left |= {lerobot_folder.PREPROCESSOR, lerobot_folder.POSTPROCESSOR}
-    if checkpoint.EXPERT in there:
+    if checkpoint.EXPERT in there:  # a checkpoint of ours
         left |= {checkpoint.EXPERT, export.RECIPE}
-    if left:
+    if left:  # a policy of ours was there, and so is a `backbone/` of ours
         left |= {path for path in there if _is_of_a_backbone(path)}
     return tuple(sorted((left & there) - set(contents)))
 
@@ -246,6 +249,7 @@ def _refused(repo: str, error: Any) -> AegisError:
     """The error for an answer of the hub that is no success."""
     status = error.response.status_code
     said = (getattr(error, "server_message", None) or str(error)).strip().splitlines()[0]
+    # The hub answers 404 to whoever may not see a repository.
     found = f"the hub refuses '{repo}' ({status}): {said}"
     if status == 401:
         return AegisError(found, "a token that is valid", _NO_TOKEN)

@@ -47,7 +47,7 @@ def run(run_path: Path, repeats: int = 50, on_event: OnEvent = ignore) -> Latenc
         AegisError: no such run.
     """
     policy = load_policy(run_path)
-    taken = 1000 * np.array(seconds(policy, repeats, on_event))
+    taken = 1000 * np.array(seconds(policy, repeats, on_event))  # [repeats] ms
     p50, p95 = (float(ms) for ms in np.quantile(taken, (0.5, 0.95)))
     return LatencyReport(
         run=str(run_path),
@@ -67,6 +67,7 @@ def seconds(policy: DeployedPolicy, repeats: int, on_event: OnEvent = ignore) ->
 
     The actions come back to the CPU, so a GPU has finished when the time is taken.
     """
+    # Random pictures: how long a prediction takes does not depend on what they show.
     rng = np.random.default_rng(0)
     side = policy.image_size or _SIDE
     names = policy.cameras or ("image",)

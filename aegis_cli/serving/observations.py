@@ -45,7 +45,7 @@ class Reader:
 
     def __init__(self, policy: DeployedPolicy, prompt: str | None = None) -> None:
         self._policy, self._prompt = policy, prompt
-        names = policy.cameras or ("image",)
+        names = policy.cameras or ("image",)  # openpi's name for the only one
         self.images = {_key(name): name for name in names}
 
     def greeting(self) -> dict[str, Any]:
@@ -60,6 +60,7 @@ class Reader:
             "default_prompt": self._prompt,
             "positions": policy.positions,
             "actions": policy.actions,
+            # An ensemble averages chunks on the server, and hands out one action at a time.
             "chunk": policy.chunk if policy.ensemble is None else 1,
             "replan": policy.replan,
             "ensemble": policy.ensemble,
@@ -88,6 +89,7 @@ class Reader:
     def _seen(self, message: Mapping[Any, Any]) -> Observation:
         """The pictures, the instruction and the positions of a message."""
         policy = self._policy
+        # openpi's key decides: a client of its protocol may send other keys besides.
         if STATE not in message and observation.is_one(message, policy.state_names, policy.state):
             return self._lerobots(message)
         sent = ", ".join(sorted(map(str, message))) or "nothing"
@@ -130,21 +132,25 @@ class Reader:
     def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
         if found.dtype.kind not in "biuf":
             raise self._wrong(f"{what} of type {found.dtype}, which is no number's")
-        if not np.isfinite(found).all():
+        # A policy would answer NaN with actions that are NaN.
+        is_finite = np.isfinite(found)
+        if not is_finite.all():
             raise AegisError(
-                f"{what} with {found[~np.isfinite(found)].flat[0]}",
+                f"{what} with {found[~is_finite].flat[0]}",
                 "finite numbers",
                 "read the robot's state again before it is sent",
             )
         return found.astype(np.float32)
 
     def _array(self, key: str, value: Any) -> np.ndarray:
+        """A value of a message as an array: clients may send lists of numbers."""
         try:
             return np.asarray(value)
         except ValueError as error:  # lists of several lengths
             raise self._wrong(f"'{key}' is no array: {error}") from error
 
     def _wrong(self, found: str) -> AegisError:
+        """The error for a message that is no observation, with what one has to be like."""
         images = ", ".join(f"'{key}': [H, W, 3] uint8" for key in self.images)
         expected = f"{{{images}, '{STATE}': [{self._policy.positions}], '{PROMPT}': text}}"
         return AegisError(found, expected, "name and shape them as the server's metadata says")

@@ -72,6 +72,7 @@ class RealTime:
                 fix if policy.chunk > 1 else "train with a longer train.chunk",
             )
         self._policy, self.execute, self.guided = policy, execute, guided
+        # One thread: a prediction at a time, and the next one waits for it.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="aegis-real-time")
         self._closed = False
         self._pending: Future[np.ndarray] | None = None
@@ -127,6 +128,7 @@ class RealTime:
                 "one that is open",
                 "make a new RealTime, and select actions inside `with`",
             )
+        # Read at each step, though few are predicted from: what is wrong with one is said at once.
         seen = self._policy.read(pictures, instruction, positions)
         if seen.instruction != self._follows:
             self._begin(seen)
@@ -134,7 +136,7 @@ class RealTime:
             self._adopt()
         if self._pending is None and (self._since >= self.execute or not self._ahead):
             self._start(seen)
-            if not self._ahead:
+            if not self._ahead:  # an earlier prediction has failed, and the robot has to wait
                 self._adopt()
         self._since += 1
         return self._ahead.popleft()
@@ -144,6 +146,7 @@ class RealTime:
         self._forget()
         started = time.perf_counter()
         self._ahead.extend(self._policy.predict(seen))
+        # Only now: after a prediction that failed the next call begins again.
         self._follows = seen.instruction
         steps = (time.perf_counter() - started) * (self._policy.fps or 0)
         self._guess = max(1, math.ceil(steps))
@@ -151,7 +154,7 @@ class RealTime:
     def _forget(self) -> None:
         """Wait for what is being predicted, and drop it with all that was."""
         if self._pending is not None:
-            self._pending.exception()
+            self._pending.exception()  # waits, and does not raise what nobody asks for any more
         self._pending = None
         self._ahead: deque[np.ndarray] = deque()
         self._follows: str | None = None  # the instruction that the actions ahead are of
@@ -161,7 +164,8 @@ class RealTime:
         """Predict from this observation, while the robot executes what is left."""
         continued = None
         if self.guided and self._ahead:
-            left = torch.from_numpy(np.stack(self._ahead))[None]
+            left = torch.from_numpy(np.stack(self._ahead))[None]  # [1, actions left, A]
+            # As many as are executed until the prediction is there cannot be changed by it.
             continued = Continued(left, min(self.delay, len(self._ahead)))
         # A camera may write its next picture to where this one lies.
         self._pending = self._thread.submit(self._policy.predict, seen.copy(), continued)
@@ -172,6 +176,7 @@ class RealTime:
         pending, self._pending = self._pending, None
         assert pending is not None
         self.waited += not pending.done()
-        chunk = pending.result()
+        chunk = pending.result()  # raises what was wrong with it
         self._delays.append(self._since)
+        # The chunk begins at the observation: actions of that time are past.
         self._ahead = deque(chunk[self._since :])

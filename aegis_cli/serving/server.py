@@ -75,9 +75,11 @@ def run(
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:
-        asyncio.run(
-            listen(policy, host, port, prompt, on_ready, lambda: signaled.number is not None)
-        )
+
+        def ends() -> bool:
+            return signaled.number is not None  # noted, not raised: connections close in order
+
+        asyncio.run(listen(policy, host, port, prompt, on_ready, ends))
 
 
 async def listen(
@@ -112,6 +114,7 @@ async def listen(
 
 
 def _where(server: Server, reader: Reader) -> Serving:
+    # What was listened at: with port 0 the system has chosen one.
     host, port = next(iter(server.sockets)).getsockname()[:2]
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     return Serving(f"ws://{address}", f"http://{address}{HEALTH}", reader.greeting())
@@ -142,11 +145,11 @@ class _Answering:
 
     async def _converse(self, connection: ServerConnection, policy: DeployedPolicy) -> None:
         previous_s: float | None = None
-        async for message in connection:
+        async for message in connection:  # until the client closes it
             started = time.perf_counter()
             try:
                 answer = await self._answer(policy, message)
-            except AegisError as error:
+            except AegisError as error:  # the client's mistake, after which it may go on
                 await connection.send(str(error))
                 continue
             except Exception as error:
@@ -169,6 +172,7 @@ class _Answering:
         if isinstance(message, str):
             fix = "send it with openpi_client.websocket_client_policy"
             raise AegisError("a text message", "an observation in msgpack, as bytes", fix)
+        # Read before the turn: a bad message need not wait for it.
         seen = self.reader.read(wire.decode(message))
         async with self._turn:
             started = time.perf_counter()

@@ -62,6 +62,7 @@ def _marked(value: Any) -> Any:
 
 def _unmarked(value: Mapping[Any, Any]) -> Any:
     if _ARRAY in value:
+        # The buffer is the message's own memory, which may not be written to.
         array, shape = np.frombuffer(value[_DATA], _type(value[_DTYPE])), value[_SHAPE]
         if any(side < 0 for side in shape):  # which NumPy would take for "as many as there are"
             raise ValueError(f"an array of shape {shape}")
