@@ -48,7 +48,7 @@ def check(name: str) -> None:
     if name in TASKS:
         return
     if name in metaworld_table.names():
-        import_module("aegis_cli.sim.metaworld")
+        import_module("aegis_cli.sim.metaworld")  # raises where MetaWorld is not installed
         return
     suite = import_module("aegis_cli.sim.suite").names()
     if name in suite:
@@ -58,16 +58,19 @@ def check(name: str) -> None:
         f"one of {', '.join(TASKS)}, a task of dm_control's suite, such as "
         "suite/cartpole-swingup, or of MetaWorld, such as metaworld/button-press"
     )
+    # The name of a whole collection is no typing error for one of its tasks.
     examples = {SUITE: "suite/cartpole-swingup", METAWORLD: "metaworld/button-press"}
-    if (example := examples.get(name.rstrip("/") + "/")) is not None:
+    example = examples.get(name.rstrip("/") + "/")
+    if example is not None:
         raise AegisError(f"task '{name}'", expected, f"name the task too, e.g. {example}")
     raise AegisError(f"task '{name}'", expected, f"use {_close(name, known)}")
 
 
 def _close(name: str, known: tuple[str, ...]) -> str:
     """Names that are meant, perhaps: `'reach'`, or several with commas."""
-    for guess in (name, SUITE + name, METAWORLD + name):
-        if close := difflib.get_close_matches(guess, known, n=3):
+    for guess in (name, SUITE + name, METAWORLD + name):  # a prefix may have been forgotten
+        close = difflib.get_close_matches(guess, known, n=3)
+        if close:
             break
     return ", or ".join(f"'{other}'" for other in close or TASKS)
 

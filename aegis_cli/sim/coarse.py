@@ -23,12 +23,13 @@ def coarse(model: mujoco.MjModel, cell_m: float, least_faces: int) -> mujoco.MjM
         cell_m: side of the cubes that vertices are gathered in, in metres.
         least_faces: meshes of fewer faces are left as they are.
     """
-    model = copy.copy(model)
+    model = copy.copy(model)  # of its arrays too, which are written to below
     for mesh in np.flatnonzero(model.mesh_facenum >= least_faces):
         start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
         vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
         faces = _gathered(vertices, cell_m)[model.mesh_face[start : start + count]]
         kept = _distinct(faces)
+        # The faces that are kept move to the front of the mesh's own rows; the rest is not drawn.
         rows = slice(start, start + len(kept))
         model.mesh_face[rows] = faces[kept]
         for corners in (model.mesh_facenormal, model.mesh_facetexcoord):

@@ -98,6 +98,7 @@ class PlanarTask(ABC):
         return self.observe()
 
     def _name(self, rng: np.random.Generator, target_colors: Sequence[str]) -> None:
+        """Draw the discs' colours, each once, and the instruction that names the target's."""
         self.target_color = str(rng.choice(list(target_colors)))
         others = [c for c in COLORS if c != self.target_color]
         distractors = rng.choice(others, size=len(self.centers) - 1, replace=False)
@@ -157,5 +158,6 @@ class PlanarTask(ABC):
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
+    """The vector at length 1; zero stays zero, for the effector may stand on its goal."""
     length = np.linalg.norm(vector)
     return vector / length if length > 0 else np.zeros_like(vector)

@@ -153,12 +153,18 @@ class _Expert:
         return np.array(totals)
 
     def _reward(self, state: np.ndarray, control: np.ndarray) -> float:
+        """What the planner is told of one state: the task's reward, and the guide's.
+
+        A copy of the physics is looked at, since the real one must stay where the episode is.
+        """
         physics = self._imagined
         mujoco.mj_setState(self._model, physics.data.ptr, state, _STATE)
         physics.data.ctrl[:] = control
         mujoco.mj_forward(self._model, physics.data.ptr)
         reward = self._env.task.get_reward(physics)
-        return reward + (self._guide(physics) if self._guide is not None else 0.0)
+        if self._guide is None:
+            return reward
+        return reward + self._guide(physics)
 
 
 def _labels(observation: Mapping[str, Any]) -> Iterator[str]:

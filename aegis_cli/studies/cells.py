@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from multiprocessing import Queue
@@ -91,9 +91,6 @@ class StudyKind(Protocol[R]):
     @property
     def recipe(self) -> AnyStudy:
         """The study, with `variants`, `seeds`, `tuning` and `keep_runs`."""
-
-    def only(self, variants: Collection[str]) -> StudyKind[R]:
-        """The same study of some of its variants."""
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> R:
         """The recipe of a compared cell; `value` is what the variant's knob is set to.
@@ -268,6 +265,7 @@ class CellStore(Generic[R]):
 
 
 def _load(path: Path) -> dict[str, Any]:
+    """What a folder's `cells.json` holds; nothing where it is not there."""
     cells = files.load_json(path) if path.exists() else {}
     if not isinstance(cells, dict):
         raise AegisError(
@@ -285,6 +283,7 @@ def _noted(note: Path) -> tuple[str, str]:
         key, label = left["cell"], left["run"]
         if not isinstance(key, str) or not isinstance(label, str):
             raise TypeError("a name that is no text")
+        # What it names is removed: a damaged note must not lead out of the study's folder.
         if Path(label).is_absolute() or not {".", ".."}.isdisjoint(label.split("/")):
             raise ValueError(f"'{label}' is no run of the study")
     except (TypeError, KeyError, ValueError) as error:
@@ -323,8 +322,10 @@ def _measure_together(
 def _finished(
     numbers: dict[Future[Outcome], int], reports: Queue[Event], on_event: OnEvent
 ) -> Iterator[tuple[int, Outcome]]:
+    """The numbers of the cells as they finish, with what they led to; events on the way."""
     waiting = set(numbers)
     while waiting:
+        # With a time limit, since events come while nothing finishes.
         done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
         while not reports.empty():
             on_event(reports.get())

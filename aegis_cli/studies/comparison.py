@@ -119,6 +119,7 @@ def _no_units(figures: Figures) -> None:
 
 def _lost_by_image(figures: PolicyFigures) -> Units | None:
     """The accuracy that a training cost, in points, with an image's questions as a unit."""
+    # Cells that an earlier version measured have kept neither.
     if figures.lost_per_image is None or figures.questions_per_image is None:
         return None
     import numpy as np
@@ -156,7 +157,7 @@ def _episodes(outcomes: str | None, seed: int, whole: float = 100.0) -> Units | 
     Args:
         whole: what a success counts: 100 points, or a share of 1.
     """
-    if outcomes is None:
+    if outcomes is None:  # nothing was played, or an earlier version played it
         return None
     import numpy as np
 
@@ -418,6 +419,7 @@ def _each_probed(samples: Iterable[Sample]) -> list[PolicyFigures]:
     asked: dict[int, PolicyFigures] = {}
     for sample in samples:
         for row in sample.figures.values():
+            # Any will do, because all methods begin with the same backbone.
             asked.setdefault(row.probe_seed, row)
     return list(asked.values())
 
@@ -633,7 +635,7 @@ def stream_results(
         unseeded: methods whose seeds are all the same run, since they learn nothing.
         frozen: methods that never change what serves a learned task, nor one that has not come.
     """
-    paired = dataclasses.astuple(pairs) if pairs else ()
+    paired = dataclasses.astuple(pairs) if pairs else ()  # the names of streams a and b
     samples = {stream: _samples(found, variants, (stream,), unseeded) for stream in paired}
     # The pairs answer questions of their own, and no mean over streams counts them.
     streams = {stream for own in found.values() for stream, _ in own} - {*paired}
@@ -646,6 +648,7 @@ def stream_results(
             measured_pair = measure(PairResult, samples[stream][name], samples[stream])
             both.append(PairResult(**measured_pair))
         diverged = [f"{s} {seed}" for (s, seed), row in own.items() if not measured(row)]
+        # Without `bar` at first: it is judged by the figures of the whole result.
         made = StreamResult(
             variant=name,
             method=variant.method,
@@ -683,6 +686,7 @@ def _samples(
 
 
 def _right_after_learning(figures: RobotStreamFigures) -> float:
+    # The last entry of a row is the task that has just been learned.
     return statistics.fmean(row[-1] for row in figures.success)
 
 
@@ -832,18 +836,20 @@ def robot_stream_results(
     samples = {}
     for name, own in found.items():
         samples[name] = Sample({run: row for run, row in own.items() if measured(row)})
-    return [
-        RobotStreamResult(
+    results = []
+    for name, own in found.items():
+        diverged = [seed for (_, seed), row in own.items() if not measured(row)]
+        made = RobotStreamResult(
             variant=name,
             method=variants[name].method,
             knob=variants[name].knob,
             value=values.get(name),
-            diverged=sorted(seed for (_, seed), row in own.items() if not measured(row)),
+            diverged=sorted(diverged),
             **measure(RobotStreamResult, samples[name], samples),
             after=_task_by_task(samples[name], tasks),
         )
-        for name, own in found.items()
-    ]
+        results.append(made)
+    return results
 
 
 def _task_by_task(sample: Sample, tasks: Sequence[str]) -> list[AfterTask]:

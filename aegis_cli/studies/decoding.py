@@ -63,10 +63,12 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 def _listed(problems: Sequence[Any]) -> str:
     """The first problems, and how many there are besides."""
     said = [_said(problem) for problem in problems[:_MOST]]
-    more = [f"and {len(problems) - _MOST} more"] if len(problems) > _MOST else []
-    return "; ".join(said + more)
+    if len(problems) > _MOST:
+        said.append(f"and {len(problems) - _MOST} more")
+    return "; ".join(said)
 
 
 def _said(problem: Any) -> str:
+    """One problem as pydantic has found it, with the value that it found."""
     where = ".".join(map(str, problem["loc"])) or "all of it"
     return f"{where}: {problem['msg']}, not {problem['input']!r:.40}"

@@ -89,7 +89,7 @@ def check(recipe: Recipe) -> None:
 def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
     check_inputs(runner, recipe)
-    if overwrite:
+    if overwrite:  # after the check, so that a job that is refused forgets nothing
         runner.begin_anew()
     rows = []
     for done, method in enumerate(recipe.methods):
@@ -143,7 +143,8 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
         return ""
-    if (unclear := _why_no_loss_is_told(naive)) is not None:
+    unclear = _why_no_loss_is_told(naive)
+    if unclear is not None:
         return unclear
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     most = max(_drops(naive)) * _KEPT_SHARE
@@ -169,6 +170,7 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
 def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
     """Why naive's questions do not tell that it has lost anything; None where they do."""
     sets = [naive, *naive.others.values()]
+    # A VLM that answers no better than by rote has nothing to lose that accuracy would show.
     if all(asked.baseline_accuracy <= asked.majority_accuracy for asked in sets):
         before, common = 100 * naive.baseline_accuracy, 100 * naive.majority_accuracy
         return (
@@ -180,7 +182,8 @@ def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
     if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."
     # Of the questions that naive lost most of: an interval that holds 0 does not tell a loss.
-    low, high = max(sets, key=lambda asked: asked.drop_points).drop_interval
+    most_lost = max(sets, key=lambda asked: asked.drop_points)
+    low, high = most_lost.drop_interval
     if low <= 0:
         return (
             f"naive lost {lost}, or none: its 95 % interval is {low:.1f} to {high:.1f}. So few "
@@ -230,7 +233,7 @@ def check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
     Else a fault would show only after the stages before the one that reads them.
     """
     _refuse_own_models(runner.folder, recipe)
-    runner.backbone_sha256(recipe)
+    runner.backbone_sha256(recipe)  # reads the model, and raises where it cannot
     for method in recipe.methods:
         runner.vqa_state(of_method(recipe, method))
     runner.check_questions(recipe, "probe")
@@ -240,6 +243,7 @@ def check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
 def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
     """Refuse a job that begins with one of its own runs, which it would train anew and remove."""
     named = {"backbone": recipe.backbone, "expert.start": recipe.expert.start}
+    # A backbone's path may have the path of its layers behind a #.
     for key, name in named.items():
         if name is not None and files.lies_in(Path(backbones.divided(name)[0]), folder):
             raise AegisError(

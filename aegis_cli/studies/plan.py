@@ -63,10 +63,9 @@ class JobPlan:
     out: str
 
     def to_json(self) -> dict[str, Any]:
-        asked = {
-            method: None if report is None else report.to_json()
-            for method, report in self.trainings.items()
-        }
+        asked = {}
+        for method, report in self.trainings.items():
+            asked[method] = None if report is None else report.to_json()
         return dataclasses.asdict(self) | {"trainings": asked}
 
 
@@ -99,6 +98,7 @@ class _Asked(StageRecords):
             _Due: it would.
         """
         self.reasons[stage] = "--overwrite" if self._overwrite else self.due(stage, key, outputs)
+        # Raised, for what follows in the stage reads the files that it would make.
         if self.reasons[stage] is not None:
             raise _Due(stage)
 
@@ -131,6 +131,7 @@ def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool 
     records = _Asked(folder, on_event, overwrite)
     runner = PolicyRunner(folder, on_event, plain=recipe, records=records)
     pipeline.check_inputs(runner, recipe)
+    # First what all methods read: the methods' own stages follow on it.
     stages = list(_planned(_shared(runner, recipe), _SHARED, records))
     for method in recipe.methods:
         stages += _planned(_of_method(runner, method, recipe), method, records)
@@ -163,6 +164,7 @@ def _planned(steps: Iterator[_Step], method: str, records: _Asked) -> Iterator[P
             try:
                 step.ask()
             except _Due as end:
+                # Another stage's where this one reads what that one makes, such as the anchor.
                 its_own = end.stage == step.name
                 due = records.reasons[end.stage] if its_own else _AFTER + end.stage
         if step.makes and due is not None:
@@ -217,7 +219,7 @@ def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRun
     except _Due:
         if methods.get(method).needs:
             return None
-        anchor = None
+        anchor = None  # a method that reads none can be asked without it
     resumes = anchor is not None and runner.goes_on(
         method, runner.training_key(own, demos.sha256, anchor.sha256)
     )
@@ -232,11 +234,12 @@ def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRun
 def shortage(plan: JobPlan) -> str | None:
     """What does not fit, on one line; None where everything that is known does."""
     reports = {method: one for method, one in plan.trainings.items() if one is not None}
-    missing = [
-        f"{method}: {found}"
-        for method, one in reports.items()
-        if (found := dry_run.shortage(one)) is not None
-    ]
+    missing = []
+    for method, one in reports.items():
+        found = dry_run.shortage(one)
+        if found is not None:
+            missing.append(f"{method}: {found}")
+    # Each may fit by itself, and all of them together not.
     if not missing and plan.disk_free_mb is not None and plan.disk_mb > plan.disk_free_mb:
         missing.append(
             f"the checkpoints of all methods need {plan.disk_mb:,.0f} MB on the disk of "

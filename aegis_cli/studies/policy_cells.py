@@ -73,11 +73,6 @@ class PolicyStudy:
         self.make_runner: MakeRunner[Recipe] = PolicyRunner
         self.places: Sequence[str] = recipe.tasks
 
-    def only(self, variants: Collection[str]) -> PolicyStudy:
-        """The same study of some of its variants."""
-        kept = {name: self.recipe.variants[name] for name in variants}
-        return PolicyStudy(dataclasses.replace(self.recipe, variants=kept))
-
     def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
         """The recipe of one policy on one task."""
         return study_cells.cell(self.recipe, variant, place, seed, value)

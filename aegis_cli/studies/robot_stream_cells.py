@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +44,6 @@ class RobotStreamStudy:
         self.recipe = recipe
         self.make_runner: MakeRunner[RobotStreamRecipe] = RobotStreamRunner
 
-    def only(self, variants: Collection[str]) -> RobotStreamStudy:
-        """The same study of some of its variants."""
-        kept = {name: self.recipe.variants[name] for name in variants}
-        return RobotStreamStudy(dataclasses.replace(self.recipe, variants=kept))
-
     def cell(self, variant: str, place: str, seed: int, value: Any) -> RobotStreamRecipe:
         """The recipe of one learner; there is one `place`."""
         return study_cells.cell(self.recipe, variant, self.recipe.tasks, seed, value)
@@ -72,8 +67,9 @@ class RobotStreamStudy:
             AegisError: questions that cannot be read, or no rendering on this machine.
         """
         gl.check()
-        for asked in dict.fromkeys(cell.recipe.probe for cell in cells):
+        for asked in dict.fromkeys(cell.recipe.probe for cell in cells):  # each set once
             runner.questions(asked)
+        # One process records what it needs when it needs it; of several each would do so.
         for cell in cells if together else ():
             runner.demonstrations(cell.recipe)
 
@@ -133,6 +129,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         The run's label, and where the backbone and given demonstrations lie, are no part of it.
         """
         recipe = cell.recipe
+        # To load a backbone takes long, and many cells begin with the same one.
         if recipe.backbone not in self._fingerprints:
             self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
         given = [self._digest(path) for path in recipe.demos.paths or ()]
@@ -224,5 +221,7 @@ def cell_key(
         "backbone": fingerprint,
     }
     if demos_sha256:
-        shaping["demos"] = list(demos_sha256)
-    return digest(shaping | ({"vqa": dict(vqa_state)} if vqa_state else {}))
+        shaping["demos"] = list(demos_sha256)  # in place of how they would be recorded
+    if vqa_state:  # scenes come from no file, and add no key
+        shaping["vqa"] = dict(vqa_state)
+    return digest(shaping)

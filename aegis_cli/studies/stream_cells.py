@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +40,6 @@ class StreamStudy:
         self.make_runner: MakeRunner[StreamRecipe] = StreamRunner
         pairs = dataclasses.astuple(recipe.pairs) if recipe.pairs else ()
         self.places: Sequence[str] = (*recipe.streams, *pairs)
-
-    def only(self, variants: Collection[str]) -> StreamStudy:
-        """The same study of some of its variants."""
-        kept = {name: self.recipe.variants[name] for name in variants}
-        return StreamStudy(dataclasses.replace(self.recipe, variants=kept))
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> StreamRecipe:
         """The recipe of one learner on one stream."""
@@ -98,6 +93,8 @@ class StreamStudy:
         study = self.recipe
         methods = {variant.method for variant in study.variants.values()}
         known = {name: learners.get(name) for name in methods}
+        # What learns nothing has the same run for each seed. A task that has not come is served by
+        # the bare encoder only where each task has a part of its own.
         unseeded = {name for name, learner in known.items() if learner.trains == "nothing"}
         frozen = {name for name, learner in known.items() if learner.frozen and not learner.shared}
         return StreamStudyReport(
@@ -131,6 +128,7 @@ class StreamRunner(StreamRuns[StreamRecipe]):
         The run's label, and where encoder and images lie, are no part of it.
         """
         recipe = cell.recipe
+        # To load an encoder, and to digest its images, takes long: many cells share them.
         if recipe.encoder not in self._fingerprints:
             self._fingerprints[recipe.encoder] = images.encoder(recipe.encoder).fingerprint()
         which = (recipe.stream, recipe.path, recipe.order)

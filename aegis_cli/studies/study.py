@@ -32,6 +32,7 @@ from aegis_cli.studies.robot_stream_cells import RobotStreamStudy
 from aegis_cli.studies.stream_cells import StreamStudy
 from aegis_cli.studies.tuning import choose
 
+_LONGEST_NAME = 100  # bytes of a folder's name; file systems take 143 or more
 Trials = Mapping[str, list[tuple[Any, Cell[R]]]]  # variant -> its knob's values and their cells
 
 
@@ -87,7 +88,8 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
         if names := _tuned_whole(kind, store):
-            store.kind = kind = kind.only(names)
+            kept: dict[str, Any] = {name: study.variants[name] for name in names}
+            store.kind = kind = kind_of(dataclasses.replace(study, variants=kept))
         report = _run(kind, trials(kind), store)
     if not report.finished:
         raise AegisError(
@@ -119,6 +121,7 @@ def planned(
         if kept.exists() and not overwrite:
             shutil.copy(kept, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
+        # In the order in which `run` measures them, so that a plan reads as the study will go.
         for own in tuned.values():
             for _, cell in own:
                 yield cell.label, store.runner.key(cell) in store.cells
@@ -218,16 +221,25 @@ def _folders(values: Sequence[Any]) -> list[str]:
     """A folder's name for each of a knob's values, no two of which are alike."""
     found: list[str] = []
     for value in values:
-        name = _slug(value)
-        if name in found:  # texts that differ in what no folder's name may have
+        slug = _slug(value)
+        name = _cut(slug) or "value"
+        if name != slug or name in found:  # texts that differ in what no folder's name may have
             name += "-" + hashlib.sha256(repr(value).encode()).hexdigest()[:8]
         found.append(name)
     return found
 
 
 def _slug(value: Any) -> str:
-    """A folder's name for a knob's value."""
+    """A knob's value in the characters that a folder's name may have."""
     return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
+
+
+def _cut(slug: str) -> str:
+    """What of it fits into a folder's name; nothing of dots alone, which name other folders."""
+    if not slug.strip("."):
+        return ""
+    # By bytes, as file systems count; a character that is cut in two is left out.
+    return slug.encode()[:_LONGEST_NAME].decode(errors="ignore")
 
 
 def _tuned(kind: StudyKind[R], tried: Trials[R]) -> Trials[R]:

@@ -97,7 +97,7 @@ POLICY_RULE: Rule = Rule(
 )
 STREAM_RULE: Rule = Rule(
     ability=lambda point: point.last,
-    merit=lambda point: -(point.parameters or 0),
+    merit=lambda point: -(point.parameters or 0),  # fewer are better
     sentence="on validation parts of {place}: of a variant's values within {within:g} points of "
     "its best Last, the one with the fewest final parameters; ties by Last",
 )
@@ -124,6 +124,7 @@ def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> 
     chosen = {}
     for variant, own in points.items():
         compared = measures if rule.reference else own
+        # One margin for all: a method may not buy accuracy with ability that the others keep.
         best = max(_ability(rule, point) for point in compared)
         # At least 0, so that a value that diverged, whose ability is -1, is never an able one.
         chosen[variant] = _best(rule, own, max(0, best - within / 100 - ROUNDING))
@@ -136,7 +137,7 @@ def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
     merits = [rule.merit(point) for point in own]
     numbers = range(len(own))
     able = [i for i in numbers if abilities[i] >= least]
-    if able:
+    if able:  # else the one nearest to it stands for the variant
         return max(able, key=lambda i: (merits[i], abilities[i]))
     return max(numbers, key=lambda i: (abilities[i], merits[i]))
 

@@ -36,6 +36,23 @@ def with_variant(**keys: Any) -> dict[str, Any]:
     return {"variants": {"naive": VARIANTS["naive"], "x": keys}}
 
 
+def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    """Also one of dots, of none of a name's characters, or longer than a name may be."""
+    values = ("a/b", "a_b", ".", "..", "/", "?", "ä" * 200, "ä" * 300, 1e-3, "_._", None)
+    variants = {"x": SimpleNamespace(values=values)}
+    kind: Any = SimpleNamespace(
+        recipe=SimpleNamespace(variants=variants), trial=lambda name, value: value
+    )
+    above = tmp_path / "tuning" / "x"
+    above.mkdir(parents=True)
+    folders = [tmp_path / cell.label for _, cell in stage.trials(kind)["x"]]
+    for folder in folders:
+        folder.mkdir()
+        assert folder.resolve().parent == above.resolve()
+    assert [folder.name for folder in folders][:2] == ["a_b", "a_b-" + folders[1].name[-8:]]
+    assert {"0.001", "fixed"} < {folder.name for folder in folders}
+
+
 @pytest.mark.parametrize(
     ("changes", "found", "fix"),
     [
