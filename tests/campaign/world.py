@@ -80,7 +80,7 @@ def _model_and_demos() -> None:
 
 def _recipes() -> None:
     small = small_run.recipe("model", ("aegis",), steps=STEPS)
-    quick = {"probe": Probe(questions=14, vqa=ASKED), "rollout": Rollout(episodes=1)}
+    quick = {"probe": Probe(questions=14, vqa=ASKED), "rollout": Rollout(episodes=1, replan=20)}
     job = dataclasses.replace(small, name="job", methods=("naive",), **quick)
     made: dict[str, Recipe | RobotStreamRecipe] = {
         RECIPE: small,
@@ -107,7 +107,7 @@ def _stream_recipe() -> RobotStreamRecipe:
             method="igsp",
             steps=2,
             batch_size=4,
-            chunk=4,
+            chunk=20,
             flow_samples=2,
             lr=1e-2,
             expert_lr=3e-3,
@@ -117,7 +117,7 @@ def _stream_recipe() -> RobotStreamRecipe:
             precision="float32",
         ),
         expert=Expert(width=16, mlp_ratio=1),
-        rollout=RobotRollout(episodes=1),
+        rollout=RobotRollout(episodes=1, replan=20),
         probe=Probe(questions=7),
         igsp=Igsp(rank=2, identify=0.5, check_every=2, checks=1),
     )

@@ -457,7 +457,7 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
     report, out = done(method)
     policy, task, replan, *_ = robots.load_policy(out, report.tasks[number])
     run = robots.load_to_act(out)
-    assert (task, replan) == (report.tasks[number], 4)
+    assert (task, replan) == (report.tasks[number], 20)
     proprio = torch.randn(2, SIZES[task], generator=torch.Generator().manual_seed(1))
     run.activate(number)
     same = [
@@ -609,7 +609,7 @@ def test_train_inspect_probe_and_rollout(
         (("--set", "tasks=[reach]"), ("demos.paths: 2 with 1 tasks",)),
         (("--set", "tasks=[reach, paint]"), ("tasks", "reach, point")),
         (("--set", "tasks=[point, reach]"), ("demonstrations of 'reach'", "for the task 'point'")),
-        (("--set", "rollout.replan=5"), ("rollout.replan: 5 with train.chunk: 4",)),
+        (("--set", "rollout.replan=21"), ("rollout.replan: 21 with train.chunk: 20",)),
         (("--set", "rollout.split=test"), ("rollout.split", "evaluation, validation")),
         (("--set", "demos.paths=[a, b]"), ("'a'",)),
         (("--set", "igsp.kapa=1"), ("did you mean 'igsp.kappa'?",)),

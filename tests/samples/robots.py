@@ -44,7 +44,7 @@ def make(tiny_folder: Path, demos_file: Path, point_file: Path) -> Make:
             "method": method,
             "steps": STEPS,
             "batch_size": 4,
-            "chunk": 4,
+            "chunk": 20,  # with as many executed: a rollout takes few predictions
             "flow_samples": 2,
             "lr": 1e-2,
             "expert_lr": 3e-3,
@@ -65,7 +65,7 @@ def make(tiny_folder: Path, demos_file: Path, point_file: Path) -> Make:
             demos=RobotDemos(paths=tuple(paths[t] for t in tasks)),
             train=RobotTrain(**train | changes),
             expert=Expert(width=16, mlp_ratio=1),
-            rollout=RobotRollout(episodes=1),
+            rollout=RobotRollout(episodes=1, replan=20),
             probe=Probe(questions=7),
             isolated_lora=IsolatedLora(rank=2),
             igsp=Igsp(rank=2, identify=0.5, check_every=2, checks=1),

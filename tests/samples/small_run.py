@@ -17,6 +17,7 @@ TRAIN: dict[str, Any] = {
     "steps": 4,
     "batch_size": 4,
     "flow_samples": 2,
+    "chunk": 20,  # with as many executed: a rollout takes few predictions
     "warmup": 1,
     "checkpoint_every": 2,
     "validate_every": 4,
@@ -39,7 +40,7 @@ def recipe(
         train=Train(**{**TRAIN, **train}),
         expert=Expert(width=16, mlp_ratio=1),
         probe=Probe(questions=14),
-        rollout=Rollout(episodes=2),
+        rollout=Rollout(episodes=2, replan=20),
     )
 
 

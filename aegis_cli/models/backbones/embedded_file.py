@@ -37,7 +37,7 @@ class EmbeddedModel(Protocol):
 
     def state_dict(self) -> dict[str, Tensor]: ...
 
-    def load_state_dict(self, state: dict[str, Tensor], /) -> Any: ...
+    def load_state_dict(self, state: dict[str, Tensor], /, *, assign: bool = False) -> Any: ...
 
     def fingerprint(self) -> str: ...
 
@@ -84,10 +84,11 @@ def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, 
         shape = shape_from(shape_type, meta["shape"], path, len(tensors))
     with outline(path):
         check_heads(shape.width, shape.heads)
-        wanted = model_type(shape, vocabulary).state_dict()
+        model = model_type(shape, vocabulary)
     # Not exact: a file may be in half precision, and the model is float32.
-    check_state(f"'{path}'", tensors, wanted, exact=False)
-    model = model_type(shape, vocabulary)
-    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    check_state(f"'{path}'", tensors, model.state_dict(), exact=False)
+    # A copy: what a training changes is never the memory that the file is read through.
+    weights = {name: t.to(torch.float32, copy=True) for name, t in tensors.items()}
+    model.load_state_dict(weights, assign=True)
     model.eval()
     return model, provenance
