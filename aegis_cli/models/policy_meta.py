@@ -90,6 +90,11 @@ def _check_types(meta: PolicyMeta) -> None:
         raise ValueError(f"'ensemble' is {ensemble!r}")
     if meta.get("stored", FLOAT32) not in STORED_TYPES:
         raise ValueError(f"'stored' is {meta['stored']!r}")
+    check_view(meta)
+
+
+def check_view(meta: PolicyMeta) -> None:
+    """Raise ValueError unless cameras and picture sizes, where there are any, are such."""
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
     for size in meta.get("pictures", []):

@@ -23,6 +23,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.batch import Share
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -122,10 +123,7 @@ class TrainingRun:
             found["dataset"] = [one, *others] if others else one
         if self.policy.backbone.hub_id is not None:
             found["base_model"] = self.policy.backbone.hub_id
-        if self.demos.cameras:
-            found["cameras"] = list(self.demos.cameras)
-        if self.policy.backbone.image_size is None:
-            found["pictures"] = [list(frames.shape[1:3]) for frames in self.demos.frames]
+        found |= view(self.demos, self.policy.backbone)
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
         return cast(PolicyMeta, found)
@@ -450,6 +448,16 @@ def _policy(
         begun = loading.begun_expert(recipe, shape, relative, demos.recorded, on_event)
         expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
+
+
+def view(demos: Demonstrations, backbone: Backbone) -> PolicyMeta:
+    """How the policy looked at its demonstrations: of its meta, `cameras` and `pictures`."""
+    found: dict[str, Any] = {}
+    if demos.cameras:
+        found["cameras"] = list(demos.cameras)
+    if backbone.image_size is None:
+        found["pictures"] = [list(frames.shape[1:3]) for frames in demos.frames]
+    return cast(PolicyMeta, found)
 
 
 def expert_shape(
