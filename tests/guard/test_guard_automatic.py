@@ -449,6 +449,26 @@ def test_a_batch_that_is_skipped(anchors: dict[str, Path]) -> None:
     assert len(guard.ledger) == 1
 
 
+@pytest.mark.parametrize("backward", [False, True])
+def test_after_a_loss_that_fails_the_next_pass_says_how_to_go_on(
+    backward: bool, anchors: dict[str, Path]
+) -> None:
+    """Outside the model's call: while it is computed, or before its backward pass comes there."""
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected)
+    model, other = automatic("aegis", anchors)
+    FailsOnce.failed = not backward
+    scores = FailsOnce.apply(model(*batch(0)))
+    with pytest.raises(MemoryError if backward else RuntimeError):
+        (scores if backward else scores.view(-1, 7919)).square().mean().backward()
+    with pytest.raises(AegisError) as caught:
+        plain_steps(model)
+    assert "guard.discard()" in caught.value.fix
+    other.discard()
+    plain_steps(model)
+    assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
+
+
 def test_a_guard_that_is_removed_leaves_the_loop_alone(anchors: dict[str, Path]) -> None:
     model, guard = automatic("aegis", anchors)
     guard.remove()
