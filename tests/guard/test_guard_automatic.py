@@ -375,6 +375,25 @@ def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None
         torch.testing.assert_close(others[name], values)
 
 
+def test_a_scaler_that_was_not_given_shows_in_the_ledger_alone(anchors: dict[str, Path]) -> None:
+    """As docs/guard.md says: the projection is the same whatever scale the task's gradient has."""
+    scale, found = 256.0, []
+    for told in (True, False):
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+        model, guard = automatic("aegis", anchors, **({"scaler": scaler} if told else {}))
+        optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+        for seed in range(3):
+            scaler.scale(task_loss(model, seed)).backward()
+            scaler.step(optimizer)
+            scaler.update()
+            optimizer.zero_grad()
+        found.append((vector(model), guard.ledger.tensors()))
+    (model, rows), (other, scaled) = found
+    torch.testing.assert_close(other, model)
+    for name, times in (("tt", scale**2), ("ta", scale), ("aa", 1.0)):
+        torch.testing.assert_close(scaled[name], rows[name] * times)
+
+
 # --- what else a loop does ------------------------------------------------------------------------
 
 
