@@ -55,6 +55,7 @@ _SAID = (
     "action_std",
     "fps",
     "base_model",
+    "began_as",
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 

@@ -66,6 +66,7 @@ class TrainingRun:
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
         masters: the float32 weights that passes see rounded.
+        began_as: as of `loading.Loaded`.
     """
 
     recipe: Recipe
@@ -86,6 +87,7 @@ class TrainingRun:
     unread: UnreadFigures = field(default_factory=UnreadFigures)
     masters: Masters = NONE
     average: Average = field(default_factory=Average)
+    began_as: str | None = None
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -123,6 +125,8 @@ class TrainingRun:
             found["dataset"] = [one, *others] if others else one
         if self.policy.backbone.hub_id is not None:
             found["base_model"] = self.policy.backbone.hub_id
+        if self.began_as is not None:
+            found["began_as"] = self.began_as
         found |= view(self.demos, self.policy.backbone)
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
@@ -189,7 +193,9 @@ class TrainingRun:
         shown = card.Data(
             self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
         )
-        readme = card.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
+        readme = card.text(
+            self.recipe, self.method, steps, shown, self.inputs, self.ledger, self.began_as
+        )
         saved = checkpoint.save(
             self.out,
             steps,
@@ -273,6 +279,7 @@ def build(
         unread=UnreadFigures.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
         average=_average(recipe.train, policy),
+        began_as=loaded.began_as,
     )
 
 
