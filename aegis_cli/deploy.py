@@ -436,7 +436,9 @@ def load_policy(
         found = robots.load_policy(folder, task)
         policy = found.policy.to(device)
         policy.acts_in = acts_in
-        return DeployedPolicy(policy, found.task, (), found.replan, seed, ensemble=ensemble)
+        return DeployedPolicy(
+            policy, found.task, (), found.replan, seed, found.sizes, ensemble=ensemble
+        )
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"

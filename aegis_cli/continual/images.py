@@ -7,7 +7,7 @@ own classes, and what is measured is the accuracy on every task, with the task t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.learners.base import Learner
@@ -184,7 +184,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
         tasks=found,
         fingerprint=fingerprint,
         out=out,
-        image_set=image_set(recipe),
+        image_set=_checked_image_set(recipe, on_event),
     )
 
 
@@ -266,10 +266,40 @@ def image_set(recipe: StreamRecipe) -> str:
         AegisError: no such stream or task, or files that cannot be read.
     """
     if recipe.path is None:
-        found: Any = streams.edition(recipe.stream)
-    else:
-        found = {name: folders.contents(Path(recipe.path) / name) for name in _folder_names(recipe)}
-    return sha256_value(found)
+        return sha256_value(streams.edition(recipe.stream))
+    return sha256_value(_contents(recipe, Path(recipe.path)))
+
+
+def _contents(recipe: StreamRecipe, root: Path) -> dict[str, dict[str, Any]]:
+    """What each task's folder is loaded from."""
+    return {name: folders.contents(root / name) for name in _folder_names(recipe)}
+
+
+def _checked_image_set(recipe: StreamRecipe, on_event: OnEvent) -> str:
+    """The same digest, with a warning of images of folders that are not held out in truth."""
+    if recipe.path is None:
+        return image_set(recipe)
+    used = _contents(recipe, Path(recipe.path))
+    _warn_of_shared(Path(recipe.path), used, on_event)
+    return sha256_value(used)
+
+
+def _warn_of_shared(root: Path, used: Mapping[str, Mapping[str, Any]], on_event: OnEvent) -> None:
+    """Warn of held-out images that are, byte for byte, also in a part that comes before."""
+    pairs: list[tuple[Path, Path]] = []
+    total = 0
+    for name, contents in used.items():
+        found, held_out = folders.shared(root / name, contents["files"])
+        pairs += [(root / name / one, root / name / other) for one, other in found]
+        total += held_out
+    if pairs:
+        one, other = pairs[0]
+        text = (
+            f"{len(pairs)} of the {total} held-out images in '{root}' are also in a part that "
+            f"comes before, byte for byte: '{one}' is '{other}'. The accuracy on them is not that "
+            "on new images; remove one of the two"
+        )
+        on_event(Warned("train", text))
 
 
 def _folder_tasks(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:

@@ -37,14 +37,15 @@ from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
 from aegis_cli.evaluation import probe, rollout
 from aegis_cli.evaluation.rollout import Acting
-from aegis_cli.models import backbones
+from aegis_cli.models import backbones, policy_meta
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import Demos, RobotStreamRecipe
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
-from aegis_cli.training import assemble, freezing, train
+from aegis_cli.training import assemble, checkpoint, freezing, train
 from aegis_cli.training.freezing import Still
 from aegis_cli.training.up_to_date import Made, StageRecords
 
@@ -70,6 +71,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     Attributes:
         policies: one per task; they share backbone and action expert and have scales of their own.
+        views: how each task's policy looks: of a policy's meta, `cameras` and `pictures`.
         still: what the recipe freezes of the backbone.
         demos: one per task; none in a run that only acts.
         question_files: digests of the files that the questions come from; none of scenes.
@@ -80,6 +82,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
     partial_matrix = True
 
     policies: tuple[Policy, ...]
+    views: Sequence[PolicyMeta]
     still: Still = Still()
     demos: tuple[Demonstrations, ...] = ()
     question_files: Mapping[str, str] = field(default_factory=dict)
@@ -136,6 +139,15 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         for task, demos in zip(self.names, self.demos, strict=False):
             digests[f"demos of {task}"] = demos.sha256
         return {**super().inputs, "backbone": self.fingerprint, **digests, **self.question_files}
+
+    def acting(self, task: int) -> Acting:
+        """The policy of the task of that number, which alone is active from here on."""
+        self.activate(task)
+        # The policies share backbone and action expert, and differ in their task's scales.
+        policy, name, view = self.policies[task].eval(), self.names[task], self.views[task]
+        cameras = checkpoint.cameras_of(view, name)
+        sizes = checkpoint.sizes_of(view)
+        return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
 
     def activate(self, task: int | None) -> None:
         """Let every map compute for the task of that number; None: the bare backbone."""
@@ -227,6 +239,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             "tasks": list(self.names),
             "shape": self.model.expert.shape.to_json(),
         }
+        if any(self.views):
+            meta["views"] = list(self.views)
         if self.sites:
             meta["experts"] = digest(artifacts.load(self.out / files.EXPERTS).tensors)
         artifacts.save(
@@ -263,7 +277,8 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    run = _assemble(recipe, backbone, shape, scales, out, demos)
+    views = [assemble.view(shown, backbone) for shown in demos]
+    run = _assemble(recipe, backbone, shape, scales, views, out, demos)
     run.measure_with(source, on_event)
     return run
 
@@ -310,7 +325,8 @@ def load_to_act(path: Path) -> RobotStreamRun:
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
         for i in range(len(recipe.tasks))
     ]
-    run = _assemble(recipe, backbone, shape, scales, path)
+    views = _views(path / ACTION_EXPERT, saved, len(recipe.tasks))
+    run = _assemble(recipe, backbone, shape, scales, views, path)
     with torch.no_grad():
         for name, parameter in own_parameters(run.model.expert).items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
@@ -352,6 +368,7 @@ def _assemble(
     backbone: Backbone,
     shape: ExpertShape,
     scales: Sequence[Scales],
+    views: Sequence[PolicyMeta],
     out: Path,
     demos: tuple[Demonstrations, ...] = (),
 ) -> RobotStreamRun:
@@ -367,6 +384,7 @@ def _assemble(
         fingerprint=fingerprint,
         out=out,
         policies=policies,
+        views=views,
         still=still,
         demos=demos,
     )
@@ -388,9 +406,7 @@ def load_policy(path: Path, task: str | None) -> Acting:
             f"--task {known[0]}",
         )
     run = load_to_act(path)
-    number = known.index(task)
-    run.activate(number)
-    return Acting(run.policies[number], task, run.recipe.rollout.replan)
+    return run.acting(known.index(task))
 
 
 def _checked_shape(
@@ -418,6 +434,21 @@ def _checked_shape(
                 wanted[name] = torch.empty(length, dtype=torch.float32)
     check_state(f"'{path}'", saved.tensors, wanted)
     return shape
+
+
+def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta]:
+    """How each task's policy looks; files that were written before this was kept do not say it.
+
+    Raises:
+        AegisError: what the header says of it is damaged.
+    """
+    with reading_meta(path):
+        views = list(saved.header.meta.get("views", [{}] * tasks))
+        if len(views) != tasks:
+            raise ValueError(f"'views' of {len(views)} tasks for {tasks}")
+        for view in views:
+            policy_meta.check_view(view)
+    return views
 
 
 def _scale(tensors: Mapping[str, Tensor], task: int, kind: str) -> Normalizer:
@@ -646,20 +677,19 @@ class RobotEvaluator:
 
     def success(self, task: int) -> float:
         """Share of successes of the task of that number, or of the highest return."""
-        run, settings = self._run, self._run.recipe.rollout
-        run.activate(task)
-        # The policies share backbone and action expert, and differ in their task's scales.
-        name, policy = run.names[task], run.policies[task].eval()
+        acting, settings = self._run.acting(task), self._run.recipe.rollout
         split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
         found = rollout.play(
-            policy,
-            name,
+            acting.policy,
+            acting.task,
             settings.episodes,
             settings.colors,
-            settings.replan,
+            acting.replan,
             split,
-            on_event=self._named(name),
+            on_event=self._named(acting.task),
             seed=settings.seed,
+            cameras=acting.cameras,
+            sizes=acting.sizes,
         )
         # A task of dm_control's suite has no success, but a return.
         share = found.return_share if found.success is None else found.success

@@ -18,6 +18,7 @@ from aegis_cli import sim
 from aegis_cli.common import artifacts, files, gl, media, processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.common.palette import COLORS, SEEN
 from aegis_cli.data import demonstrations, keeping
 from aegis_cli.data.lerobot import layout, write
@@ -28,7 +29,6 @@ from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 # How many episodes repay a worker's start of a few seconds: of our own tasks, and of MetaWorld's,
 # whose robot takes far longer to simulate and to draw. An episode of a planner does so alone.
 _PER_WORKER, _PER_WORKER_METAWORLD = 400, 20
-_MOST = 10_000_000  # episodes
 FORMATS = ("safetensors", "lerobot")
 
 
@@ -236,8 +236,8 @@ def _check(
             "a share of the episodes, 0 or more and below 1",
             "e.g. 0.25",
         )
-    if not 1 <= episodes <= _MOST:
-        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+    if not 1 <= episodes <= MOST_MADE:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {MOST_MADE} episodes"
         raise AegisError(f"{episodes} episodes", expected, "use --episodes 300")
     if not (math.isfinite(noise) and noise >= 0):
         raise AegisError(f"noise {noise}", "a finite number >= 0", "use --noise 0.3")

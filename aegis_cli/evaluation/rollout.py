@@ -16,6 +16,7 @@ from aegis_cli import sim
 from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.common.pictures import fit
 from aegis_cli.core import ensemble as temporal
@@ -33,7 +34,6 @@ EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default, and the only choice for a task without colours
 _LOCKSTEP = 64  # episodes that share a forward pass
-_MOST = 10_000_000  # episodes
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,8 @@ def run(
     """
     if ensemble is not None:
         temporal.check(ensemble)
-    if not 1 <= episodes <= _MOST:
-        expected = "at least 1 episode" if episodes < 1 else f"at most {_MOST} episodes"
+    if not 1 <= episodes <= MOST_MADE:
+        expected = "at least 1 episode" if episodes < 1 else f"at most {MOST_MADE} episodes"
         raise AegisError(f"{episodes} episodes", expected, "use --episodes 50")
     if video_out is not None:
         media.check_video(video_out)

@@ -47,6 +47,7 @@ _SAID = (
     "relative",
     "cameras",
     "pictures",
+    "only",
     "state",
     "action",
     "rename",
@@ -54,7 +55,9 @@ _SAID = (
     "proprio_names",
     "action_std",
     "fps",
+    "dataset",
     "base_model",
+    "began_as",
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 

@@ -26,6 +26,8 @@ class PolicyMeta(TypedDict, total=False):
         action_std: the actions' standard deviations, where one of the policy's scales is another.
         dataset: the id on the hub of the demonstrations, or the ids of several.
         base_model: the id on the hub of the model that the backbone began as.
+        began_as: of a run that began with another run's backbone, the name of the model that this
+            one began with, without a folder.
         cameras: in their order, if they are several, or not the task's own.
         pictures: (height, width) of what each camera showed, for a backbone that reads pictures of
             any size.
@@ -49,6 +51,7 @@ class PolicyMeta(TypedDict, total=False):
     action_std: list[float]
     dataset: str | list[str]
     base_model: str
+    began_as: str
     cameras: list[str]
     pictures: list[list[int]]
     stored: str
@@ -74,7 +77,8 @@ def check(meta: PolicyMeta, actions: int, positions: int) -> None:
 
 def _check_types(meta: PolicyMeta) -> None:
     """Raise ValueError unless what a policy's user has to know is of the types that they read."""
-    kinds = {"method": str, "task": str | None, "replan": int, "normalization": str, "only": str}
+    kinds = {"method": str, "task": str | None, "replan": int}
+    kinds |= dict.fromkeys(("normalization", "only", "began_as"), str)
     for name, kind in kinds.items():
         if name in meta and not isinstance(meta[name], kind):
             raise ValueError(f"'{name}' is {meta[name]!r}")
@@ -90,6 +94,11 @@ def _check_types(meta: PolicyMeta) -> None:
         raise ValueError(f"'ensemble' is {ensemble!r}")
     if meta.get("stored", FLOAT32) not in STORED_TYPES:
         raise ValueError(f"'stored' is {meta['stored']!r}")
+    check_view(meta)
+
+
+def check_view(meta: PolicyMeta) -> None:
+    """Raise ValueError unless cameras and picture sizes, where there are any, are such."""
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
     for size in meta.get("pictures", []):

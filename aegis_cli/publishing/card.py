@@ -6,6 +6,7 @@ into the run.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +29,7 @@ from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint, freezing
-from aegis_cli.training.card import without_folders, without_places
+from aegis_cli.training.card import model, without_folders, without_places
 
 NAME = "README.md"
 LEROBOT, AEGIS = "lerobot", "aegis"
@@ -41,7 +42,7 @@ _CARD = """---
 
 # {title}
 
-A robot policy made of the vision-language model `{backbone}` and an action expert that reads it,
+A robot policy made of the vision-language model {model} and an action expert that reads it,
 fine-tuned by Aegis {version} with the method `{method}`:
 {summary}.
 
@@ -127,10 +128,13 @@ def text(
     # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
     options = without_places(recipes.options(recipe))
     merge, decay = facts.get("merge"), recipe.train.ema_decay
+    meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
+    # Others have the model that an earlier run began with, and not that run.
+    known = dataclasses.replace(recipe, backbone=meta.get("began_as", recipe.backbone))
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {found.method}",
-        backbone=without_folders(recipe.backbone),
+        model=model(recipe, meta.get("began_as")),
         version=__version__,
         method=recipe.train.method,
         summary=methods.get(recipe.train.method).summary,
@@ -147,7 +151,7 @@ def text(
         merged=_merged(merge),
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
-        use=_use(form, repo, recipe, facts["task"], cameras, _looks_by(at, facts["task"])),
+        use=_use(form, repo, known, facts["task"], cameras, _looks_by(meta, facts["task"])),
     )
 
 
@@ -158,12 +162,11 @@ def _merged(merge: Mapping[str, Any] | None) -> str:
     return f" Merged afterwards: `{json.dumps(without_places(merge), sort_keys=True)}`."
 
 
-def _looks_by(at: Path, task: str | None) -> Sequence[str]:
+def _looks_by(meta: PolicyMeta, task: str | None) -> Sequence[str]:
     """The cameras of its simulated task that a checkpoint's policy looks by, by the task's names.
 
     They are empty for the task's own, where there is none, and where the policy has several.
     """
-    meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
     several = len(meta.get("cameras", ())) > 1
     if task is None or several:
         return ()

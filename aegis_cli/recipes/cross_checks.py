@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.recipes.keys import changed
 from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
@@ -32,6 +33,10 @@ def cross_checks(
             "no more actions executed than predicted",
             f"set rollout.replan to at most {recipe.train.chunk}",
         )
+    # Of a file's questions a probe asks as many as there are.
+    if recipe.probe.questions > MOST_MADE and "scenes" in recipe.probe.sets:
+        found = f"probe.questions: {recipe.probe.questions} with probe.vqa: scenes"
+        yield Problem(found, f"at most {MOST_MADE:,}", "ask for fewer")
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
     else:

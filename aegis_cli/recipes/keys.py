@@ -25,6 +25,7 @@ from typing import (
     get_type_hints,
 )
 
+from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.recipes.strict_yaml import plain
 
 LARGEST = 10**12  # whole number that a key takes; from some size on, arrays and times overflow
@@ -52,6 +53,7 @@ def choice(*choices: str) -> Check:
 
 WITH_PLACE = Check("a text with one {}", lambda v: v.count("{}") == 1)
 POSITIVE = Check("above 0", lambda v: v > 0)
+MADE = Check(f"from 1 to {MOST_MADE:,}", lambda v: 1 <= v <= MOST_MADE)
 POSITIVE_EACH = Check("above 0", lambda v: v > 0, repeats=True)
 TWO_OR_MORE = Check("2 or more", lambda v: v >= 2)
 EVEN = Check("above 0 and even", lambda v: v > 0 and v % 2 == 0)

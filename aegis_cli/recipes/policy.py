@@ -11,6 +11,7 @@ from aegis_cli.recipes.keys import (
     BELOW_ONE,
     EVEN,
     FOLDER_NAME,
+    MADE,
     NAMES,
     NOT_EMPTY,
     NOT_NEGATIVE,
@@ -97,7 +98,7 @@ _ASK = (
 class Demos:
     """The demonstrations that are recorded, or that exist already."""
 
-    episodes: int = key(POSITIVE, default=300, doc="Number of episodes that are recorded.")
+    episodes: int = key(MADE, default=300, doc="Number of episodes that are recorded.")
     noise: float = key(
         NOT_NEGATIVE,
         default=0.3,
@@ -775,7 +776,7 @@ class Probe:
 class Rollout:
     """How a policy's success is measured."""
 
-    episodes: int = key(POSITIVE, default=50, doc="Number of episodes for each set of colours.")
+    episodes: int = key(MADE, default=50, doc="Number of episodes for each set of colours.")
     seed: int = key(
         SEED, default=0, doc="Seed of the episodes, none of which is a demonstration's."
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from aegis_cli.data.streams.names import TASKS as STREAM_TASKS
 from aegis_cli.recipes.keys import (
     FOLDER_NAME,
+    MADE,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
@@ -43,9 +44,9 @@ class PretrainRecipe:
 
     name: str = key(FOLDER_NAME, doc="Name of the run; it is written to runs/NAME.")
     seed: int = key(SEED, default=0, doc="Seed of the scenes, the weights and the training.")
-    scenes: int = key(POSITIVE, default=50_000, doc="Number of scenes that are trained on.")
+    scenes: int = key(MADE, default=50_000, doc="Number of scenes that are trained on.")
     probe_questions: int = key(
-        POSITIVE, default=7000, doc="Number of questions that the finished model is asked."
+        MADE, default=7000, doc="Number of questions that the finished model is asked."
     )
     start: str | None = key(
         NOT_EMPTY,

@@ -8,6 +8,7 @@ from aegis_cli.data.streams.names import STREAMS
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     FOLDER_NAME,
+    MADE,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
@@ -153,7 +154,7 @@ class RobotTrain:
 class RobotDemos:
     """The demonstrations of each task of a stream."""
 
-    episodes: int = key(POSITIVE, default=300, doc="Number of episodes that are recorded per task.")
+    episodes: int = key(MADE, default=300, doc="Number of episodes that are recorded per task.")
     noise: float = key(
         NOT_NEGATIVE,
         default=0.3,
@@ -172,7 +173,7 @@ class RobotDemos:
 class RobotRollout:
     """How success is measured after each task of a stream."""
 
-    episodes: int = key(POSITIVE, default=50, doc="Number of episodes per task.")
+    episodes: int = key(MADE, default=50, doc="Number of episodes per task.")
     seed: int = key(
         SEED, default=0, later=True, doc="Seed of the episodes, none of which is a demonstration's."
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from aegis_cli.recipes.keys import (
     FOLDER_NAME,
+    MADE,
     NOT_EMPTY,
     NOT_NEGATIVE,
     POSITIVE,
@@ -92,9 +93,9 @@ class Tuning:
     seed: int = key(
         SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
-    questions: int = key(POSITIVE, default=1400, doc="Number of questions on validation scenes.")
+    questions: int = key(MADE, default=1400, doc="Number of questions on validation scenes.")
     episodes: int = key(
-        POSITIVE, default=100, doc="Number of validation rollouts, with the colours of training."
+        MADE, default=100, doc="Number of validation rollouts, with the colours of training."
     )
     within: float = key(
         NOT_NEGATIVE,

@@ -23,6 +23,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.batch import Share
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.methods import ledger_file
@@ -65,6 +66,7 @@ class TrainingRun:
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
             None where each step takes its own.
         masters: the float32 weights that passes see rounded.
+        began_as: as of `loading.Loaded`.
     """
 
     recipe: Recipe
@@ -85,6 +87,7 @@ class TrainingRun:
     unread: UnreadFigures = field(default_factory=UnreadFigures)
     masters: Masters = NONE
     average: Average = field(default_factory=Average)
+    began_as: str | None = None
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -122,10 +125,9 @@ class TrainingRun:
             found["dataset"] = [one, *others] if others else one
         if self.policy.backbone.hub_id is not None:
             found["base_model"] = self.policy.backbone.hub_id
-        if self.demos.cameras:
-            found["cameras"] = list(self.demos.cameras)
-        if self.policy.backbone.image_size is None:
-            found["pictures"] = [list(frames.shape[1:3]) for frames in self.demos.frames]
+        if self.began_as is not None:
+            found["began_as"] = self.began_as
+        found |= view(self.demos, self.policy.backbone)
         if self.policy.backbone.stored != FLOAT32:
             found["stored"] = self.policy.backbone.stored
         return cast(PolicyMeta, found)
@@ -191,7 +193,9 @@ class TrainingRun:
         shown = card.Data(
             self.demos.task, self.demos.cameras, len(self.demos.train), len(self.demos.validation)
         )
-        readme = card.text(self.recipe, self.method, steps, shown, self.inputs, self.ledger)
+        readme = card.text(
+            self.recipe, self.method, steps, shown, self.inputs, self.ledger, self.began_as
+        )
         saved = checkpoint.save(
             self.out,
             steps,
@@ -275,6 +279,7 @@ def build(
         unread=UnreadFigures.of(backbone.device, made, parts, sharded=owners.several),
         masters=masters,
         average=_average(recipe.train, policy),
+        began_as=loaded.began_as,
     )
 
 
@@ -450,6 +455,16 @@ def _policy(
         begun = loading.begun_expert(recipe, shape, relative, demos.recorded, on_event)
         expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
+
+
+def view(demos: Demonstrations, backbone: Backbone) -> PolicyMeta:
+    """How the policy looked at its demonstrations: of its meta, `cameras` and `pictures`."""
+    found: dict[str, Any] = {}
+    if demos.cameras:
+        found["cameras"] = list(demos.cameras)
+    if backbone.image_size is None:
+        found["pictures"] = [list(frames.shape[1:3]) for frames in demos.frames]
+    return cast(PolicyMeta, found)
 
 
 def expert_shape(

@@ -25,7 +25,7 @@ tags: [robotics, vision-language-action, aegis]
 
 # {name}: {steps} steps of `{method}`
 
-The vision-language model `{backbone}` as the backbone of a robot policy,
+The vision-language model {model} as the backbone of a robot policy,
 fine-tuned with Aegis {version}. It loads and is asked as the original is; the action expert that
 reads it is in `expert.safetensors`, beside this folder.
 
@@ -82,12 +82,14 @@ def text(
     data: Data,
     inputs: Mapping[str, str],
     ledger: Ledger,
+    began_as: str | None = None,
 ) -> str:
     """The card after `steps` steps; equal runs give equal cards.
 
     Args:
         inputs: sha256 of what the run was made from, by a name for it.
         ledger: with one row per step, where the method reads the anchor.
+        began_as: of a policy's meta.
     """
     settings, options = recipe.train, recipes.options(recipe)
     asks = method.trains_on_questions(options)
@@ -98,7 +100,8 @@ def text(
         name=recipe.name,
         steps=steps,
         method=method.name,
-        backbone=without_folders(recipe.backbone),
+        model=model(recipe, began_as),
+        backbone=began_as or without_folders(recipe.backbone),
         version=__version__,
         summary=method.summary,
         options=json.dumps(without_places(options), sort_keys=True),
@@ -117,6 +120,17 @@ def text(
         drift=_drift(ledger.tensors()),
         anchor=" --anchor ANCHOR" if "anchor" in read else "",
     )
+
+
+def model(recipe: Recipe, began_as: str | None) -> str:
+    """What a card calls the model that a run began with, which another run may have trained.
+
+    Args:
+        began_as: of a policy's meta.
+    """
+    if began_as is None:
+        return f"`{without_folders(recipe.backbone)}`"
+    return f"`{began_as}` (which Aegis had fine-tuned before)"
 
 
 def without_folders(name: str) -> str:

@@ -160,15 +160,17 @@ def _planned(
     there, free, base = _alive(device), memory.free(device), memory.restart_peak(device)
     ranks.wait()
     method = methods.get(recipe.train.method)
+    told = on_event if ranks.first else ignore
+    told(Progress("dry run (loading)", 0, 1, "model"))
     training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
+    told(Progress("dry run (loading)", 1, 1, "model"))
     held = _held(training, there)
-    tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks))
+    tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)
     written = [] if overwrite else checkpoint.whole(out)
     disk = _disk(training, written)
     buffers = WrittenBuffers(training.policy.backbone)
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
-    told = on_event if ranks.first else ignore
     needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
     return _report(training, tokens, needs, free, disk, recipe.train.steps - _done(written))
@@ -353,14 +355,17 @@ def _bytes_here(tensors: Iterable[Tensor]) -> int:
 # --- memory ---------------------------------------------------------------------------------------
 
 
-def _pass_kept(training: TrainingRun, frames: int) -> tuple[int, int]:
+def _pass_kept(training: TrainingRun, frames: int, on_event: OnEvent) -> tuple[int, int]:
     """Tokens of one frame, and bytes that the forward pass of some keeps for the backward.
 
     Passes of two and of three frames tell what grows with the frames from what does not (weights
     that autocast has rounded). A pass of a single frame would keep less, being no batch.
     """
+    on_event(Progress("dry run (memory)", 0, 2, "passes"))
     tokens, of_two = _pass_some(training, 2)
+    on_event(Progress("dry run (memory)", 1, 2, "passes"))
     _, of_three = _pass_some(training, 3)
+    on_event(Progress("dry run (memory)", 2, 2, "passes"))
     per_frame = of_three - of_two
     return tokens, of_two + (frames - 2) * per_frame
 

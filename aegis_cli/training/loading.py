@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices, launch
 from aegis_cli.common.errors import AegisError
@@ -23,6 +24,7 @@ from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones import shapes
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy_meta import PolicyMeta
@@ -39,12 +41,15 @@ class Loaded:
     Attributes:
         backbone: with its weights as they were stored, on the device that it learns on; on the
             CPU if it is to be sharded.
+        began_as: what the model is called that the backbone was before another run trained it;
+            None where none did, or nobody knows.
         fingerprint: of its weights.
         watched: the anchor's file, if there is one, and `anchor` its digest.
         measured: what the anchor holds; None where there is none.
     """
 
     backbone: Backbone
+    began_as: str | None
     fingerprint: str
     demos: demonstrations.Demonstrations
     watched: WatchedFiles
@@ -80,7 +85,29 @@ def load(
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
     digest = None if anchor is None else watched.sha256[anchor]
-    return Loaded(backbone, fingerprint, recorded, watched, digest, measured)
+    before = began_as(recipe.backbone)
+    return Loaded(backbone, before, fingerprint, recorded, watched, digest, measured)
+
+
+def began_as(name: str) -> str | None:
+    """What the model is called that the run began with whose backbone `name` is.
+
+    Where it lay is left out. None where `name` is no backbone of a checkpoint, or its run is gone.
+    """
+    if shapes.of_backbone(name) is not None:
+        return None
+    path = backbones.locate(name)
+    at = path.parent if path.is_dir() else path.parent.parent
+    if not (at / checkpoint.EXPERT).is_file():
+        return None
+    known = artifacts.read_header(at / checkpoint.EXPERT).meta
+    if (told := known.get("began_as") or known.get("base_model")) is not None:
+        return told
+    run = checkpoint.run_of(at)
+    if run is None:
+        return None
+    own = recipes.load(run / "recipe.yaml", kind=Recipe).backbone
+    return own if own in backbones.SHIPPED else Path(own).name
 
 
 def _demonstrations(

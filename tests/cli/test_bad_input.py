@@ -36,8 +36,8 @@ NAN = float("nan")
         ("train: 5", ("train", "5")),
         ("methods: [naive, aegsi]", ("aegsi", "'aegis'")),
         ("task: raech", ("raech", "'reach'")),
-        ("demos: {episodes: 0}", ("demos.episodes", "above 0")),
-        ("rollout: {episodes: 0}", ("rollout.episodes", "above 0")),
+        ("demos: {episodes: 0}", ("demos.episodes", "from 1 to 10,000,000")),
+        ("rollout: {episodes: 0}", ("rollout.episodes", "from 1 to 10,000,000")),
         ("train: {backbone_lr: .nan}", ("train.backbone_lr",)),
     ],
 )

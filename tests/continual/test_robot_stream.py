@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,16 +20,18 @@ from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, 
 from samples.training_runs import contents
 from samples.vqa_files import hub_rows, write_jsonl
 
-from aegis_cli import inspection
+from aegis_cli import inspection, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.continual import files, loop, probe, robots, state, train
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.continual.robots import RobotEvaluator, RobotStreamRun
 from aegis_cli.core.accuracy_matrix import seen_scores
+from aegis_cli.data import demonstrations
 from aegis_cli.data import record as demos
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa.dataset import load_scenes
-from aegis_cli.deploy import load_acting
+from aegis_cli.deploy import load_acting, load_policy
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import backbones
 from aegis_cli.models.policy import Policy
@@ -466,6 +469,73 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
     ]
     assert torch.equal(*same)
     assert rollout.run(out, task, 1, "seen", load=load_acting).success == report.success[-1][number]
+
+
+@pytest.fixture(scope="module")
+def of_any_size(
+    make: Make, hf_folder: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[tuple[int, ...]]]:
+    """A stream whose backbone takes any pictures, and in which sizes it saw those of rollouts."""
+    out, shown = tmp_path_factory.mktemp("any") / "run", []
+    wanted = make("sequential", steps=1, backbone=str(hf_folder("paligemma")))
+    load, act, sizes = demonstrations.load, Policy.act, {"reach": (40, 60), "point": (48, 48)}
+
+    def otherwise(*given: Any, **options: Any) -> Demonstrations:
+        found = load(*given, **options)
+        return found.fitted([sizes[str(found.task)]])
+
+    def watched(self: Policy, pictures: torch.Tensor, *rest: Any) -> torch.Tensor:
+        shown.append(tuple(pictures.shape[1:3]))
+        return act(self, pictures, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "load", otherwise)
+        patch.setattr(Policy, "act", watched)
+        train.run(wanted, out)
+    return out, shown
+
+
+def test_rollouts_of_a_stream_show_pictures_in_the_sizes_of_each_tasks_training(
+    of_any_size: tuple[Path, list[tuple[int, ...]]],
+) -> None:
+    """While it is trained, in `aegis rollout` and in `load_policy`."""
+    out, shown = of_any_size
+    assert set(shown) == {(40, 60), (48, 48)}
+    for task, size in (("reach", (40, 60)), ("point", (48, 48))):
+        assert load_acting(out, task).sizes == (size,)
+        assert load_policy(out, task).sizes == (size,)
+
+
+def test_a_damaged_view_is_one_error(
+    of_any_size: tuple[Path, list[tuple[int, ...]]], tmp_path: Path
+) -> None:
+    shutil.copytree(of_any_size[0], tmp_path / "run")
+    path = tmp_path / "run" / "expert.safetensors"
+    saved = artifacts.load(path)
+    own = {"seed": saved.header.seed, "inputs": saved.header.inputs}
+    for views in ([], [{}], [{}, {"pictures": [[0, 4]]}], [{}, 3]):
+        meta = {**saved.header.meta, "views": views}
+        fingerprint = saved.header.fingerprint
+        artifacts.save(path, "expert", saved.tensors, fingerprint=fingerprint, meta=meta, **own)
+        with pytest.raises(AegisError, match="is damaged"):
+            robots.load_to_act(tmp_path / "run")
+
+
+def test_a_stream_acts_by_the_camera_that_its_demonstrations_were_seen_by(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a policy of one task does; other names of the only camera are the task's own."""
+    monkeypatch.setattr(sim, "cameras", lambda name: ("top", "side"))
+    load = demonstrations.load
+
+    def seen_by(*given: Any, **options: Any) -> Demonstrations:
+        found = load(*given, **options)
+        camera = {"reach": "side", "point": "webcam"}[str(found.task)]
+        return dataclasses.replace(found, cameras=(f"observation.images.{camera}",))
+
+    monkeypatch.setattr(demonstrations, "load", seen_by)
+    built = train.build(make("sequential"), tmp_path / "run")
+    assert [built.acting(task).cameras for task in (0, 1)] == [("side",), ()]
 
 
 # --- interrupted ----------------------------------------------------------------------------------

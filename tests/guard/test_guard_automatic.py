@@ -375,6 +375,25 @@ def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None
         torch.testing.assert_close(others[name], values)
 
 
+def test_a_scaler_that_was_not_given_shows_in_the_ledger_alone(anchors: dict[str, Path]) -> None:
+    """As docs/guard.md says: the projection is the same whatever scale the task's gradient has."""
+    scale, found = 256.0, []
+    for told in (True, False):
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+        model, guard = automatic("aegis", anchors, **({"scaler": scaler} if told else {}))
+        optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+        for seed in range(3):
+            scaler.scale(task_loss(model, seed)).backward()
+            scaler.step(optimizer)
+            scaler.update()
+            optimizer.zero_grad()
+        found.append((vector(model), guard.ledger.tensors()))
+    (model, rows), (other, scaled) = found
+    torch.testing.assert_close(other, model)
+    for name, times in (("tt", scale**2), ("ta", scale), ("aa", 1.0)):
+        torch.testing.assert_close(scaled[name], rows[name] * times)
+
+
 # --- what else a loop does ------------------------------------------------------------------------
 
 
@@ -447,6 +466,26 @@ def test_a_batch_that_is_skipped(anchors: dict[str, Path]) -> None:
     guard.discard()
     plain_steps(model, 1)
     assert len(guard.ledger) == 1
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_after_a_loss_that_fails_the_next_pass_says_how_to_go_on(
+    backward: bool, anchors: dict[str, Path]
+) -> None:
+    """Outside the model's call: while it is computed, or before its backward pass comes there."""
+    expected, guard = automatic("aegis", anchors)
+    plain_steps(expected)
+    model, other = automatic("aegis", anchors)
+    FailsOnce.failed = not backward
+    scores = FailsOnce.apply(model(*batch(0)))
+    with pytest.raises(MemoryError if backward else RuntimeError):
+        (scores if backward else scores.view(-1, 7919)).square().mean().backward()
+    with pytest.raises(AegisError) as caught:
+        plain_steps(model)
+    assert "guard.discard()" in caught.value.fix
+    other.discard()
+    plain_steps(model)
+    assert torch.equal(vector(model), vector(expected)) and same_ledger(guard, other)
 
 
 def test_a_guard_that_is_removed_leaves_the_loop_alone(anchors: dict[str, Path]) -> None:

@@ -18,11 +18,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned
+from aegis_cli.continual import images
 from aegis_cli.continual.report import ImageStreamReport, TaskRecord, sums
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.data.streams import folders, mtil
 from aegis_cli.models.backbones import EMBEDDED_DUAL, clip, load_dual
 from aegis_cli.models.backbones.dual import class_weights
+from aegis_cli.recipes import StreamRecipe
 
 SIZE = 16
 CLASSES = ("red fox", "tabby cat", "zebra")
@@ -223,6 +226,42 @@ def test_a_folder_becomes_a_task(dataset: Path) -> None:
     )
     assert torch.equal(task.test.images(rows)[1], task.test.images(torch.tensor([11]))[0])
     assert task.test.labels.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+
+
+def told(encoder: Path, root: Path) -> list[str]:
+    """What a stream of the folder's task warns of before it trains."""
+    heard: list[Event] = []
+    where = {"encoder": str(encoder), "path": str(root)}
+    made = StreamRecipe(name="own", stream="own", order=("animals",), **where)
+    images.build(made, root.parent / "run", heard.append)
+    return [event.text for event in heard if isinstance(event, Warned)]
+
+
+@pytest.mark.parametrize("part", ["test", "validation"])
+def test_a_held_out_image_that_is_also_learned_from_is_told(
+    part: str, folder: Path, dataset: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(dataset, tmp_path / "copy")
+    assert not told(folder, root)
+    source = root / "animals" / "train" / "zebra" / "00.png"
+    copy = root / "animals" / part / "red_fox" / "copy.png"
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(source, copy)
+    (text,) = told(folder, root)
+    # 12 images to test on, and one or more to validate on
+    assert text.startswith("1 of the 1") and f"'{copy}' is '{source}'" in text
+
+
+def test_copies_of_training_images_that_are_held_back_are_told(
+    folder: Path, dataset: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(dataset, tmp_path / "copy")
+    source = root / "animals" / "train" / "zebra" / "00.png"
+    for number in range(40):
+        shutil.copy(source, source.with_name(f"copy{number}.png"))
+    held_back = len(folders.load(root, "animals", SIZE).validation)
+    (text,) = told(folder, root)
+    assert 1 <= int(text.split()[0]) <= held_back
 
 
 def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: Path) -> None:

@@ -197,6 +197,23 @@ def test_an_export_can_be_exported_again(exported: Path, tmp_path: Path) -> None
     assert one.read_bytes() == other.read_bytes()
 
 
+@pytest.mark.parametrize("form", [card.LEROBOT, card.AEGIS])
+def test_what_a_policy_learned_from_is_kept(
+    form: str, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which episodes, and of which data set on the hub; also by an export of the export."""
+    policy, meta = checkpoint.load_policy(run_folder)
+    learned = {"only": "0-3", "dataset": "lab/arm"}
+    with monkeypatch.context() as patch:
+        told = {**meta, **learned}
+        patch.setattr(checkpoint, "load_policy", lambda _: (policy, told))
+        export.run(run_folder, tmp_path / "first", form)
+    export.run(tmp_path / "first", tmp_path / "second", card.AEGIS)
+    for name in ("first", "second"):
+        _, kept = checkpoint.load_policy(tmp_path / name)
+        assert {key: kept.get(key) for key in learned} == learned
+
+
 def test_nothing_is_left_of_an_export_that_fails(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -265,6 +265,24 @@ def test_a_card_names_what_the_run_that_it_goes_on_from_began_with(
         assert yaml.safe_load(said.split("---\n", 2)[1])["base_model"] == name
 
 
+def test_a_card_names_no_run_that_others_do_not_have(
+    run_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also after a third run, and where the earlier ones are gone."""
+    shutil.copytree(run_folder, tmp_path / "runs" / "first", symlinks=True)
+    began = Path(recipes.load(run_folder / "recipe.yaml").backbone).name
+    monkeypatch.chdir(tmp_path)
+    for before, run in (("first", "second"), ("second", "third")):
+        started = small(f"runs/{before}", steps=1)
+        train.run(started, "naive", demos_file, None, Path("runs", run))
+        shutil.rmtree(Path("runs", before))
+        at, stored = checkpoint.last(Path("runs", run)), card.Stored("float32", rounded=False)
+        for form in FORMS:
+            said = card.text(Path("runs", run), at, form, REPO, stored)
+            assert f"model `{began}` (which Aegis had fine-tuned before) and" in said
+            assert f"--baseline {began} " in said and "runs/" not in said
+
+
 def test_a_card_of_an_unmeasured_checkpoint_says_so(run_folder: Path) -> None:
     bare = results.probes(run_folder)
     assert bare  # so that the run itself has figures

@@ -47,3 +47,11 @@ def test_nobody_is_told_where_the_backbone_lies() -> None:
     assert "model `vlm` as" in said and "--baseline vlm\n" in said and "/home" not in said
     said = card.text(Recipe("x", backbone="org/vlm"), method, 3, data, INPUTS, ledger)
     assert "model `org/vlm` as" in said
+
+
+def test_a_card_names_the_model_before_and_not_the_run_that_had_it() -> None:
+    method, data, ledger = methods.get("naive"), card.Data(None, (), 1, 1), Ledger([], [])
+    recipe = Recipe("x", backbone="runs/first")
+    said = card.text(recipe, method, 3, data, INPUTS, ledger, began_as="org/vlm")
+    assert "model `org/vlm` (which Aegis had fine-tuned before) as" in said
+    assert "--baseline org/vlm\n" in said and "runs/" not in said

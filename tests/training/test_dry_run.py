@@ -196,6 +196,33 @@ def test_a_dry_run_tells_the_steps_that_it_takes(
     assert [e.done for e in told] == list(range(told[0].total + 1))
 
 
+def test_a_dry_run_tells_what_it_does_before_its_first_step(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a pipe nothing else would: a large model takes minutes to load, and to pass a frame."""
+    told: list[str] = []
+
+    def noted(stage: Callable[..., Any], name: str) -> Callable[..., Any]:
+        return lambda *given: told.append(name) or stage(*given)
+
+    def heard(event: Event) -> None:
+        if isinstance(event, Progress):
+            told.append(f"{event.stage} {event.done}/{event.total}")
+
+    monkeypatch.setattr(dry_run.assemble, "build", noted(dry_run.assemble.build, "build"))
+    monkeypatch.setattr(dry_run, "_pass_some", noted(dry_run._pass_some, "pass"))
+    dry_run.run(small(tiny_folder), "naive", demos_file, None, tmp_path / "out", on_event=heard)
+    assert told[:7] == [
+        "dry run (loading) 0/1",
+        "build",
+        "dry run (loading) 1/1",
+        "dry run (memory) 0/2",
+        "pass",
+        "dry run (memory) 1/2",
+        "pass",
+    ]
+
+
 def test_hours_are_those_of_the_steps_that_are_left(
     tiny_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:

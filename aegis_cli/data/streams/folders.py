@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,8 +58,7 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
     """
     folder = Path(root) / name
     classes, listed = _parts(folder)
-    if "validation" not in listed:
-        listed["train"], listed["validation"] = _held_back(listed["train"], folder)
+    listed = _split(folder, listed)
     words = _words(folder, classes)
     if (folder / TEMPLATES).is_file():
         templates = _sentences(folder / TEMPLATES)
@@ -84,6 +83,28 @@ def contents(folder: Path) -> dict[str, object]:
         digests = list(pool.map(sha256_file, used))
     names = [path.relative_to(folder).as_posix() for path in used]
     return {"classes": classes, "files": dict(zip(names, digests, strict=True))}
+
+
+def shared(folder: Path, digests: Mapping[str, str]) -> tuple[list[tuple[str, str]], int]:
+    """The held-out images of a task that are, byte for byte, also in a part that comes before.
+
+    Args:
+        digests: of the files, by their names, as `contents` has them.
+
+    Returns:
+        Their names, each with that of an earlier part's; and how many images are held out.
+    """
+    listed = _split(folder, _parts(folder)[1])
+    known: dict[str, str] = {}  # of each digest, the first file
+    total, found = 0, list[tuple[str, str]]()
+    for part in ("train", "validation", "test"):
+        names = [file.relative_to(folder).as_posix() for file in listed[part].files]
+        if part != "train":
+            total += len(names)
+            found += [(name, known[digests[name]]) for name in names if digests[name] in known]
+        for name in names:
+            known.setdefault(digests[name], name)
+    return found, total
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:
@@ -138,6 +159,14 @@ def _visible_folders(folder: Path) -> list[str]:
     """Names of the folders in it, without hidden ones, in alphabetical order."""
     names = [path.name for path in folder.iterdir() if path.is_dir()]
     return sorted(name for name in names if not name.startswith("."))
+
+
+def _split(folder: Path, listed: Mapping[str, Listing]) -> dict[str, Listing]:
+    """The same parts; without images for validation, some of training's are held back."""
+    if "validation" in listed:
+        return dict(listed)
+    train, validation = _held_back(listed["train"], folder)
+    return {**listed, "train": train, "validation": validation}
 
 
 def _class_folders(train: Path) -> list[str]:

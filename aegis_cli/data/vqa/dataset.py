@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from aegis_cli.common import gl
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.common.processes import mapped
 from aegis_cli.data.vqa.questions import FAMILIES, Balancer, Question, cell_labels
 
@@ -107,7 +109,12 @@ class Rendered(NamedTuple):
 def render_training(
     seed: int, scenes: int, workers: int = 2, on_event: OnEvent = ignore
 ) -> Rendered:
-    """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each."""
+    """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each.
+
+    Raises:
+        AegisError: more of them than are drawn.
+    """
+    _check_count(scenes, "scenes")
     gl.check()
     # Chunks of one size, whatever the workers: the balance of answers is kept within a chunk.
     jobs = [
@@ -131,7 +138,11 @@ def load_scenes(
 
     A scene is asked at most one question of each family. The first scenes that fill the quotas are
     used: a shorter set's scenes are among a longer one's, in their order.
+
+    Raises:
+        AegisError: more of them than are drawn.
     """
+    _check_count(questions, "questions about scenes")
     gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
     for family in FAMILIES[: questions % len(FAMILIES)]:
@@ -157,6 +168,12 @@ def load_scenes(
                     kept += wanted
         on_event(Progress("render", questions - missing.total(), questions, "questions"))
     return VQASet(np.stack(images), np.array(image_of), tuple(kept))
+
+
+def _check_count(count: int, what: str) -> None:
+    """Raise AegisError for so many that they would be drawn without an end."""
+    if count > MOST_MADE:
+        raise AegisError(f"{count:,} {what}", f"at most {MOST_MADE:,}", "ask for fewer")
 
 
 _Job = tuple[int, str, int, int, dict[str, int]]

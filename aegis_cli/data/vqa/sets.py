@@ -19,12 +19,12 @@ from torch import Tensor
 
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import sha256_file, sha256_value
-from aegis_cli.data.vqa import download, easy, jsonl, official, saved
+from aegis_cli.data.vqa import download, easy, equal_files, jsonl, official, saved
 from aegis_cli.data.vqa.dataset import VQASet, digest_of, load_scenes
 from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
-from aegis_cli.data.vqa.images import Pictures, decode
+from aegis_cli.data.vqa.images import Picture, Pictures, decode
 
 SCENES = "scenes"
 PLAIN = "{}"  # a question is asked as it is
@@ -35,6 +35,15 @@ PARTS: dict[str, range] = {
     "train": range(4),
     "validation": range(4, 5),
     "probe": range(5, 10),
+}
+
+
+# What a part must not share an image with: the parts that are used before it.
+_EARLIER: dict[str, tuple[str, ...]] = {
+    "anchor": (),
+    "train": (),
+    "validation": ("anchor", "train"),
+    "probe": ("anchor", "train", "validation"),
 }
 
 
@@ -138,11 +147,27 @@ class Listed:
             raise self._nothing(part, len(by_image), skipped)
         if count < questions:  # some were left out, and the progress has not reached its end
             on_event(Progress("questions", count, count, "questions"))
+        self._warn_of_shared(part, [own[0].picture for own in kept], on_event)
         return _assemble(kept, skipped).asked(self.ask)
 
     def holds(self, part: str, key: str) -> bool:
         """Whether an image belongs to a part."""
         return share(key) in PARTS[part]
+
+    def _warn_of_shared(self, part: str, chosen: Sequence[Picture], on_event: OnEvent) -> None:
+        """Warn of held-out images that lie under another name in a part that is learned from."""
+        earlier = _EARLIER[part]
+        others = {e.picture.key: e.picture for e in self.entries} if earlier else {}
+        learned = [p for key, p in others.items() if any(self.holds(of, key) for of in earlier)]
+        if found := equal_files.shared(chosen, learned, on_event):
+            (one, other), *_ = found
+            text = (
+                f"{len(found)} of the {len(chosen)} images of '{self.name}' that are asked about "
+                f"are also among those for anchors, training or tuning, byte for byte under "
+                f"another name: '{one.key}' is '{other.key}'. An anchor or a training on the same "
+                "set knows them; let all questions about a picture name one file"
+            )
+            on_event(Warned("questions", text))
 
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
         """The questions about one image that can be asked.

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -225,6 +226,16 @@ def test_quotas(questions: int) -> None:
     counts = Counter(q.family for q in made.questions)
     assert len(made.questions) == questions == counts.total()
     assert max(counts.values()) - min(counts[family] for family in FAMILIES) <= 1
+
+
+@pytest.mark.parametrize(
+    "draw", [lambda count: load_scenes("probe", count), lambda count: render_training(0, count)]
+)
+def test_more_scenes_than_anybody_waits_for_are_refused_before_the_first(
+    draw: Callable[[int], object],
+) -> None:
+    with pytest.raises(AegisError, match="at most 10,000,000"):
+        draw(10**12)
 
 
 def test_image_of_points_at_the_scene_that_was_asked_about() -> None:

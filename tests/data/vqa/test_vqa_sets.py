@@ -33,8 +33,10 @@ from samples.vqa_files import (
 
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Warned, ignore
+from aegis_cli.common.files import sha256_file
 from aegis_cli.data.batch import Asked, Share
-from aegis_cli.data.vqa import images, sets
+from aegis_cli.data.vqa import equal_files, images, sets
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
 from aegis_cli.data.vqa.metrics import grade
@@ -335,6 +337,74 @@ def test_no_image_serves_two_purposes(lines: Path) -> None:
     assert {name for name, _ in asked_about(source.choose("train", 1000, 3))} == chosen[
         0
     ]  # what co-training may see
+
+
+def copied_across(folder: Path, part: str, of: str) -> tuple[Path, str, str]:
+    """Questions whose last image is a copy, in `part`, of an image of another part, `of`."""
+    path = write_jsonl(folder, IMAGES)
+    source = next(name for name in NAMES if sets.share(name) in sets.PARTS[of])
+    copy = next(
+        name
+        for name in (f"images/copy{i}.png" for i in range(100))
+        if sets.share(name) in sets.PARTS[part]
+    )
+    (folder / copy).write_bytes((folder / source).read_bytes())
+    with path.open("a") as lines:
+        lines.write(json.dumps(row(copy)) + "\n")
+    return path, source, copy
+
+
+@pytest.mark.parametrize(
+    ("part", "of"), [("probe", "anchor"), ("probe", "validation"), ("validation", "anchor")]
+)
+def test_a_held_out_picture_under_another_name_among_those_to_learn_from_is_told(
+    part: str, of: str, tmp_path: Path
+) -> None:
+    path, source, copy = copied_across(tmp_path, part, of)
+    heard: list[Event] = []
+    asked = sets.read(str(path)).choose(part, 1000, 0, on_event=heard.append)
+    (told,) = [event.text for event in heard if isinstance(event, Warned)]
+    assert told.startswith(f"1 of the {len(asked.images)} images of 'set.jsonl'")
+    assert f"'{copy}' is '{source}'" in told
+
+
+@pytest.mark.parametrize(("part", "of"), [("anchor", "probe"), ("probe", "probe")])
+def test_pictures_under_two_names_that_no_figure_relies_on_are_not_told(
+    part: str, of: str, tmp_path: Path
+) -> None:
+    """What is learned from is told of by the probe; one part may hold a picture twice."""
+    path, *_ = copied_across(tmp_path, part, of)
+    heard: list[Event] = []
+    sets.read(str(path)).choose(part, 1000, 0, on_event=heard.append)
+    assert not [event for event in heard if isinstance(event, Warned)]
+
+
+def test_only_files_of_one_size_and_one_end_are_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contents = {
+        "a": b"x" * 9000,
+        "b": b"y" + b"x" * 8999,  # another beginning
+        "c": b"x" * 8999 + b"y",  # another end
+        "d": b"x" * 9001,  # another size
+        "e": b"x" * 9000,
+    }
+    shown = {}
+    for name, data in contents.items():
+        (tmp_path / name).write_bytes(data)
+        shown[name] = Picture(name, name, tmp_path / name)
+    shown["gone"] = Picture("gone", "gone", tmp_path / "gone")
+    shown["row"] = Picture("row", "row", lambda: b"x" * 9000)
+    read: list[str] = []
+
+    def sha256(path: Path) -> str:
+        read.append(path.name)
+        return sha256_file(path)
+
+    monkeypatch.setattr(equal_files, "sha256_file", sha256)
+    held_out, others = [shown["a"], shown["c"]], [shown[n] for n in ("gone", "row", "b", "d", "e")]
+    assert equal_files.shared(held_out, others, ignore) == [(shown["a"], shown["e"])]
+    assert read == ["a", "b", "e"]
 
 
 def test_parts_have_the_shares_that_are_told() -> None:
