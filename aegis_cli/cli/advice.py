@@ -56,10 +56,12 @@ def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
         of_questions(recipe.backbone, *_asked(recipe))
         return
     if isinstance(recipe, RobotStreamStudyRecipe):
+        # No variant may set the backbone or the probe, so that any cell stands for all.
         name, first = next(iter(recipe.variants.items()))
         asked = cell(recipe, name, recipe.tasks, recipe.seeds[0], first.values[0])
         of_questions(asked.backbone, asked.probe.only_set)
         return
+    # Here a variant may have an anchor of its own. Tasks and seeds ask the same.
     place, seed = recipe.tasks[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():
         one = cell(recipe, name, place, seed, variant.values[0])
@@ -94,7 +96,7 @@ def of_settings(
 def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[str]:
     train = recipe.train
     if train.warmup >= train.steps:
-        share = 100 * train.steps / train.warmup
+        share = 100 * train.steps / train.warmup  # the rise is linear
         yield (
             f"train.warmup: {train.warmup} with train.steps: {train.steps}: the learning rates end "
             f"at {share:.3g} % of their peaks, where the rise ends, and never fall. Set "
@@ -104,9 +106,10 @@ def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[
 
 def _of_unread(overrides: Sequence[str], methods: Sequence[str]) -> Iterator[str]:
     """Options of methods that are not trained, and the rate of a backbone that does not learn."""
-    own = {method.replace("-", "_") for method in methods}
+    own = {method.replace("-", "_") for method in methods}  # the sections that they read
     named = " and ".join(methods)
-    for dotted in (each.partition("=")[0].strip() for each in overrides):
+    for override in overrides:
+        dotted = override.partition("=")[0].strip()
         section = dotted.partition(".")[0]
         frozen = dotted == "train.backbone_lr" and set(methods) == {"stop-gradient"}
         if frozen or (section in SECTIONS and section not in own):
@@ -130,10 +133,11 @@ def _asked(recipe: Recipe) -> Iterator[str | None]:
 
 def _trained_on(recipe: Recipe) -> str | None:
     """The questions of a method that trains on some."""
-    from aegis_cli import methods
+    from aegis_cli import methods  # with it comes torch
 
     own = options(recipe)
-    return own["vqa"] if methods.get(recipe.train.method).trains_on_questions(own) else None
+    trains_on_some = methods.get(recipe.train.method).trains_on_questions(own)
+    return own["vqa"] if trains_on_some else None
 
 
 def _measured_on(anchor: Path | None) -> str | None:

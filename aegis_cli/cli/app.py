@@ -287,21 +287,10 @@ def anchor(
     Example: aegis anchor --samples 3000 --out anchor.safetensors
     Example: aegis anchor --demos reach.safetensors --out robot-anchor.safetensors
     """
-    of_demos = {
-        "--camera": (camera, "demonstrations to choose a camera of"),
-        "--only": (only, "demonstrations to choose episodes of"),
-        "--rename": (rename, "demonstrations with names of their own"),
-    }
-    for option, (value, wanted) in of_demos.items():
-        if demos is None and value:
-            fix = f"give the LeRobot folder as --demos, or leave {option} out"
-            raise AegisError(f"{option} without --demos", wanted, fix)
-    chosen = given(ctx)
-    if demos is not None and (unused := {"--vqa", "--ask", "--skip-bad"} & set(chosen)):
-        found = f"{', '.join(sorted(unused))} with --demos"
-        raise AegisError(found, "questions or robot frames", "leave one of them out")
+    chosen = set(given(ctx))
+    _check_frames_or_questions(demos is not None, chosen)
     if demos is not None and "--parts" not in chosen:
-        parts = "moments"
+        parts = "moments"  # the option's default asks for parts that need answers
     settings = read_anchor(
         {
             "source": "questions" if demos is None else "demos",
@@ -322,16 +311,45 @@ def anchor(
     )
     if demos is None:
         advice.of_questions(backbone, vqa)
-    cameras = None if not camera else camera[0] if len(camera) == 1 else tuple(camera)
     stages.ANCHOR.run(
         backbone,
         settings,
         out,
         demos=demos,
-        selection=Selection(cameras, only, rename=renaming(rename)),
+        selection=Selection(_cameras(camera), only, rename=renaming(rename)),
         device=device,
         as_json=as_json,
     )
+
+
+# What means nothing where an anchor is measured on questions, and what it would need instead.
+_OF_FRAMES = {
+    "--camera": "demonstrations to choose a camera of",
+    "--only": "demonstrations to choose episodes of",
+    "--rename": "demonstrations with names of their own",
+}
+_OF_QUESTIONS = {"--vqa", "--ask", "--skip-bad"}
+
+
+def _check_frames_or_questions(reads_frames: bool, chosen: set[str]) -> None:
+    """Raise AegisError for options of `anchor` that are not of what it is measured on."""
+    if reads_frames:
+        unused = _OF_QUESTIONS & chosen
+        if unused:
+            found = f"{', '.join(sorted(unused))} with --demos"
+            raise AegisError(found, "questions or robot frames", "leave one of them out")
+        return
+    for option, wanted in _OF_FRAMES.items():
+        if option in chosen:
+            fix = f"give the LeRobot folder as --demos, or leave {option} out"
+            raise AegisError(f"{option} without --demos", wanted, fix)
+
+
+def _cameras(names: list[str] | None) -> str | tuple[str, ...] | None:
+    """Cameras as a recipe's `demos.camera` has them: none, one by its name, or several."""
+    if not names:
+        return None
+    return names[0] if len(names) == 1 else tuple(names)
 
 
 @app.command(short_help="Fine-tune a backbone on demonstrations, or on a stream.")
@@ -391,13 +409,16 @@ def train(
     run = recipe if recipe.is_dir() else None
     if run is not None:
         recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
+    # Last, so that --method also wins against a --set train.method.
     chosen = [f"train.method={method}"] if method is not None else []
-    resolved = load_training(recipe, (overrides or []) + chosen)  # a path may be mistyped
+    # Before a missing --out is told of: the recipe's path may be the one that is mistyped.
+    resolved = load_training(recipe, (overrides or []) + chosen)
     if out is None:
         fix = commands.aegis("train", recipe, "--out", "runs/NAME")
         raise AegisError("no --out", "a folder for the run", fix)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
+    # Where the command is ended by a signal, exits.py asks what goes on with the run (GOES_ON).
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
@@ -415,6 +436,8 @@ def train(
     if not dry_run:
         ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, paths, anchor, as_they_are)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
+    # The gate is told inside the block and ends the process outside: one that ends with another
+    # code than 0 takes the others down, which may not have finished their writing.
     with stages.joined(device):
         report = stage.run(
             resolved,
@@ -434,13 +457,12 @@ def train(
 
 def _kept_options(ctx: typer.Context, device: str | None, as_json: bool) -> list[str]:
     """What a command that goes on with the run has of this one, word by word."""
-    source = ctx.get_parameter_source("device")  # a class of typer's own click, or of click
-    given_here = source is not None and source.name == "COMMANDLINE"
-    kept = ["--device", str(device)] if given_here else []
+    # Not a device from AEGIS_DEVICE, which the next command finds there too.
+    kept = ["--device", str(device)] if "--device" in given(ctx) else []
     return kept + (["--json"] if as_json else [])
 
 
-def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Paths, Recipe]:
+def _learned_from(recipe: Recipe, file: Path, demos: Sequence[Path]) -> tuple[Paths, Recipe]:
     """The demonstrations of a training, and its recipe, which names these and no others.
 
     Several that are given stand in the recipe in any case: that tells what the run was trained on.
@@ -449,7 +471,7 @@ def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Pa
         AegisError: neither the command nor the recipe names any.
     """
     named = recipe.demos.path
-    if not given:
+    if not demos:
         if named is None:
             raise AegisError(
                 f"no --demos for '{file}', which names none as demos.path",
@@ -457,8 +479,8 @@ def _learned_from(recipe: Recipe, file: Path, given: Sequence[Path]) -> tuple[Pa
                 "record some with aegis demos, and give them as --demos",
             )
         return _paths(named), recipe
-    told = str(given[0]) if len(given) == 1 else tuple(map(str, given))
-    if named is not None or len(given) > 1:
+    told = str(demos[0]) if len(demos) == 1 else tuple(map(str, demos))
+    if named is not None or len(demos) > 1:
         recipe = replace(recipe, demos=replace(recipe.demos, path=told))
     return _paths(told), recipe
 
@@ -587,6 +609,7 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, gate, out, plot)
+    # A sweep is judged on questions whatever the method; a single merge only measures curvature.
     asks_nothing = strength is not None and (method == "linear" or anchor is not None)
     if asks_nothing and vqa is not None:
         reason = "--method linear" if method == "linear" else "--anchor"
@@ -616,7 +639,7 @@ def merge(
         settings,
         out,
         strength,
-        numbers(sweep),
+        numbers(sweep),  # none without --sweep: the stage takes the method's grid
         max_drop,
         gate=(gate or Gate.mean).value,
         device=device,
@@ -743,15 +766,7 @@ def probe(
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
         if launch.rank() == 0:
             render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
-    if max_drop is None and gate is not None:
-        expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
-        fix = "add --max-drop POINTS, or leave --gate out"
-        raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
-    if baseline is None and (max_drop is not None or anchor is not None):
-        baseline = question_sets.baseline(target, anchor)
-    if max_drop is not None and baseline is None:
-        expected = "something to measure the drop against"
-        raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    baseline = _drop_against(target, baseline, anchor, max_drop, gate)
     gate = Gate(asks.gate) if gate is None else gate
     advice.of_questions(target, asks.only_set)
     with stages.joined(device):
@@ -780,6 +795,31 @@ def probe(
     _end_at_gate(failed)
 
 
+def _drop_against(
+    target: str,
+    baseline: str | None,
+    anchor: Path | None,
+    max_drop: float | None,
+    gate: Gate | None,
+) -> str | None:
+    """What a probe's drop is measured against; None where no drop is asked for.
+
+    Raises:
+        AegisError: a gate without a limit, or a limit with nothing to measure the drop against.
+    """
+    if max_drop is None and gate is not None:
+        expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
+        fix = "add --max-drop POINTS, or leave --gate out"
+        raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
+    # An anchor tells the drift of what was fine-tuned, beside that of the model it began from.
+    if baseline is None and (max_drop is not None or anchor is not None):
+        baseline = question_sets.baseline(target, anchor)
+    if max_drop is not None and baseline is None:
+        expected = "something to measure the drop against"
+        raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+    return baseline
+
+
 def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
     """A probe's drop in words, by what of it the gate limits."""
     if gate is not Gate.upper_end:
@@ -790,7 +830,8 @@ def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
 
 def _beyond(points: float, max_drop: float) -> str:
     """Points in two digits after the point, or in as many as show that they are past the limit."""
-    return f"{points:.{deciding_decimals(points, f'<= {max_drop!r}', 2)}f}"
+    decimals = deciding_decimals(points, f"<= {max_drop!r}", 2)
+    return f"{points:.{decimals}f}"
 
 
 @app.command(short_help="Say what a file, recipe, run, study or dataset is.")
@@ -836,6 +877,7 @@ def inspect(
     Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
+    # Before anything is shown: of a damaged file nothing else is told.
     verified = inspecting.verify(path) if verify else None
     inspecting.show(path, plot, as_json, tensors, wide, verified)
 
@@ -980,11 +1022,10 @@ def rollout(
     Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
     Example: aegis rollout runs/x --delay 2
     """
-    from aegis_cli.deploy import load_acting
-
     if guided and delay is None:
         expected = "a delay, in which the chunk goes on that the next one continues"
         raise AegisError("--guided without --delay", expected, "add --delay STEPS, such as 0")
+    from aegis_cli.deploy import load_acting  # with it comes torch
 
     stages.ROLLOUT.run(
         run,
@@ -992,7 +1033,7 @@ def rollout(
         episodes,
         colors.value,
         video,
-        load=load_acting,
+        load=load_acting,  # `deploy` may import `evaluation`, not the other way round
         seed=seed,
         keep=True,
         ensemble=ensemble,
@@ -1048,7 +1089,7 @@ def evaluate(
     Example: aegis evaluate runs/x --plot actions.png
     Example: aegis evaluate runs/x --demos datasets/arm --episodes 40-49
     """
-    if plot is not None:
+    if plot is not None:  # before the work, which takes minutes
         render.check_plot(plot)
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
@@ -1059,7 +1100,7 @@ def evaluate(
         frames,
         seed,
         batch_size,
-        plot is not None,
+        plot is not None,  # traces of some episodes are kept for a plot alone
         keep=True,
         rename=renaming(rename),
         device=device,
@@ -1113,13 +1154,15 @@ def serve(
     """
     from aegis_cli import serving
 
-    serving.require()
+    serving.require()  # before the import below, which needs the extra's package
     from aegis_cli.serving import server
 
     def listening(report: Any) -> None:
+        """Show where the server listens, at once: whoever waits for it may read a pipe."""
         render.show(report, render.serving, as_json)
         sys.stdout.flush()
 
+    # Not as a `Stage`, which shows its report at its end: a server has one at its beginning.
     with stages.computing_on(device):
         server.run(run, task, host, port, prompt, seed, precision, listening, ensemble)
 
@@ -1257,7 +1300,7 @@ def run(
     Example: aegis run recipes/igsp-compare.yaml
     """
     resolved = load_run(recipe, overrides or [])
-    one_run = isinstance(resolved, Recipe)
+    one_run = isinstance(resolved, Recipe)  # else a study, of several seeds
     if one_run and workers > 1:
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
@@ -1272,7 +1315,9 @@ def run(
         _end_at_gate(failed)
         return
     stage = stages.RUN[type(resolved)]
-    options = {"overwrite": overwrite} | ({} if one_run else {"workers": workers})
+    options: dict[str, Any] = {"overwrite": overwrite}
+    if not one_run:
+        options["workers"] = workers
     with stages.joined(device) if stage.shared else nullcontext():
         report = stage.run(resolved, out, **options, device=device, wide=wide, as_json=as_json)
         if launch.rank() == 0:
@@ -1282,7 +1327,7 @@ def run(
             limit, gate = f"probe.max_drop {resolved.probe.max_drop:g}", Gate(resolved.probe.gate)
             failed = f"{', '.join(report.gate_failed)} dropped {_past(limit, gate)}"
         _say_gate(failed)
-    _end_at_gate(failed)
+    _end_at_gate(failed)  # after the block, as in `train`
 
 
 def _save_tables(resolved: Any, report: Any, stage: stages.Stage) -> None:
@@ -1290,7 +1335,15 @@ def _save_tables(resolved: Any, report: Any, stage: stages.Stage) -> None:
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
-    reporting.write_of(Path(report.out))
+    reporting.write_of(Path(report.out))  # last: the page is made of what lies there
+
+
+def _save_frontier(report: Any) -> None:
+    """Draw a study's frontier beside its table, or say why there is none."""
+    if render.has_frontier(report):
+        render.frontier_plot(report, Path(report.out) / "frontier.png")
+    else:
+        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 @app.command(short_help="Compare the methods' step times and peak memory.")
@@ -1350,6 +1403,8 @@ def bench(
     Example: aegis bench --latency runs/x
     Example: aegis bench --shape smolvlm2-256m --methods aegis,kfac --batch-size 8
     """
+    # The defaults of --batch-size and --repeats differ with what is timed, so that they are
+    # decided here.
     options = set(given(ctx))
     if latency is not None:
         unused = {"--backbone", "--batch-size", "--shape", "--methods", "--set"}
@@ -1367,7 +1422,7 @@ def bench(
             as_json=as_json,
         )
     else:
-        from aegis_cli.guard import Guard
+        from aegis_cli.guard import Guard  # with it comes torch
 
         stages.BENCH.run(
             backbone,
@@ -1412,6 +1467,7 @@ def recipes(
     Example: aegis recipes show quickstart
     Example: aegis recipes cp quickstart mine.yaml
     """
+    # `ls` takes no word, `show` one; arguments come in order, so that one too many is the last.
     unused = out if action is RecipeAction.show else name
     if action is not RecipeAction.cp and unused is not None:
         fix = f"aegis recipes cp {name} {out or ''}".rstrip()
@@ -1430,7 +1486,7 @@ def recipes(
     if out.exists():
         raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
     files.write_text(out, text)
-    if as_json:
+    if as_json:  # the note below is what a reader is told
         render.show(shipped.Copied(name, str(out)), render.facts, as_json)
     render.note(f"copied {name} to {out}")
 
@@ -1476,14 +1532,6 @@ def _end_at_gate(failed: str | None) -> None:
     """End with exit code 1 if a gate failed."""
     if failed is not None:
         raise typer.Exit(1)
-
-
-def _save_frontier(report: Any) -> None:
-    """Draw a study's frontier beside its table, or say why there is none."""
-    if render.has_frontier(report):
-        render.frontier_plot(report, Path(report.out) / "frontier.png")
-    else:
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
 
 
 def main() -> None:

@@ -80,6 +80,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
         *_extras(),
     ]
     if self_test:
+        # Without the extra there is nothing to try; the line above has said so.
         if not any(_version(name) is None for name in _required("hf")):
             checks.append(_attempt("hugging face", _hugging_face, "pip install -U 'aegis-vla[hf]'"))
         checks.append(_attempt("self-test", lambda: _self_test(on_event), ""))
@@ -105,7 +106,7 @@ def _packages() -> Iterator[Check]:
         version = _version(name)
         if version is None:
             yield Check(name, FAILED, "not installed", f"pip install {name}")
-        elif name != "torch":
+        elif name != "torch":  # it has a line of its own, with where it computes
             yield Check(name, OK, version)
 
 
@@ -114,23 +115,25 @@ def _extras() -> Iterator[Check]:
     extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
     for extra in extras:
         needed = _required(extra)
-        if extra in ("test", "docs", "lint") or not needed:
+        if extra in ("test", "docs", "lint") or not needed:  # for those who work on Aegis itself
             continue
         lacking = sorted(name for name in needed if _version(name) is None)
-        install = f"pip install '{DISTRIBUTION}[{extra}]'"
         if lacking:
+            install = f"pip install '{DISTRIBUTION}[{extra}]'"
             yield Check(f"[{extra}]", MISSING, f"without {', '.join(lacking)}", install)
         else:
-            yield Check(f"[{extra}]", OK, ", ".join(f"{n} {_version(n)}" for n in sorted(needed)))
+            versions = [f"{name} {_version(name)}" for name in sorted(needed)]
+            yield Check(f"[{extra}]", OK, ", ".join(versions))
 
 
 def _required(extra: str | None) -> set[str]:
     """Names of the packages that an extra brings; of None, those that are always needed."""
     found = set()
-    for line in importlib.metadata.requires(DISTRIBUTION) or []:
+    for line in importlib.metadata.requires(DISTRIBUTION) or []:  # av>=15; extra == "lerobot"
         name = re.match(r"[A-Za-z0-9._-]+", line)
         marker = re.search(r"extra *== *['\"]([^'\"]+)", line)
-        if name and (marker.group(1) if marker else None) == extra:
+        of_extra = marker.group(1) if marker else None
+        if name and of_extra == extra:
             found.add(name.group())
     return found
 
@@ -186,6 +189,7 @@ def _hugging_face() -> str:
     images = torch.zeros(1, 32, 32, 3, dtype=torch.uint8)
     with torch.enable_grad():
         encoding = backbone.encode(backbone.prepare(images, ["reach the red disc"]))
+        # The gradient of the last layer's keys and values reaches every layer below it.
         keys, values = encoding.keys_values[-1]
         (keys.sum() + values.sum()).backward()
     learned = sum(p.grad is not None for p in backbone.parameters())

@@ -35,12 +35,13 @@ class Commands(TyperGroup):
     """The commands, in the order of the pipeline, and what becomes of their errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        ctx.meta["aegis.args"] = list(args)
+        ctx.meta["aegis.args"] = list(args)  # as they were typed; click takes its own list apart
         try:
             return super().parse_args(ctx, args)
         except OSError as error:  # of --help, whose output may be a full disk
             raise typer.Exit(ended_by(error)) from None
         except Exception as error:
+            # A usage error of click's, or of the click that typer brings along.
             if hasattr(error, "show"):
                 raise typer.Exit(_misused(error)) from None
             raise
@@ -50,7 +51,7 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         found = super().resolve_command(ctx, args)
-        if not ctx.resilient_parsing:
+        if not ctx.resilient_parsing:  # else a shell asks how a word goes on
             _, command, rest = found
             _check_each_once(command, ctx, rest)
         return found
@@ -67,8 +68,8 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             _say(render.note, f"{_ended(number)}; {_what_now(ctx.meta)}")
-            raise typer.Exit(128 + number) from None
-        except (typer.Exit, typer.Abort):
+            raise typer.Exit(128 + number) from None  # as a shell says it of a signal
+        except (typer.Exit, typer.Abort):  # they have a code already, such as a failed gate's
             raise
         except Exception as error:
             if hasattr(error, "show"):
@@ -95,7 +96,7 @@ def _check_each_once(command: Any, ctx: Any, args: Sequence[str]) -> None:
     given = set[str]()
     for option in order:
         single = option.param_type_name == "option" and option.nargs == 1 and not option.multiple
-        if not single or getattr(option, "is_flag", False):
+        if not single or getattr(option, "is_flag", False):  # a flag says the same twice
             continue
         if option.name in given:
             name = max(option.opts, key=len)
@@ -114,7 +115,7 @@ def _misused(error: Any) -> int:
 
 def ended_by(error: OSError) -> int:
     """Tell what the system would not do; the exit code."""
-    if error.errno == errno.EPIPE:
+    if error.errno == errno.EPIPE:  # as after `| head`: whoever read has what he wanted
         _close_output()
         return 128 + signal.SIGPIPE
     _say(render.error, _too_large(error) if error.errno == errno.ENOMEM else _refused(error))
@@ -134,6 +135,7 @@ def _close_output() -> None:
             try:
                 stream.flush()
             except OSError:
+                # The descriptor is exchanged, since the stream still holds what it could not write.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -148,7 +150,7 @@ def _say(show: Callable[[Any], None], what: Any) -> None:
     if isinstance(what, PeerLost):
         time.sleep(_LOST_S)
     elif launch.rank() > 0:
-        if show is render.note:
+        if show is render.note:  # a signal reaches all, and the first one says so
             return
         time.sleep(_OWN_S)
     with contextlib.suppress(OSError, ValueError):  # a ValueError is of a file that was closed
@@ -190,7 +192,7 @@ def _refused(error: OSError) -> AegisError:
 
     Examples are a name too long, or a folder that may not be looked into.
     """
-    if error.filename == render.STDOUT:
+    if error.filename == render.STDOUT:  # as `render.name_errors` has it
         return AegisError(
             f"{render.STDOUT} cannot be written: {error.strerror}",
             "an output that takes what the command says",
@@ -209,7 +211,7 @@ def _ended(number: int) -> str:
 def _what_now(meta: Mapping[str, Any]) -> str:
     """What a command has left that was ended, and how its work goes on, or begins again."""
     args = meta["aegis.args"]
-    if args[0] == "serve":
+    if args[0] == "serve":  # Ctrl-C is its usual end
         return "the server is closed"
     flag = _WITH_RESUME.get(args[0])
     if flag is None or "--dry-run" in args:
@@ -219,7 +221,9 @@ def _what_now(meta: Mapping[str, Any]) -> str:
     if alone is not None:
         return f"resume with: {_program()} {shlex.join(alone)}"
     args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
-    command = f"{_program()} {shlex.join(args)}" + ("" if flag.strip() in args else flag)
+    command = f"{_program()} {shlex.join(args)}"
+    if flag.strip() not in args:
+        command += flag
     return f"resume with: {command}"
 
 

@@ -13,7 +13,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, describe, shipped, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
-_CELLS = "cells.json"
+# What `aegis run` leaves in a study's folder; the modules that write it need torch.
+_TABLE, _CELLS = "table.json", "cells.json"
 _RECIPES = (".yaml", ".yml")
 _LISTED = 3  # files that a note names
 
@@ -45,9 +46,9 @@ def show(
     """
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
-    elif path.name.endswith(_CELLS) and path.is_file():
+    elif path.name.endswith(_CELLS) and path.is_file():  # NAME.cells.json too, as those that ship
         _cells(path, plot, as_json, wide)
-    elif (path / "table.json").is_file() or (path / "cells.json").is_file():
+    elif (path / _TABLE).is_file() or (path / _CELLS).is_file():
         _table(path, plot, as_json, wide)
     else:
         _anything(path, plot, as_json, tensors, wide, verified)
@@ -74,12 +75,12 @@ def verify(path: Path) -> VerifiedReport:
     found = inspection.verify(path)
     bare = [str(file) for file, has_digest in found.items() if not has_digest]
     agreeing = len(found) - len(bare)
-    one = agreeing == 1
-    render.note(
-        f"{agreeing} {'file agrees with its digest' if one else 'files agree with their digests'}"
-    )
+    said = "file agrees with its digest" if agreeing == 1 else "files agree with their digests"
+    render.note(f"{agreeing} {said}")
     if bare:
-        listed = ", ".join(bare[:_LISTED]) + (" ..." if len(bare) > _LISTED else "")
+        listed = ", ".join(bare[:_LISTED])
+        if len(bare) > _LISTED:
+            listed += " ..."
         render.note(f"{len(bare)} without a digest, written by an earlier Aegis: {listed}")
     return VerifiedReport("folder", str(path), agreeing, len(bare))
 
@@ -110,7 +111,7 @@ def _cells(path: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
 
 def _recipe_of(cells: Path) -> Path:
     """The study's recipe: beside its cells, in the folder above them, or one that ships."""
-    if cells.name == _CELLS:
+    if cells.name == _CELLS:  # a study's own, whose folder has its recipe and its table
         raise AegisError(
             f"'{cells}', which does not say of which study it is",
             "a study's folder, or NAME.cells.json with its recipe NAME.yaml beside it",
@@ -132,7 +133,11 @@ def _table(folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
 
 def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
     """A table of `aegis run`, and a study's frontier."""
-    from aegis_cli.studies.comparison import RobotStreamStudyReport, StudyReport
+    from aegis_cli.studies.comparison import (
+        RobotStreamStudyReport,
+        StreamStudyReport,
+        StudyReport,
+    )
     from aegis_cli.studies.pipeline import PipelineReport
 
     if plot is not None and not isinstance(report, StudyReport):
@@ -144,9 +149,10 @@ def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bo
     views = {
         PipelineReport: render.pipeline,
         StudyReport: render.study,
+        StreamStudyReport: render.stream_study,
         RobotStreamStudyReport: render.robot_stream_study,
     }
-    render.show(report, views.get(type(report), render.stream_study), as_json, wide)
+    render.show(report, views[type(report)], as_json, wide)
 
 
 def _anything(
@@ -163,7 +169,7 @@ def _anything(
     try:
         report = inspection.run(path)
     except inspection.UnknownFolder:
-        if verified is None or plot is not None:
+        if verified is None or plot is not None:  # a folder of files has nothing to draw
             raise
         render.show(verified, render.facts, as_json)
         return
@@ -184,7 +190,7 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
         from aegis_cli.data.lerobot import dataset, download, summary
 
         folder = path
-        if not path.exists():
+        if not path.exists():  # an id on the hub; the files of the frames shown are fetched alone
             found = dataset.load(download.meta(str(path)))
             shown = summary.on_sheet(found)
             folder = download.fetch(str(path), found, found.info.cameras, shown)

@@ -17,6 +17,9 @@ from aegis_cli.data.renaming import Renaming
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import SEED, WITH_PLACE
 
+# Each of these is what an option may say. Typer makes a list of choices of an enumeration, and
+# checks it. A stage is given the value as text.
+
 
 class Format(StrEnum):
     safetensors = "safetensors"
@@ -55,6 +58,10 @@ class Colors(StrEnum):
     seen = "seen"
     held_out = "held-out"
     all = "all"
+
+
+# --- what values may be ---------------------------------------------------------------------------
+# click calls these with the value that was given, or else with the option's default.
 
 
 def positive(param: typer.CallbackParam, value: int | None) -> int | None:
@@ -104,7 +111,7 @@ def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
     if value is not None:
         try:
             fine = all(0 <= number < math.inf for number in numbers(value))
-        except ValueError:
+        except ValueError:  # a word that is no number
             fine = False
         if not fine:
             raise _refused(param, value, "numbers, 0 or more, with commas between", "1,10,100")
@@ -122,6 +129,7 @@ def with_place(param: typer.CallbackParam, value: str | None) -> str | None:
 def demonstrations_path(text: str) -> Path:
     """A path or a hub id; `./a/b` has to be there, for as a Path it would look like an id."""
     path = Path(text)
+    # pathlib drops the `./`, by which a user says that the hub is not meant.
     if hub.is_id(text) or not hub.is_id(str(path)):
         return path
     from aegis_cli.data import demonstrations
@@ -161,18 +169,20 @@ def listed_episodes(listed: str | None) -> list[int] | None:
 
 def renamed(param: typer.CallbackParam, value: list[str] | None) -> list[str] | None:
     """Pairs NAME=NAME, each name given once; None where the option was not given."""
-    old = [one.partition("=")[0].strip() for one in value or ()]
-    for one, name in zip(value or (), old, strict=True):
-        if not name or not one.partition("=")[2].strip():
+    pairs = renaming(value)
+    named = [old for old, _ in pairs]
+    for written, (old, new) in zip(value or (), pairs, strict=True):
+        if not old or not new:
             expected = "a name of the demonstrations, '=' and the policy's"
-            raise _refused(param, one, expected, "overhead=top")
-        if old.count(name) > 1:
-            raise _refused(param, f"{one}, and '{name}' again", "each name once", "overhead=top")
+            raise _refused(param, written, expected, "overhead=top")
+        if named.count(old) > 1:
+            found = f"{written}, and '{old}' again"
+            raise _refused(param, found, "each name once", "overhead=top")
     return value
 
 
 def renaming(pairs: list[str] | None) -> Renaming:
-    """The renaming that `renamed` has let pass."""
+    """Pairs OLD=NEW as the stages take them; whether they are any good, `renamed` says."""
     parts = (pair.partition("=") for pair in pairs or ())
     return tuple((old.strip(), new.strip()) for old, _, new in parts)
 
@@ -194,18 +204,21 @@ def _refused(param: typer.CallbackParam, value: str, expected: str, example: obj
 
 def given(ctx: typer.Context) -> list[str]:
     """The options on the command line, not those at their defaults."""
-    params = [p for p in ctx.command.params if p.param_type_name == "option"]
-    return [
-        p.opts[0]
-        for p in params
-        if getattr(ctx.get_parameter_source(p.name), "name", "") == "COMMANDLINE"
-    ]
+    found = []
+    for param in ctx.command.params:
+        # By name: the source is of a class of click's, or of the click that typer brings along.
+        source = getattr(ctx.get_parameter_source(param.name), "name", "")
+        if param.param_type_name == "option" and source == "COMMANDLINE":
+            found.append(param.opts[0])
+    return found
 
 
 def recipe_file(value: Path) -> Path:
     """The file of a recipe that is given by its path, or by the name of one that ships."""
     return shipped.find(value)
 
+
+# --- what several commands take -------------------------------------------------------------------
 
 RecipeArg = Annotated[
     Path,

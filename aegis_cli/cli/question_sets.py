@@ -30,9 +30,11 @@ def chosen(
     """
     named = _of_run(model, warn=vqa is None)
     own = named[0]
+    of_recipe = vqa is None or vqa in [each.vqa for each in named]
     return dataclasses.replace(
         own,
-        max_drop=own.max_drop if vqa in (None, *(each.vqa for each in named)) else None,
+        # How much of other questions may be lost, the recipe does not say.
+        max_drop=own.max_drop if of_recipe else None,
         vqa=own.vqa if vqa is None else vqa,
         ask=own.ask if ask is None else ask,
         skip_bad=skip_bad or (vqa is None and own.skip_bad),
@@ -58,8 +60,9 @@ def baseline(model: str, anchor: Path | None = None) -> str | None:
     if anchor is not None:
         measured = artifacts.read_header(anchor, "anchor").fingerprint
         known = [number for number, origin in enumerate(origins) if origin.digest == measured]
+        # A drift is one from the model of the anchor, and so the drop is one from it, too.
         origins = origins[: known[0] + 1] if known else origins
-    *between, began_from = (origin.name for origin in origins)
+    *between, began_from = [origin.name for origin in origins]  # the nearest first
     if launch.rank() == 0:
         by_way = f" by way of {', '.join(between)}" if between else ""
         render.note(f"the baseline is '{began_from}', the model that the run began from{by_way}")

@@ -79,7 +79,7 @@ def recipes_page() -> str:
         )
         for dotted, section in _sections(kind.recipe):
             lines += ["", f"### {name}: {dotted}", "", _said(section), ""]
-            if section in described:
+            if section in described:  # such as `probe`, which several kinds have
                 first = described[section]
                 lines.append(f"The keys are those of [{first}](#{_anchor(first)}).")
             else:
@@ -113,15 +113,18 @@ def _keys(section: type, lead: Sequence[tuple[str, ...]] = ()) -> list[str]:
     hints = get_type_hints(section)
     rows = list(lead)
     for field in dataclasses.fields(section):
-        if not dataclasses.is_dataclass(base_type(hints[field.name])) and not is_retired(field):
-            takes = _takes(hints[field.name], field.metadata["check"])
-            rows.append((f"`{field.name}`", takes, _default(field), field.metadata["doc"]))
+        hint = hints[field.name]
+        if dataclasses.is_dataclass(base_type(hint)) or is_retired(field):
+            continue  # a section has a heading of its own, and a retired key no effect
+        takes = _takes(hint, field.metadata["check"])
+        rows.append((f"`{field.name}`", takes, _default(field), field.metadata["doc"]))
     return _table(("Key", "Takes", "Default", "Meaning"), rows)
 
 
 def _takes(hint: Any, check: Check | None) -> str:
     """A key's type and which values of it: `whole number, above 0, or null`."""
     words = _TYPES.get(hint) or _TYPES[base_type(hint)]
+    # That a text is not empty goes without saying, and so does that one of some words is a text.
     limits = [check.expected] if check and check is not NOT_EMPTY else []
     known = [] if words == "text" and check and check.choices else [words]
     return ", ".join(known + limits + (["or null"] if is_optional(hint) else []))
@@ -130,7 +133,7 @@ def _takes(hint: Any, check: Check | None) -> str:
 def _default(field: dataclasses.Field[Any]) -> str:
     if is_required(field):
         return "*required*"
-    value = {} if field.default is dataclasses.MISSING else field.default
+    value = {} if field.default is dataclasses.MISSING else field.default  # `factory=dict`
     if isinstance(value, tuple):
         return f"`[{', '.join(map(str, value))}]`"
     return f"`{dump(value).splitlines()[0]}`"
@@ -183,14 +186,16 @@ def _prose(command: Any) -> list[str]:
     lines: list[str] = []
     for paragraph in inspect.cleandoc(command.help).split("\n\n"):
         head, *kept = paragraph.split("\n")
-        if head.strip() != "\b":
+        if head.strip() != "\b":  # click's mark of a paragraph that it does not wrap
             lines += ["", " ".join([head, *(line.strip() for line in kept)])]
             continue
         notes = [" ".join(line.split()) for line in kept if _is_note(line)]
+        # `Example: aegis ...` without its first word; what goes on below it has none.
         code = [line.partition(": ")[2] or line for line in kept if not _is_note(line)]
         lines += ["", *(notes if len(notes) == 1 else [f"- {note}" for note in notes])]
-        lines += ["", "```text", *code, "```"] if code else []
-    return lines[1:]
+        if code:
+            lines += ["", "```text", *code, "```"]
+    return lines[1:]  # without the blank line before the first paragraph
 
 
 def _is_note(line: str) -> bool:
@@ -216,6 +221,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _cell(text: str) -> str:
+    """A text that neither ends its cell nor begins an element of HTML."""
     return text.replace("|", r"\|").replace("<", "&lt;")
 
 

@@ -21,7 +21,7 @@ def write(path: Path, out: Path | None, as_json: bool) -> None:
         found, fix = f"--out {out}", f"--out {out.with_suffix('.html')}"
         raise AegisError(found, "a file name ending in .html", fix)
     if out is not None:
-        files.check_writable(out)
+        files.check_writable(out)  # before anything is read
     # The pages need torch, by way of the artifacts, which the command line loads only here.
     from aegis_cli.cli import page
     from aegis_cli.reporting import gather
@@ -30,7 +30,7 @@ def write(path: Path, out: Path | None, as_json: bool) -> None:
     target = path / NAME if out is None else out
     page.save(found, target)
     if as_json:
-        render.show(found, render.facts, as_json)
+        render.show(found, render.facts, as_json)  # the view is not asked for
     render.note(f"report: {target}")
 
 

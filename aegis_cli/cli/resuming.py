@@ -40,9 +40,11 @@ def _instead(folder: Path) -> str:
     """What may have been meant by a folder that is no run."""
     from aegis_cli.training import checkpoint
 
-    if checkpoint.is_one(folder) and (home := checkpoint.run_of(folder)) is not None:
+    home = checkpoint.run_of(folder) if checkpoint.is_one(folder) else None
+    if home is not None:  # a policy that was exported has no run
         return f"give the run of this checkpoint: {commands.aegis('train', home)}"
-    if inner := sorted(path.parent for path in folder.glob(f"*/{RECIPE}")):
+    inner = sorted(path.parent for path in folder.glob(f"*/{RECIPE}"))
+    if inner:
         return (
             f"give one of its runs, e.g. {commands.aegis('train', inner[0])}; a job or study of "
             "aegis run goes on when it is called again"
@@ -64,15 +66,15 @@ def inputs_of(
     from aegis_cli.training import checkpoint, inputs
 
     if checkpoint.begun(run):
-        checkpoint.kept_state(run)
+        checkpoint.kept_state(run)  # of a merged run there is none, which raises
     kept = inputs.of(run)
-    if kept is None:
+    if kept is None:  # a run of an earlier version
         if not demos and recipe.demos.path is None:
             raise _unknown(run, "demonstrations", "--demos PATH")
         return list(demos), anchor or _no_anchor(run)
     if not demos:
         demos = _all_there(run, kept.demos)
-    elif len(demos) != len(kept.demos):
+    elif len(demos) != len(kept.demos):  # by its place in the list, one stands for one of these
         raise AegisError(
             f"{len(demos)} of --demos for the run in '{run}', which began with {len(kept.demos)}",
             f"each of its sets, in their order: {', '.join(kept.demos)}",
@@ -96,7 +98,7 @@ def demonstrations_of(run: Path) -> Path:
     home = results.run_of(run)
     kept = None if home is None else inputs.of(home)
     if kept is None:
-        open_loop.check_policy(run)
+        open_loop.check_policy(run)  # first: a path that is no policy is the larger mistake
         raise AegisError(
             f"no --demos for '{run}', which does not say where those of its training lie",
             "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",
@@ -180,5 +182,6 @@ def command(
     if isinstance(recipe, Recipe):
         if demos is None or inputs.of(out) != inputs.Inputs.given(demos, anchor):
             return None
+        # With more steps than the run was begun with, the recipe on the disk is not this one.
         recipe = longer.plan(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None

@@ -64,13 +64,13 @@ class Stage(NamedTuple):
                 such device.
         """
         if not self.shared:
-            launch.check_one()
+            launch.check_one()  # before the import, which takes seconds
         with computing_on(device):
-            if launch.rank() > 0:
+            if launch.rank() > 0:  # the first process alone speaks
                 return self.module.run(*args, on_event=ignore, **options)
             with render.progress() as on_event:  # already while the stage is imported
                 report = self.module.run(*args, on_event=on_event, **options)
-        render.show(report, self.view, as_json, wide)
+        render.show(report, self.view, as_json, wide)  # once no bar is drawn into it
         return report
 
 
@@ -89,7 +89,7 @@ def joined(device: str | None) -> AbstractContextManager[None]:
     A process that ends with another code than 0 ends all others, which torchrun sees to.
     """
     if launch.world_size() == 1:
-        return nullcontext()
+        return nullcontext()  # what a context manager of our own would do, without torch
     return _joined(device)
 
 
@@ -97,6 +97,7 @@ def joined(device: str | None) -> AbstractContextManager[None]:
 def _joined(device: str | None) -> Generator[None]:
     from aegis_cli.common import ranks  # with it comes torch
 
+    # The device first: processes on GPUs meet in another way than those on CPUs.
     with computing_on(device), ranks.joined():
         yield
 

@@ -147,16 +147,18 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
         header = parse_header(path, metadata, kind)
         tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
     again = rewrite(header.kind)
+    # Units are said by the header alone.
     found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
-    if found != {name: replace(spec, unit="") for name, spec in header.tensors.items()}:
+    listed = {name: replace(spec, unit="") for name, spec in header.tensors.items()}
+    if found != listed:
         raise AegisError(
             f"the tensors in '{path}' are not those its header lists",
             "the file as Aegis wrote it",
             again,
         )
-    if header.digest is not None and header.digest != _digest(
-        json.loads(metadata["aegis"]), tensors
-    ):
+    # Of the fields as they stand in the file: those of an older schema are others by now.
+    fields = json.loads(metadata["aegis"])
+    if header.digest is not None and header.digest != _digest(fields, tensors):
         raise AegisError(
             f"'{path}' is damaged: its content is not that of its digest",
             "the file as Aegis wrote it",
@@ -177,6 +179,7 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
 def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[str, Tensor]]:
     """Lift an older file, schema by schema, to the one that this version writes."""
     meta = header.meta
+    # The first one lifts schema 1, so that a file of the newest schema meets none.
     for migration in MIGRATIONS.get(header.kind, ())[header.schema - 1 :]:
         tensors, meta = migration(tensors, meta)
     units = {name: spec.unit for name, spec in header.tensors.items()}
@@ -208,7 +211,7 @@ def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:
-    with single_threaded():
+    with single_threaded():  # thousands of short sums, at each of which threads would meet
         wrong = {name: tensor for name, tensor in tensors.items() if not is_finite(tensor)}
     for name, tensor in wrong.items():
         bad = int((~tensor.isfinite()).sum())
@@ -236,7 +239,7 @@ def _write_safetensors(
         table[name] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
     file.write(_head(table, fields, _NO_DIGEST))
     pour(file, (_bytes(tensors[name]) for name in names))
-    file.seek(0)
+    file.seek(0)  # the same head once more, now that the thread has come to its end
     file.write(_head(table, fields, digest.result()))
 
 
@@ -244,7 +247,7 @@ def _head(table: Mapping[str, Any], fields: Mapping[str, Any], digest: str) -> b
     """What a file begins with; it is as long with any digest."""
     metadata = {"aegis": canonical({**fields, "digest": digest})}
     raw = canonical({**table, "__metadata__": metadata}).encode()
-    raw += b" " * (-len(raw) % 8)
+    raw += b" " * (-len(raw) % 8)  # so that the data begins at a multiple of 8 bytes
     return len(raw).to_bytes(8, "little") + raw
 
 

@@ -32,7 +32,7 @@ def chosen(name: str | None) -> Generator[None]:
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = name
     try:
-        pick()
+        pick()  # raises here, and not in the midst of the work
         yield
     finally:
         if before is None:

@@ -93,6 +93,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     try:
         with aside(path) as (temporary, file):
             write(file)
+            # To the disk before the name: else a power cut could leave the name of an empty file.
             file.flush()
             os.fsync(file.fileno())
             os.replace(temporary, path)
@@ -262,6 +263,7 @@ def _remove_unlocked(left: Path) -> None:
     Raises:
         OSError: somebody does, or the file system does not tell.
     """
+    # Neither along a link, nor waiting at a pipe: anything may have such a name.
     descriptor = os.open(left, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -340,8 +342,13 @@ def _special(path: Path) -> str | None:
         mode = path.stat().st_mode
     except (OSError, ValueError):  # nothing is there, or nobody may look: to open it will tell
         return None
-    kinds = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a pipe"}
-    return (kinds | {stat.S_IFSOCK: "a socket"}).get(stat.S_IFMT(mode))
+    kinds = {
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFSOCK: "a socket",
+    }
+    return kinds.get(stat.S_IFMT(mode))
 
 
 def check_utf8(path: str | Path, fix: str) -> None:
@@ -396,7 +403,7 @@ def make_folder(path: Path) -> None:
             with contextlib.suppress(FileNotFoundError):
                 path.mkdir(parents=True, exist_ok=True)
                 return
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)  # once more, now to raise
     except OSError as error:
         problem = f"cannot create the folder '{path}': {error.strerror or error}"
         raise AegisError(problem, "a place to write to", cure(path.parent, error)) from error

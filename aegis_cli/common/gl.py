@@ -28,7 +28,7 @@ def choose_backend() -> str:
     # Pictures of 64 x 64 pixels do not repay threads in Mesa's software renderer.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if sys.platform != "linux":
+    if sys.platform != "linux":  # there the system itself draws without a window
         return chosen or "default"
     _import_triton()
     if chosen:
@@ -85,9 +85,8 @@ def check() -> None:
             context = mujoco.GLContext(8, 8)
             context.make_current()
             context.free()
-    except (
-        Exception
-    ) as error:  # each backend fails in its own way, down to an AttributeError on None
+    except Exception as error:
+        # Each backend fails in its own way, down to an AttributeError on None.
         raise AegisError(
             f"MUJOCO_GL={backend} cannot open an OpenGL context ({type(error).__name__}: {error})",
             "an OpenGL driver that renders without a screen",

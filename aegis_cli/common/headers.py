@@ -136,7 +136,7 @@ def parse_header(
         canonical(fields)  # a number that is not finite is a ValueError
         kind, number = str(fields["kind"]), int(fields["schema"])
         _check_kind(path, kind, expected)
-        _check_schema(path, kind, number)
+        _check_schema(path, kind, number)  # before the fields: a newer Aegis may have others
         tensors = {name: _spec(said) for name, said in fields["tensors"].items()}
         whole: dict[str, Any] = {**fields, "tensors": tensors}
         header = Header(**whole)
@@ -173,7 +173,7 @@ def _check_types(header: Header) -> None:
     if not all(isinstance(digest, str) for digest in header.inputs.values()):
         raise TypeError("an input whose digest is no text")
     for name, spec in header.tensors.items():
-        sizes = all(type(size) is int for size in spec.shape)
+        sizes = all(type(size) is int for size in spec.shape)  # not `isinstance`: True is one
         if not sizes or not isinstance(spec.unit, str) or not isinstance(spec.dtype, str):
             raise TypeError(f"'{name}' is {spec}")
 

@@ -23,6 +23,7 @@ def is_id(name: str) -> bool:
 def is_local(name: str) -> bool:
     """Whether a name can only be a path: the hub is never asked for a typo in one."""
     is_file = Path(name).suffix in _FILES
+    # `runs/x` is a run that is not there, since that is where the documentation puts runs.
     return not is_id(name) or is_file or _first(name) == "runs" or Path(_first(name)).is_dir()
 
 

@@ -66,7 +66,7 @@ def listening() -> Generator[None]:
     usual = {signal.default_int_handler, leave, signal.SIG_DFL}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
     before = {n: handler for n, handler in handlers.items() if _in_main() and handler in usual}
-    _stopped.clear()
+    _stopped.clear()  # what came in an earlier block has been raised there
     for number in before:
         signal.signal(number, stop)
     try:
@@ -112,7 +112,7 @@ def _sending_again() -> Generator[None]:
         if not isinstance(dropped.exc_value, Stopped):
             usual(dropped)
             return
-        # Here the handler would raise into this very hook.
+        # Not at once: here the handler would raise into this very hook.
         timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.number))
         timer.daemon = True
         timers.append(timer)
@@ -169,6 +169,7 @@ def deferred(tell: Callable[[], None] | None = None) -> Generator[Deferred]:
     raising = (signal.default_int_handler, stop)
     before = {n: handler for n, handler in handlers.items() if _in_main() and handler in raising}
     telling = _telling(tell, before) if tell is not None and before else nullcontext()
+    # Around all of it, so that its thread has ended when a held signal is raised below.
     with telling:
         for number in before:
             signal.signal(number, held.handle)
@@ -204,7 +205,7 @@ def _telling(tell: Callable[[], None], numbers: Collection[int]) -> Generator[No
     with reader, writer:
         writer.setblocking(False)
         before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-        if before != -1:
+        if before != -1:  # somebody else's, such as an event loop of asyncio
             signal.set_wakeup_fd(before)
             yield
             return
@@ -221,5 +222,5 @@ def _telling(tell: Callable[[], None], numbers: Collection[int]) -> Generator[No
             yield
         finally:
             signal.set_wakeup_fd(-1)
-            writer.shutdown(socket.SHUT_WR)
+            writer.shutdown(socket.SHUT_WR)  # the thread reads the end, and ends itself
             thread.join()

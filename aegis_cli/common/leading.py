@@ -87,6 +87,7 @@ def led(job: Callable[[], T]) -> T:
 
 def _led(job: Callable[[], T], lead: _Lead) -> T:
     try:
+        # Alone, so that what the job does by itself asks nobody to take a share.
         with _leading(lead), among(ALONE):
             report = job()
     except AegisError as error:

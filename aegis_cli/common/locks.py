@@ -59,6 +59,8 @@ def _locked(folder: Path) -> tuple[list[Path], int, Path | None]:
         raise AegisError(f"'{folder}' is no folder", "a new or empty one", "choose another --out")
     above = [folder, *folder.parents]
     made = [path for path in above if not path.exists()]
+    # Again and again, for between the making, the opening and the locking another process may
+    # remove the folder; then the lock is on one that no path leads to any more.
     while True:
         files.make_folder(folder)
         try:
@@ -101,7 +103,7 @@ def _lock(descriptor: int, folder: Path) -> tuple[int, Path] | None:
         if _is_still(beside, own):
             os.close(descriptor)
             return own, beside
-        os.close(own)
+        os.close(own)  # its holder has ended and removed the file: another one is made
 
 
 def _is_still(path: Path, descriptor: int) -> bool:

@@ -27,7 +27,7 @@ def describe() -> dict[str, str | int]:
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
     }
-    from aegis_cli.common import devices
+    from aegis_cli.common import devices  # with it comes torch
 
     if devices.on_gpu():
         found["gpu"] = torch.cuda.get_device_name()

@@ -155,6 +155,7 @@ def _pictures(clips: Sequence[Clip]) -> Iterator[Any]:
     columns = len(clips) if len(clips) <= 4 else math.ceil(len(clips) / 2)
     rings = [_ring(clip.ring) for clip in clips]
     first = [clip.moments[0] for clip in clips]
+    # Each clip's last moment with its tile, which is drawn anew only where the moment is another.
     drawn = [(m, _framed(m, ring)) for m, ring in zip(first, rings, strict=True)]
     for t in range(max(len(clip.moments) for clip in clips) + _HOLD_FRAMES):
         for i, clip in enumerate(clips):
@@ -252,6 +253,7 @@ class Mp4Writer:
         opened = str(target) if isinstance(target, Path) else target
         self._container = av.open(opened, "w", format="mp4")
         self._rate = Fraction(fps).limit_denominator(1_000_000)
+        # Without frames that lean on later ones ("bf"), so that they come out in their order.
         self._options = {"g": str(keyframe_every), "crf": "18", "bf": "0", "threads": "1"}
         self._stream: Any = None
         self._frames = self._bytes = 0

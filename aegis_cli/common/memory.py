@@ -39,7 +39,7 @@ def restart_peak(device: torch.device) -> int:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         return torch.cuda.memory_allocated(device)
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # not Linux, or a container that may not
         _RESTART.write_text("5", encoding="utf-8")
     return peak(device)
 

@@ -37,15 +37,13 @@ def decoded(data: bytes) -> np.ndarray:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # about metadata; what makes pixels unreadable is raised
+            # They are about metadata; what makes pixels unreadable is raised.
+            warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=_raster()) as image:
                 image.load()
-                with contextlib.suppress(
-                    Exception
-                ):  # damaged metadata: viewers show the picture as it lies
+                # With damaged metadata, viewers show the picture as it lies.
+                with contextlib.suppress(Exception):
                     ImageOps.exif_transpose(image, in_place=True)
                 return rgb(image)
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
@@ -70,7 +68,8 @@ def rgb(image: Image) -> np.ndarray:
     from PIL import Image as pillow
 
     if image.mode.startswith("I;16"):  # where Pillow's own conversion makes all above 255 white
-        return np.repeat((np.asarray(image) / 257).round().astype(np.uint8)[..., None], 3, axis=-1)
+        grey = (np.asarray(image) / 257).round().astype(np.uint8)  # 65535 becomes 255
+        return np.repeat(grey[..., None], 3, axis=-1)
     if image.mode in ("I", "F"):
         raise ValueError(f"numbers of mode {image.mode}, which do not say what is white")
     if image.has_transparency_data:
@@ -92,11 +91,10 @@ def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     from PIL import Image
 
     scale = min(height / picture.shape[0], width / picture.shape[1])
-    inner = [max(1, round(side * scale)) for side in picture.shape[:2]]
-    small = np.asarray(
-        Image.fromarray(picture).resize((inner[1], inner[0]), Image.Resampling.BILINEAR)
-    )
+    rows, columns = [max(1, round(side * scale)) for side in picture.shape[:2]]
+    # Pillow has the width first.
+    small = Image.fromarray(picture).resize((columns, rows), Image.Resampling.BILINEAR)
     out = np.full((height, width, 3), GREY, np.uint8)
-    top, left = (height - inner[0]) // 2, (width - inner[1]) // 2
-    out[top : top + inner[0], left : left + inner[1]] = small
+    top, left = (height - rows) // 2, (width - columns) // 2
+    out[top : top + rows, left : left + columns] = np.asarray(small)
     return out

@@ -97,7 +97,7 @@ class WorkerPool:
         Args:
             chunk: number of items that a process takes at a time.
         """
-        waiting: deque[Future[list[Result]]] = deque()
+        waiting: deque[Future[list[Result]]] = deque()  # in the order of the items
         for start in range(0, len(items), chunk):
             waiting.append(self.submit(_each, work, items[start : start + chunk]))
             if len(waiting) == _AHEAD * self.workers:
@@ -117,7 +117,7 @@ class WorkerPool:
 
     def _stop(self) -> None:
         """End the workers, and let the executor's thread notice it."""
-        own = set(multiprocessing.active_children()) - self._older
+        own = set(multiprocessing.active_children()) - self._older  # not those of another pool
         for process in own:
             process.terminate()
         for process in own:
@@ -160,6 +160,7 @@ def _work(work: Callable[..., Result], *arguments: Any) -> Result:
     try:
         return work(*arguments)
     except KeyboardInterrupt:
+        # At once: the pool's own loop would send the exception as a result, and go on.
         os._exit(_ENDED)
     finally:
         signal.signal(signal.SIGTERM, idle)

@@ -77,7 +77,7 @@ class Ranks:
 
         `fully_shard` cuts as `torch.chunk` does.
         """
-        most = -(-size // self.count)
+        most = -(-size // self.count)  # rounded up
         return slice(min(self.rank * most, size), min((self.rank + 1) * most, size))
 
     def any(self, *flags: bool) -> list[bool]:
@@ -114,6 +114,7 @@ class Ranks:
 
     def _told(self, box: list[Any]) -> Any:
         """What is in the first process's box."""
+        # `patient` is gloo's, which sends from a CPU; NCCL's own sends from a GPU.
         device = _device() if self.patient is None else torch.device("cpu")
         dist.broadcast_object_list(box, src=0, group=self.patient, device=device)
         return box[0]
@@ -139,7 +140,7 @@ def joined() -> Generator[Ranks]:
     launch.check_meeting()
     on_gpu = devices.on_gpu()
     if on_gpu:
-        torch.cuda.set_device(launch.local_rank())
+        torch.cuda.set_device(launch.local_rank())  # before NCCL takes the current one
     with interrupts.ending_at_once():
         dist.init_process_group("nccl" if on_gpu else "gloo")
     try:

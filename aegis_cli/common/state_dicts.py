@@ -106,6 +106,7 @@ def shape_from(kind: type[Shape], raw: Any, path: Path, tensors: int) -> Shape:
         for name, value in sizes.items():
             absent = value is None and known[name].default is None
             whole = isinstance(value, int) and not isinstance(value, bool)
+            # A damaged depth could ask for a million layers, which take long to make.
             most = tensors if name.endswith("depth") else _LARGEST
             if not absent and not (whole and 1 <= value <= most):
                 raise ValueError(f"'{name}' is {value!r}")

@@ -52,7 +52,7 @@ class WatchedFiles:
             same_size = stamp[0] == self._noted[path][0]
             if not same_size or self.sha256.get(path) != _digest(path, number):
                 raise _written_to(path)
-            self._noted[path] = stamp
+            self._noted[path] = stamp  # the same content: it need not be read again each time
 
 
 class WatchedPaths:

@@ -59,6 +59,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspect
             that is not learned to its end.
     """
     path = _located(path)
+    # What is here goes before what the hub may have of the same name.
     if not path.exists() and not hub.is_local(str(path)):
         from aegis_cli.data.lerobot import download
         from aegis_cli.inspection import folders
@@ -85,11 +86,11 @@ def verify(path: Path) -> dict[Path, bool]:
     path = _located(path)
     if not path.is_dir():
         return {path: artifacts.load(path).header.digest is not None}
-    # Copies and links of one checkpoint are one file.
+    # Links to one file, such as those of the last checkpoint, count once.
     listed = {os.path.realpath(each): each for each in _artifacts_below(path)}
     found = {}
     for each in listed.values():
-        if artifacts.is_artifact(each):
+        if artifacts.is_artifact(each):  # else it may be a Hugging Face model's
             found[each] = artifacts.load(each).header.digest is not None
     if not found:
         raise AegisError(

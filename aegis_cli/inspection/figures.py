@@ -26,13 +26,12 @@ def of_file(path: Path, kind: str) -> dict[str, Any]:
 def of_anchor(path: Path) -> dict[str, Any]:
     """Moments per layer, and the spectra of inputs and curvature per map."""
     anchor = anchor_file.from_artifact(artifacts.load(path, "anchor"))
-    moments = (
-        _moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var)
-        for i in range(len(anchor.image))
-        for kind, layers in (("image", anchor.image), ("text", anchor.text))
-        if layers[i].count
-    )
-    inputs, curvature = (_sites(part) for part in (anchor.inputs, anchor.curvature))
+    moments = []
+    for i in range(len(anchor.image)):
+        for kind, layers in (("image", anchor.image), ("text", anchor.text)):
+            if layers[i].count:  # a model without images has seen no token of one
+                moments.append(_moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var))
+    inputs, curvature = _sites(anchor.inputs), _sites(anchor.curvature)
     return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
 
 
@@ -51,13 +50,13 @@ def _sites(spectra: Mapping[str, Spectrum]) -> tuple[SiteSpectrum, ...]:
 
 def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:
     values, vectors = spectrum.values, spectrum.vectors
-    if vectors is None:
+    if vectors is None:  # a table, whose directions are its rows
         read = int((values > 0).sum())
         return SiteSpectrum(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
+    # Dense [d, k]; elementwise [D, m, m], which keeps all.
     stored = vectors.shape[1] if vectors.ndim == 2 else values.numel()
-    return SiteSpectrum(
-        name, spectrum.kind, values.numel(), tuple(rank(values, e) for e in ENERGIES), stored
-    )
+    kept = tuple(rank(values, share) for share in ENERGIES)
+    return SiteSpectrum(name, spectrum.kind, values.numel(), kept, stored)
 
 
 def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
@@ -90,8 +89,11 @@ def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
 def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, ...]:
     """The rows in at most `BINS` parts of (almost) equal length."""
     count = len(tensors["step"])
-    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})
-    return tuple(_bin(groups, {k: v[a:b] for k, v in tensors.items()}) for a, b in pairwise(edges))
+    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})  # fewer of a short run
+    bins = []
+    for first, end in pairwise(edges):
+        bins.append(_bin(groups, {name: rows[first:end] for name, rows in tensors.items()}))
+    return tuple(bins)
 
 
 def _bin(groups: list[str], rows: Mapping[str, Tensor]) -> Bin:

@@ -20,15 +20,12 @@ def inspect(path: Path) -> InspectReport:
         AegisError: it is none, or damaged.
     """
     if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
-        found = f"'{path}' is " + (
-            f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
-        )
+        what = f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
         fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
         if path.suffix in _OF_QUESTIONS:
             fix += f"; questions are asked by aegis probe MODEL --vqa '{path}'"
-        raise AegisError(
-            found, "a .safetensors file, or the folder of a run, study, dataset or model", fix
-        )
+        expected = "a .safetensors file, or the folder of a run, study, dataset or model"
+        raise AegisError(f"'{path}' is {what}", expected, fix)
     header = headers.read_header(path)
     figures: dict[str, Any] = {}
     if header.kind in _WITH_FIGURES:
@@ -44,7 +41,7 @@ def inspect(path: Path) -> InspectReport:
 def _is_safetensors(path: Path) -> bool:
     """Whether a file of another name begins as those do: the header's length, then JSON."""
     with files.reading(path, "check the path"), open(path, "rb") as file:
-        return file.read(9)[8:] == b"{"
+        return file.read(9)[8:] == b"{"  # the length takes 8 bytes
 
 
 def _header_facts(header: headers.Header) -> dict[str, Any]:
@@ -54,7 +51,7 @@ def _header_facts(header: headers.Header) -> dict[str, Any]:
         "seed": header.seed,
         "fingerprint": header.fingerprint,
     }
-    facts = known | {"inputs": header.inputs or None} | header.meta
+    facts = known | {"inputs": header.inputs or None} | header.meta  # what is None has no line
     if header.kind == "ledger" and "step" in header.tensors:
         facts["steps"] = header.tensors["step"].shape[0]
     return {k: v for k, v in facts.items() if v is not None}

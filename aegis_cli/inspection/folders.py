@@ -44,6 +44,8 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
         AegisError: damaged, a run without a ledger yet, or a stream that is not
             learned to its end.
     """
+    # The order matters: a run of a stream has a recipe too, and a checkpoint has the folder of a
+    # model in it.
     if recipes.is_stream_run(path):
         report = stream_files.read(path)
         return StreamInspection(report.kind, str(path), report)
@@ -64,7 +66,7 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
             return _hub_model(inside)
         if (inside / "model.safetensors").is_file():
             return file.inspect(inside / "model.safetensors")
-    refuse_unfinished(path, "inspect")
+    refuse_unfinished(path, "inspect")  # a job that has no table yet
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
@@ -92,6 +94,7 @@ def _hub_model(path: Path) -> InspectReport:
         raise AegisError(
             found, "the configuration of a Hugging Face model", "download the model again"
         )
+    # A model of images and text has the language model's sizes in a section of its own.
     inner = config.get("text_config")
     text = inner if isinstance(inner, dict) else config
     named = {
@@ -102,13 +105,12 @@ def _hub_model(path: Path) -> InspectReport:
         "vocabulary": "vocab_size",
     }
     tensors = tuple(info for part in model_folder.weights(path) for info in _tensor_infos(part))
-    facts = {"family": config.get("model_type"), "known": config.get("model_type") in FAMILIES}
-    facts |= {"parameters": sum(math.prod(t.shape) for t in tensors)} | {
-        name: text.get(key) for name, key in named.items()
-    }
-    return InspectReport(
-        "hugging-face-model", str(path), {k: v for k, v in facts.items() if v is not None}, tensors
-    )
+    family = config["model_type"]
+    facts: dict[str, Any] = {"family": family, "known": family in FAMILIES}
+    facts["parameters"] = sum(math.prod(tensor.shape) for tensor in tensors)
+    facts |= {name: text.get(key) for name, key in named.items()}
+    said = {name: value for name, value in facts.items() if value is not None}
+    return InspectReport("hugging-face-model", str(path), said, tensors)
 
 
 def _tensor_infos(weights: Path) -> Iterator[TensorInfo]:
@@ -135,7 +137,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     until = None if at is None else checkpoint.step_of(at)
     header, metrics = artifacts.read_header(rows), _last_metrics(path, until)
     which = path / "checkpoints" / checkpoint.LAST if at is None else at
-    if merged := _merged(path, which):
+    merged = _merged(path, which)
+    if merged:
         # The log is that of the training, before the weights were moved back.
         metrics["validation_loss"] = merged.get("validation_loss")
     facts = _run_facts(path, until, header, settings, metrics)
@@ -182,11 +185,9 @@ def _run_facts(
     metrics: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What a run is, or after `until` steps was."""
-    which = (
-        {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
-        if until is None
-        else {"run": str(path), "checkpoint": f"{until:06d}"}
-    )
+    which: dict[str, Any] = {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
+    if until is not None:
+        which = {"run": str(path), "checkpoint": f"{until:06d}"}
     return {
         "method": header.meta.get("method"),
         "task": header.meta.get("task", settings.task),
@@ -227,9 +228,8 @@ def _steps(path: Path, metrics: Mapping[str, Any]) -> int | None:
 
 def _without_pictures(found: Result) -> Result:
     """A probe without the images of its wrong answers, which a report shows."""
-    return dataclasses.replace(
-        found, figures={name: value for name, value in found.figures.items() if name != "wrong"}
-    )
+    figures = {name: value for name, value in found.figures.items() if name != "wrong"}
+    return dataclasses.replace(found, figures=figures)
 
 
 def _merged(run: Path, at: Path) -> dict[str, Any] | None:
@@ -243,14 +243,16 @@ def _merged(run: Path, at: Path) -> dict[str, Any] | None:
     if home is None or not (home / folder.MERGE_REPORT).is_file():
         return found
     told = kept_figures.read(home / folder.MERGE_REPORT, kept_figures.MergeFigures)
-    return {name: told.get(name) for name in _TOLD_OF_MERGES} | {
-        name: value for name, value in (found or {}).items() if value is not None
-    }
+    merge = {name: told.get(name) for name in _TOLD_OF_MERGES}
+    # The checkpoint's own facts win, as far as it has them.
+    return merge | {name: value for name, value in (found or {}).items() if value is not None}
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:
     """The latest value of each figure of a run, or of its beginning."""
-    rows = [
-        row for row in folder.read_metrics(path, "step") if until is None or row["step"] <= until
-    ]
-    return {name: value for row in rows for name, value in row.items() if value is not None}
+    latest: dict[str, Any] = {}
+    for row in folder.read_metrics(path, "step"):
+        if until is None or row["step"] <= until:
+            # Not every line has every figure: the validation loss comes more seldom.
+            latest |= {name: value for name, value in row.items() if value is not None}
+    return latest

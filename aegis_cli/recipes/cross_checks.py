@@ -52,7 +52,11 @@ def _width_checks(section: str, model: Model | Towers) -> Iterator[Problem]:
 
 
 def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
-    """Whether the keys of a policy's recipe go together."""
+    """Whether the keys of a policy's recipe go together.
+
+    A key that would have no effect is refused, since whoever has set it has something in mind. It
+    is asked for by `changed`, for at its default nobody has.
+    """
     if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
         yield Problem(
             f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
@@ -98,13 +102,13 @@ def _train_checks(train: Train) -> Iterator[Problem]:
 
 def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
     """Whether a run can have been made longer as it says."""
-    earlier, plans = recipe.train.extended_from, recipe.train.plans
+    earlier, plans = recipe.train.extended_from, recipe.train.plans  # `steps` is the last plan
     if list(plans) != sorted(set(plans)):
         named = ", ".join(map(str, plans[:-1]))
         found = f"train.extended_from: {named} with train.steps: {recipe.train.steps}"
         fix = "raise train.steps, which cannot fall again, or delete train.extended_from"
         yield Problem(found, "rising numbers below train.steps", fix)
-    if earlier and recipe.train.backbone_until < 1:
+    if earlier and recipe.train.backbone_until < 1:  # a share of which plan's steps?
         found = f"train.extended_from with train.backbone_until: {recipe.train.backbone_until:g}"
         yield Problem(found, "one of them", "delete train.extended_from")
 
@@ -156,7 +160,7 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
             found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
             yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
-    share = recipe.nullspace.energy
+    share = recipe.nullspace.energy  # which the anchor has cut off beyond its own share
     if "nullspace" in methods and share is not None and share > measured.energy:
         found = f"nullspace.energy: {share:g} with anchor.energy: {measured.energy:g}"
         yield Problem(

@@ -24,6 +24,7 @@ from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
+# What a key of each type takes. A union is looked up whole first, then by its base type.
 _PHRASES: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -66,6 +67,7 @@ def build(
         found = [_problem(kind, raw, each["loc"], prefix, places) for each in wrong]
         problems += dict.fromkeys(found)  # each alternative of a union says what it minds
         return None
+    # Problems of before, such as a key given twice, leave it open what was meant.
     return None if problems else made
 
 
@@ -86,7 +88,7 @@ def _problem(
     line: int | None = None,
 ) -> Problem:
     """What is wrong with the key at `place`, a path from `kind` down; `line` is its section's."""
-    name, *inner = place
+    name, *inner = place  # of a union, `inner` also has names of pydantic's for its alternatives
     fields = {field.name: field for field in dataclasses.fields(kind)}
     dotted, here = f"{prefix}{name}", line_of(raw, name)
     if name not in fields:
@@ -109,12 +111,15 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     check = field.metadata.get("check")
     limits = [] if check and check.choices and phrase == "text" else [phrase]
     limits += [check.expected] if check else []
-    if "number" in phrase and any(map(is_too_large, raw if isinstance(raw, list) else [raw])):
+    items = raw if isinstance(raw, list) else [raw]
+    if "number" in phrase and any(map(is_too_large, items)):
+        # Only then: nobody who mistypes a small number wants to read of the largest one.
         most = f"{LARGEST:,}" if "whole" in phrase else f"{LARGEST_FLOAT:g}"
         limits.append(f"at most {most}")
     expected = f"{dotted}: " + ", ".join(limits)
-    listed = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
-    fix = _as_list(raw, dotted, check) if listed else _fix(field, raw, dotted, check, phrase)
+    # `methods: naive, lora`, a text to YAML, where a list was meant. A bool is an int, no word.
+    unlisted = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
+    fix = _as_list(raw, dotted, check) if unlisted else _fix(field, raw, dotted, check, phrase)
     return Problem(f"{dotted}: {_quote(raw)}", expected, fix)
 
 
@@ -136,6 +141,7 @@ def _fix(
     if near:
         return f"did you mean '{near}'?"
     if phrase == "text" and not choices and not isinstance(raw, bool | list | None):
+        # A number as text, or a text that begins with { and is a mapping to YAML.
         meant = raw if isinstance(raw, int | float) else "..."
         return f"put the text in quotes: {dotted}: '{meant}', or --set \"{dotted}='{meant}'\""
     if field.default is dataclasses.MISSING:
@@ -159,12 +165,14 @@ def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Proble
 
 def below(name: str, kind: type) -> list[str]:
     """Where the sections of a dataclass have a key of this name."""
-    sections = {section: base_type(hint) for section, hint in get_type_hints(kind).items()}
-    return [
-        f"{section}.{name}"
-        for section, inner in sections.items()
-        if dataclasses.is_dataclass(inner) and name in {f.name for f in dataclasses.fields(inner)}
-    ]
+    found = []
+    for section, hint in get_type_hints(kind).items():
+        inner = base_type(hint)
+        if not dataclasses.is_dataclass(inner):
+            continue
+        if name in [field.name for field in dataclasses.fields(inner)]:
+            found.append(f"{section}.{name}")
+    return found
 
 
 def _quote(raw: Any) -> str:

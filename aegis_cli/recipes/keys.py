@@ -119,9 +119,12 @@ def first_default(field: dataclasses.Field[Any]) -> Any:
 
 def changed(section: Any) -> dict[str, Any]:
     """The keys of a recipe's section whose values are not the defaults that they came with."""
-    shaping = [f for f in dataclasses.fields(section) if f.metadata.get("shapes", True)]
-    values = {f: getattr(section, f.name) for f in shaping}
-    return {f.name: value for f, value in values.items() if value != first_default(f)}
+    found = {}
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if field.metadata.get("shapes", True) and value != first_default(field):
+            found[field.name] = value
+    return found
 
 
 def recorded(section: Any) -> dict[str, Any]:
@@ -131,8 +134,9 @@ def recorded(section: Any) -> dict[str, Any]:
     records still hold.
     """
     values = dataclasses.asdict(section)
+    own = changed(section)
     for field in dataclasses.fields(section):
-        late = field.metadata.get("later") and field.name not in changed(section)
+        late = field.metadata.get("later") and field.name not in own
         if late or not field.metadata.get("shapes", True):
             del values[field.name]
     return values
@@ -156,7 +160,7 @@ def is_optional(hint: Any) -> bool:
 def base_type(hint: Any) -> Any:
     """`int | None` -> int, `tuple[str, ...]` -> tuple."""
     inner = next((arg for arg in get_args(hint) if arg is not type(None)), hint)
-    plain = inner if is_optional(hint) else hint
+    plain = inner if is_optional(hint) else hint  # the first argument of a tuple is an item
     return get_origin(plain) or plain
 
 
@@ -165,7 +169,7 @@ def section(kind: type[T]) -> type[T]:
     """Make a class a frozen dataclass that pydantic decodes strictly, each key by its check."""
     made = dataclasses.dataclass(frozen=True)(kind)
     assert dataclasses.is_dataclass(made)
-    hints = get_type_hints(made)
+    hints = get_type_hints(made)  # they are texts in a module with `annotations` of the future
     for field in dataclasses.fields(made):
         if not dataclasses.is_dataclass(base_type(hints[field.name])):
             # pydantic reads a dataclass by the types of its fields
@@ -184,7 +188,9 @@ class _Value:
         """The protocol by which pydantic asks a type for its schema."""
         from pydantic_core import core_schema
 
-        judged = core_schema.no_info_after_validator_function(self._judged, handler(_strict(hint)))
+        # By pydantic's own rules for the type first, and the key's check after that.
+        by_type = handler(_strict(hint))
+        judged = core_schema.no_info_after_validator_function(self._judged, by_type)
         if self.check is WITH_PLACE:
             return core_schema.no_info_before_validator_function(_as_text, judged)
         return judged
@@ -192,11 +198,11 @@ class _Value:
     def _judged(self, value: Any) -> Any:
         """The value; pydantic collects the errors of all keys."""
         repeats = self.check is not None and self.check.repeats
-        if value == () or (
-            isinstance(value, tuple) and not repeats and len(set(value)) < len(value)
-        ):
-            raise ValueError("not empty, and no word twice")
         items = value if isinstance(value, tuple) else (value,)
+        is_twice = isinstance(value, tuple) and not repeats and len(set(value)) < len(value)
+        if value == () or is_twice:
+            raise ValueError("not empty, and no word twice")
+        # What these errors say is not shown: decoding.py has the words for every key.
         if value is not None and self.check and not all(map(self.check.accepts, items)):
             raise ValueError(self.check.expected)
         if any(map(is_too_large, items)):

@@ -74,7 +74,7 @@ def take_kind(raw: dict[Any, Any], path: Path, default: type = Recipe) -> type:
     if "kind" not in raw:
         return next((kind for name, kind in TELLING.items() if name in raw), default)
     line = line_of(raw, "kind")
-    name = raw.pop("kind")
+    name = raw.pop("kind")  # no section has such a key: `build` would call it unknown
     if isinstance(name, str) and name in KINDS:
         return KINDS[name].recipe
     near = did_you_mean(str(name), KINDS)

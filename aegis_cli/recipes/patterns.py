@@ -33,10 +33,13 @@ def at_its_ends(pattern: str) -> tuple[str, ...]:
     words = pattern.split(".")
     if not any(map(_RANGE.fullmatch, words)):
         return ()
-    return tuple(".".join(_end(word, number) for word in words) for number in (1, 2))
+    first = ".".join(_end(word, 1) for word in words)
+    last = ".".join(_end(word, 2) for word in words)
+    return first, last
 
 
 def _end(word: str, number: int) -> str:
+    """The range's first number (1) or its last (2); of another word, the word."""
     found = _RANGE.fullmatch(word)
     return found[number] if found else word
 
@@ -47,7 +50,10 @@ def _rises(word: str) -> bool:
 
 
 def _word(word: str) -> str:
-    if found := _RANGE.fullmatch(word):
+    """A word between dots as a regular expression."""
+    found = _RANGE.fullmatch(word)
+    if found:
         numbers = range(int(found[1]), int(found[2]) + 1)
         return f"(?:{'|'.join(map(str, numbers))})"
-    return "".join({"*": ".*", "?": "."}.get(letter) or re.escape(letter) for letter in word)
+    wild = {"*": ".*", "?": "."}
+    return "".join(wild.get(letter) or re.escape(letter) for letter in word)

@@ -30,6 +30,7 @@ from aegis_cli.recipes.keys import (
 )
 from aegis_cli.recipes.patterns import EXPECTED, is_pattern
 
+# The words that keys take. They are names of files, options and records, so that none ever changes.
 METHODS = (
     "naive",
     "stop-gradient",
@@ -752,7 +753,7 @@ class Probe:
     @property
     def only_set(self) -> str:
         """The name of the one question set, as one of `of_each_set` and a stream's probe have."""
-        (name,) = self.sets
+        (name,) = self.sets  # of several, to take one would pass over the others
         return name
 
     def of_each_set(self) -> tuple[Probe, ...]:

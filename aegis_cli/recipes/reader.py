@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import refuse_special, sha256_value
 from aegis_cli.recipes import shipped
@@ -62,14 +63,16 @@ def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRe
 def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: str | None) -> Any:
     """A recipe of one of these kinds; the first is that of a file which does not say."""
     raw, problems = read(path)
+    # Before everything else: by the keys of another kind, nearly every key would be unknown.
     kind = take_kind(raw, path, kinds[0])
     if kind not in kinds:
         expected = _READS.get(command, describe(kinds[0]))
-        fix = f"aegis {KINDS[name_of(kind)].commands[0]} {path}"
+        fix = commands.aegis(KINDS[name_of(kind)].commands[0], path)
         raise AegisError(f"{path} is {describe(kind)}", expected, fix)
     for setting in overrides:
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
+    # There is a recipe to check as a whole only where each key is right.
     refuse(problems or list(cross_checks(recipe)), str(path))
     return recipe
 
@@ -80,7 +83,7 @@ def from_mapping(raw: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recip
     Raises:
         AegisError: the recipe has problems; one error names all of them.
     """
-    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()
+    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()  # overrides are put into sections
     for setting in overrides:
         problems += override(keys, setting)
     recipe = build(Recipe, keys, problems)
@@ -160,8 +163,7 @@ def digest(recipe: AnyRecipe) -> str:
     values = dataclasses.asdict(recipe)
     if isinstance(recipe, PretrainRecipe):
         # The shipped weights name a digest that is older than these keys.
-        later = changed(recipe)
-        for name in {"easy_vqa", "start"} - later.keys():
+        for name in {"easy_vqa", "start"} - changed(recipe).keys():
             del values[name]
     return sha256_value(values)
 
@@ -172,21 +174,17 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     The last two are part of what a stream of robot tasks writes, and count. So does a stream's
     `split`, but where it is the default, so that runs that began before there was the key go on.
     """
+    # What this returns is compared with what a run's folder holds, of any earlier version: a key
+    # that is added here may only stand in it with a value that no older run had.
     if isinstance(recipe, RobotStreamRecipe):
         everything = dataclasses.asdict(recipe)
         own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
         part = {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
         return part | {"rollout": recorded(recipe.rollout)}
     if isinstance(recipe, StreamRecipe):
-        shared = (
-            "stream",
-            "order",
-            "encoder",
-            "seed",
-            "train",
-            "inference",
-            *(("split",) if recipe.split != TEST else ()),
-        )
+        shared = ["stream", "order", "encoder", "seed", "train", "inference"]
+        if recipe.split != TEST:
+            shared.append("split")
         everything = dataclasses.asdict(recipe)
         return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
     part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
@@ -225,7 +223,9 @@ def _own_section(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Any:
 
 def _instead(path: Path) -> str:
     """What may have been meant by the path of a recipe that is not there."""
-    if near := did_you_mean(path.stem, [p.stem for p in path.parent.glob("*.yaml")]):
+    beside = [other.stem for other in path.parent.glob("*.yaml")]
+    near = did_you_mean(path.stem, beside)
+    if near:
         return f"did you mean {path.with_name(near + '.yaml')}?"
     if shipped.is_one(path.stem):
         return f"'{path.stem}' ships with Aegis, and is found by its name alone: {path.stem}"
@@ -233,7 +233,7 @@ def _instead(path: Path) -> str:
 
 
 def _read(path: Path) -> str:
-    refuse_special(path)
+    refuse_special(path)  # a pipe gives its bytes once, and a recipe is read more than once
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -93,7 +93,7 @@ def is_one(name: str) -> bool:
 
 def find(given: Path) -> Path:
     """The file that a user means: the one at this path, or else the recipe of this name."""
-    bare = given.name == str(given) and not given.suffix
+    bare = given.name == str(given) and not given.suffix  # `quickstart`; a file goes before it
     return path(given.name) if bare and not given.exists() else given
 
 
@@ -102,6 +102,7 @@ def _described(path: Path) -> Shipped:
 
     The line below the comment says its kind.
     """
+    # As text, because a comment is no part of what YAML makes of a file.
     lines = path.read_text(encoding="utf-8").splitlines()
     comment = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
     kind = lines[len(comment)].removeprefix("kind:").strip()

@@ -36,6 +36,7 @@ class _Lines(dict[Any, Any]):
     lines: dict[str, int] = {}
 
     def __setitem__(self, name: Any, value: Any) -> None:
+        # A new mapping, since copies share this one.
         self.lines = {key: line for key, line in self.lines.items() if key != name}
         super().__setitem__(name, value)
 
@@ -69,7 +70,7 @@ def put(raw: dict[Any, Any], dotted: str, value: Any, line: int | None = None) -
     *sections, name = dotted.split(".")
     for section in sections:
         raw = raw.setdefault(section, _Lines())
-        if not isinstance(raw, dict):
+        if not isinstance(raw, dict):  # such as the number in `train: 3`
             return section
     if isinstance(raw, _Lines):
         raw.put(name, value, line)
@@ -97,6 +98,7 @@ def refuse(problems: Sequence[Problem], source: str) -> None:
         place = source if only.line is None else f"{source}, line {only.line}"
         raise AegisError(f"{only.found} (in {place})", only.expected, only.fix)
     if problems:
+        # What has no line, such as an override, comes first.
         ordered = sorted(problems, key=lambda problem: problem.line or 0)
         found = _numbered(_with_line(problem) for problem in ordered)
         expected = _numbered(problem.expected for problem in ordered)
@@ -118,7 +120,7 @@ class _Loader(yaml.SafeLoader):
     There `1e-4` is a number; `no`, `010` and `2024-01-01` are text.
     """
 
-    yaml_implicit_resolvers: dict[str, Any] = {}
+    yaml_implicit_resolvers: dict[str, Any] = {}  # none of PyYAML's own, which are those of 1.1
     problems: list[Problem]
 
     def construct_lines(self, node: yaml.MappingNode) -> Iterator[_Lines]:
@@ -144,6 +146,8 @@ class _Dumper(yaml.SafeDumper):
     """Quotes text that YAML 1.1 or 1.2 would take for something else."""
 
 
+# What a scalar without quotes is, by its letters, and which letters it may begin with: PyYAML only
+# tries the patterns of a scalar's first letter. The dumper has 1.1's patterns too, as its own.
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -178,8 +182,9 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
         loader = _Loader(text)
         loader.problems = []
         node = loader.get_single_node()
-        if node is None:
+        if node is None:  # nothing, or comments alone
             return None, loader.problems
+        # Before anything is made of it: a few lines of aliases can stand for billions of values.
         if _size(node, {}) > _LARGEST:
             raise ValueError(f"more than {_LARGEST} values, counted as often as they are named")
         return _each_its_own(loader.construct_document(node)), loader.problems
@@ -220,12 +225,17 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
         known: the sizes of the nodes so far by their ids; that of a node that is still being
             counted is infinite for our purpose, for it holds itself.
     """
-    if id(node) not in known:
-        known[id(node)] = _LARGEST + 1
-        inner = [] if isinstance(node, yaml.ScalarNode) else node.value
-        parts = [part for item in inner for part in (item if isinstance(item, tuple) else (item,))]
-        known[id(node)] = 1 + sum(_size(part, known) for part in parts)
-    return known[id(node)]
+    if id(node) in known:
+        return known[id(node)]
+    known[id(node)] = _LARGEST + 1
+    count = 1
+    for item in [] if isinstance(node, yaml.ScalarNode) else node.value:
+        pair = (
+            item if isinstance(item, tuple) else (item,)
+        )  # a key with its value, or a list's item
+        count += sum(_size(part, known) for part in pair)
+    known[id(node)] = count
+    return count
 
 
 def _quoted(text: str) -> str:
@@ -238,7 +248,7 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
 
     `c` is YAML, but for a text that begins with a place for another: `{} Answer briefly.`
     """
-    dotted, equals, text = setting.partition("=")
+    dotted, equals, text = setting.partition("=")  # the value may have further signs
     dotted = dotted.strip()
     if not equals or not all(dotted.split(".")):
         fix = "write e.g. --set train.steps=200"

@@ -59,7 +59,7 @@ class Variant:
     def chosen(self, value: Any) -> dict[str, Any]:
         """The keys that one of `values` stands for."""
         values: Sequence[Any] = value if len(self.tune) > 1 else [value]
-        return dict(zip(self.tune, values, strict=False))
+        return dict(zip(self.tune, values, strict=False))  # without a knob, [None] is of no key
 
 
 @section

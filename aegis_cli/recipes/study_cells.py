@@ -86,13 +86,13 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | AnyStudy:
     path = Path(path)
     raw, problems = recipes.read(path)
     kind = recipes.take_kind(raw, path)
-    if kind not in _CELL_RULES:
+    if kind not in _CELL_RULES:  # a recipe, or one that another command reads, which is refused
         return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
     study = build(kind, raw, problems, places=lambda name: _places(name, kind))
     checked = _check(raw, _CELL_RULES[kind], problems)
-    refuse(list(dict.fromkeys(problems)), str(path))
+    refuse(list(dict.fromkeys(problems)), str(path))  # many cells have the same one
     return dataclasses.replace(study, variants=checked)
 
 
@@ -133,6 +133,7 @@ def cell(
     raw = variants.merged(study.shared, study.variants[variant], value)
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
+    # Last, for they win against what `shared` and the variant say.
     raw |= {"name": study.name, rules.place: place, "seed": seed}
     for dotted in _drawn(study):
         put(raw, dotted, seed)
@@ -165,7 +166,7 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     shared = recipes.every_key(build(rules.recipe, {**recipe.shared, **given}, []))
     given_below = [dotted for dotted in rules.given if "." in dotted]
     for dotted in (*given_below, *_drawn(recipe)):
-        section, name = dotted.split(".")
+        section, name = dotted.split(".")  # every such key is one of a section
         del shared[section][name]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
@@ -191,6 +192,7 @@ def _check(
     raw: Mapping[str, Any], rules: _CellRules, problems: list[Problem]
 ) -> dict[str, Variant]:
     """The variants that can be read; everything wrong in any cell is appended."""
+    # All is read from the raw keys, since one that is wrong leaves no study to ask.
     drawn = raw.get("per_seed")
     per_seed = _per_seed(drawn if isinstance(drawn, list) else ())
     places_given = {**rules.given, **dict.fromkeys(per_seed, "per_seed")}
@@ -198,8 +200,11 @@ def _check(
     readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
+    # Which streams there are is known to the stage alone: one name is as good as another here.
     places = [] if rules.recipe is StreamRecipe else _readable(raw.get(rules.places))
-    checked = [places] if rules.listed and places else places or [rules.any_place]
+    checked: list[Any] = [*places] or [rules.any_place]
+    if rules.listed and places:
+        checked = [places]
     given = [{"name": "cell", rules.place: place} for place in checked]
     problems += variants.cell_problems(
         rules.recipe,
@@ -229,11 +234,8 @@ def _per_seed(names: Iterable[str]) -> list[str]:
 
 def _readable(tasks: Any) -> list[str]:
     """The tasks that can be read; `build` has complained of the others."""
-    return [
-        task
-        for task in (tasks if isinstance(tasks, list) else [])
-        if isinstance(task, str) and recipes.TASK.accepts(task)
-    ]
+    listed = tasks if isinstance(tasks, list) else []
+    return [task for task in listed if isinstance(task, str) and recipes.TASK.accepts(task)]
 
 
 def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
@@ -262,8 +264,10 @@ def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
     for name, variant in named.items() if isinstance(named, dict) else ():
         for part in ("set", "tune"):
             own = variant.get(part) if isinstance(variant, dict) else None
+            if not isinstance(own, dict):
+                continue
             for key in ("demos.path", "demos.paths"):
-                if isinstance(own, dict) and own.get(key) is not None:
+                if own.get(key) is not None:
                     yield f"variants.{name}.{part}: {key}: {own[key]}"
 
 

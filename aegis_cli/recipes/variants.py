@@ -32,7 +32,7 @@ def merged(
     Args:
         lines: where the variant's dotted keys stand in the study's file.
     """
-    raw = copy.deepcopy(shared)
+    raw = copy.deepcopy(shared)  # variants are put into its sections
     for dotted, its_value in {**variant.set, **variant.chosen(value)}.items():
         put(raw, dotted, copy.deepcopy(its_value), (lines or {}).get(dotted))
     put(raw, "train.method", variant.method)
@@ -59,8 +59,9 @@ def read(
             measured against it.
     """
     found = {}
+    # Of what is no mapping, `build` has complained.
     for name, keys in (raw if isinstance(raw, dict) else {}).items():
-        where, own = f"variants.{name}", []
+        where, own = f"variants.{name}", []  # the problems of this variant
         if not isinstance(name, str) or not FOLDER_NAME.accepts(name):
             own.append(
                 Problem(f"the variant '{name}'", f"a name of {FOLDER_NAME.expected}", "rename it")
@@ -79,10 +80,9 @@ def read(
         if variant is not None:
             own += _problems(where, variant, places, _lines(keys))
             if anchors.get(name, variant.method) != variant.method:
+                wrong = f"{where}.method: {variant.method}"
                 expected = f"{anchors[name]}: the others are measured against it"
-                own.append(
-                    Problem(f"{where}.method: {variant.method}", expected, "rename the variant")
-                )
+                own.append(Problem(wrong, expected, "rename the variant"))
         if variant is not None and not own:
             found[name] = variant
         line = line_of(raw, name)  # that of the variant, where no key of its own is to blame
@@ -97,24 +97,10 @@ SECTIONS = frozenset(name.replace("-", "_") for name in (*METHODS, *LEARNERS))
 def _problems(
     where: str, variant: Variant, places: Places, lines: Mapping[str, int | None]
 ) -> Iterator[Problem]:
+    """What is wrong with a variant's keys, whatever the recipe's own checks say of their values."""
     for part, keys in (("set", variant.set), ("tune", variant.tune)):
         for dotted, value in keys.items():
-            found = list(_reserved(f"{where}.{part}", dotted, places))
-            if not all(dotted.split(".")) or isinstance(value, dict):
-                expected, fix = "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4"
-                found.insert(0, Problem(f"{where}.{part}: {dotted}", expected, fix))
-            section = dotted.partition(".")[0]
-            if section in SECTIONS and section != variant.method.replace("-", "_"):
-                expected = f"keys that method '{variant.method}' reads"
-                fix = f"delete it, or set method: {section.replace('_', '-')}"
-                found.append(Problem(f"{where}.{part}: {dotted}", expected, fix))
-            unread = UNREAD_RATES.get(variant.method, {})
-            if dotted in unread:
-                instead = unread[dotted]
-                fix = "delete it" if instead is None else f"set {instead} instead"
-                expected = f"keys that method '{variant.method}' reads"
-                found.append(Problem(f"{where}.{part}: {dotted}", expected, fix))
-            for problem in found:
+            for problem in _key_problems(f"{where}.{part}", dotted, value, variant.method, places):
                 yield problem._replace(line=lines.get(dotted))
     for knob, values in variant.tune.items():
         line = lines.get(knob)
@@ -126,24 +112,46 @@ def _problems(
             yield Problem(f"{where}: {knob} in set and in tune", expected, fix, line)
 
 
+def _key_problems(
+    where: str, dotted: str, value: Any, method: str, places: Places
+) -> Iterator[Problem]:
+    """What is wrong with one key of a variant of this method."""
+    if not all(dotted.split(".")) or isinstance(value, dict):
+        expected, fix = "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4"
+        yield Problem(f"{where}: {dotted}", expected, fix)
+    yield from _reserved(where, dotted, places)
+    expected = f"keys that method '{method}' reads"
+    section = dotted.partition(".")[0]
+    if section in SECTIONS and section != method.replace("-", "_"):
+        fix = f"delete it, or set method: {section.replace('_', '-')}"
+        yield Problem(f"{where}: {dotted}", expected, fix)
+    unread = UNREAD_RATES.get(method, {})
+    if dotted in unread:
+        instead = unread[dotted]
+        fix = "delete it" if instead is None else f"set {instead} instead"
+        yield Problem(f"{where}: {dotted}", expected, fix)
+
+
 def _distinct(values: Any) -> bool:
     """Whether it is a list of values, each another one."""
+    if not isinstance(values, list):
+        return False
     try:
-        return isinstance(values, list) and 0 < len({canonical(v) for v in values}) == len(values)
+        texts = {canonical(value) for value in values}  # a list among them cannot be in a set
     except (TypeError, ValueError):  # NaN, or what only YAML can write
         return False
+    return 0 < len(texts) == len(values)
 
 
 def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:
     """A key that may not stand there."""
-    if any(dotted == key or dotted.startswith(f"{key}.") for key in places):
-        place = places.get(dotted)
-        said, fix = (
-            (f"the study's '{place}'", f"use '{place}'")
-            if place
-            else ("the same for all", "move it to 'shared'")
-        )
-        yield Problem(f"{where}: {dotted}", said, fix)
+    if not any(dotted == key or dotted.startswith(f"{key}.") for key in places):
+        return
+    place = places.get(dotted)
+    if place:
+        yield Problem(f"{where}: {dotted}", f"the study's '{place}'", f"use '{place}'")
+    else:
+        yield Problem(f"{where}: {dotted}", "the same for all", "move it to 'shared'")
 
 
 def cell_problems(
@@ -167,7 +175,7 @@ def cell_problems(
         return
     for dotted in _dotted(shared):
         yield from _reserved("shared", dotted, places)
-    common: list[Problem] = []
+    common: list[Problem] = []  # they come again in every cell
     build(kind, {**shared, **given[0]}, common)
     yield from _within("shared", common)
     for name, variant in variants.items():
@@ -175,7 +183,9 @@ def cell_problems(
         for value, keys in itertools.product(variant.values, given):
             found: list[Problem] = []
             made = build(kind, merged(shared, variant, value, lines) | keys, found)
-            own = [p for p in found if p not in common] or ([] if made is None else together(made))
+            own: Iterable[Problem] = [problem for problem in found if problem not in common]
+            if not own and made is not None:  # only a whole recipe can be judged as a whole
+                own = together(made)
             own = [p if p.line else p._replace(line=line_of(raw, name)) for p in own]
             yield from _within(f"variants.{name}", own)
 
@@ -203,6 +213,7 @@ def tuning_problems(
     if not isinstance(tuning, dict):
         return
     seed, runs = tuning.get("seed", default), tuning.get("runs")
+    # Else a knob would be chosen by a run that is then compared. A wrong type is told elsewhere.
     if isinstance(seed, int) and isinstance(seeds, list) and seed in seeds:
         said = f"set tuning.seed to {max(s for s in seeds if isinstance(s, int)) + 1000}"
         yield Problem(

@@ -106,7 +106,10 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     Raises:
         AegisError: a path that is no run of a policy, and no job of such.
     """
-    found = [(path, _inspected(path)) for given in paths for path in _runs(Path(given))]
+    found = []
+    for given in paths:  # a run, or a job with several
+        found += [(path, _inspected(path)) for path in _runs(Path(given))]
+    # What is compared is chosen over all runs together.
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(path, one) for path, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
@@ -119,6 +122,12 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     same_frames = len({own[0] for own in evaluated if own is not None}) < 2
     same_episodes = _same_episodes([_by_colors(one) for _, one in found])
     made = Comparison(rows, same_frames, same_episodes, differences.between(facts))
+    _warn_of_differences(made, on_event)
+    return made
+
+
+def _warn_of_differences(made: Comparison, on_event: OnEvent) -> None:
+    """Say in what the runs differ beside their methods."""
     if made.differs:
         text = f"the runs differ in {differences.said(made.differs)}"
         on_event(Warned("compare", f"{text}: their figures tell more than their methods"))
@@ -126,10 +135,9 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
         text = f"VQA is of different questions: {', '.join(made.question_sets)}"
         on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))
     if not made.same_open_loop:
-        said = "; ".join(f"{row.run}, {row.open_loop_on}" for row in rows if row.open_loop_on)
-        text = f"open-loop errors are not of the same frames: {said}"
+        shown = [f"{row.run}, {row.open_loop_on}" for row in made.rows if row.open_loop_on]
+        text = f"open-loop errors are not of the same frames: {'; '.join(shown)}"
         on_event(Warned("compare", f"{text}; aegis evaluate --episodes measures each on the same"))
-    return made
 
 
 def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
@@ -185,6 +193,7 @@ def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
 
 def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
     """The run's rollouts by their colours, the first of each; None where a task has no colours."""
+    # Backwards, so that the first of each wins.
     return {result.figures.get("colors"): result for result in reversed(found.rollouts)}
 
 
@@ -202,17 +211,22 @@ def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) ->
 def _by_episodes(path: Path, found: InspectReport) -> dict[Any, results.Result]:
     """The run's open-loop evaluations by what has to be the same for them to be compared."""
     named = ("episodes", "trained_on", "frames", "seed")
-    return {
-        (results.evaluated_data(path, one), *(str(one.figures[name]) for name in named)): one
-        for one in found.open_loops
-    }
+    by_episodes = {}
+    for one in found.open_loops:
+        told = [str(one.figures[name]) for name in named]  # lists as texts, which can be keys
+        by_episodes[results.evaluated_data(path, one), *told] = one
+    return by_episodes
 
 
 def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Named | None]:
     """Each run's first result whose name all runs with any have, else its own first."""
     some = [own for own in measured if own]
     shared = [name for name in next(iter(some), {}) if all(name in own for own in some)]
-    return [next(((n, own[n]) for n in (*shared[:1], *own) if n in own), None) for own in measured]
+    chosen: list[_Named | None] = []
+    for own in measured:
+        name = next(iter([*shared, *own] if own else ()), None)  # where none is shared, its first
+        chosen.append(None if name is None else (name, own[name]))
+    return chosen
 
 
 def _runs(path: Path) -> Iterator[Path]:
@@ -225,14 +239,14 @@ def _runs(path: Path) -> Iterator[Path]:
     if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
         if not (path / CELLS).is_file():  # a study's has stages too, and no table of runs
             refuse_unfinished(path, "compare")
-        there = path.exists()
+        expected = "folders that aegis train wrote, or one that aegis run made of a recipe"
+        if not path.exists():
+            raise AegisError(f"nothing is at '{path}'", expected, "check the path")
         raise AegisError(
-            f"'{path}' is no run of a policy" if there else f"nothing is at '{path}'",
-            "folders that aegis train wrote, or one that aegis run made of a recipe",
+            f"'{path}' is no run of a policy",
+            expected,
             "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
-            "--baseline MODEL"
-            if there
-            else "check the path",
+            "--baseline MODEL",
         )
     yield path
 

@@ -52,7 +52,7 @@ def _rollout(found: PlayedResult | None) -> str | None:
         return None
     words = [f"{found.figures['episodes']} episodes of {found.figures.get('task')}"]
     for name, value in vars(found.played).items():
-        if value is not None and value is not False:
+        if value is not None and value is not False:  # a delay of 0 is something
             words.append(f"{name} {value}")
     return ", ".join(words)
 
@@ -67,12 +67,15 @@ def _questions(path: Path, vqa: str, probed: Result) -> str:
     own = results.recipe_of(path).probe
     words = [f"{probed.figures.get('questions', 0):,} of {vqa}"]
     families = probed.figures.get("families")
+    # Those that ship are told by their names, with the seed below.
     if vqa not in (sets.SCENES, easy.NAME) and families:
         told = {name: [one["questions"], one["majority"]] for name, one in families.items()}
         words.append(f"families of digest {digest(told)[:_DIGITS]}")
-    if (seed := probed.settings.get("seed", own.seed)) != 0:
+    # A probe of `aegis run` has no settings of its own: it asks as the recipe says.
+    seed, ask = probed.settings.get("seed", own.seed), probed.settings.get("ask", own.ask)
+    if seed != 0:
         words.append(f"seed {seed}")
-    if (ask := probed.settings.get("ask", own.ask)) != "{}":
+    if ask != "{}":
         words.append(f"asked as '{ask}'")
     return ", ".join(words)
 

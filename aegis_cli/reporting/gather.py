@@ -7,19 +7,19 @@ figure is one that a stage has written.
 from __future__ import annotations
 
 import dataclasses
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from aegis_cli import inspection, recipes, sim
-from aegis_cli.common import artifacts, machine
+from aegis_cli.common import artifacts, commands, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.recipes.study_cells import written_out
 from aegis_cli.studies import table
+from aegis_cli.studies.cells import CELLS
 from aegis_cli.studies.comparison import (
     RobotStreamStudyReport,
     StreamStudyReport,
@@ -159,36 +159,36 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         AegisError: nothing there that `aegis train` or `aegis run` wrote, or a damaged file.
     """
     path = Path(path)
-    if (path / table.NAME).is_file() or (path / "cells.json").is_file():
+    # A table first: a study that has only begun has cells alone, which `table.load` tells.
+    if (path / table.NAME).is_file() or (path / CELLS).is_file():
         return _of_table(path)
     if recipes.is_stream_run(path):
         found = inspection.run(path)
         assert isinstance(found, inspection.StreamInspection)
-        repeat = _command("aegis", "train", path / "recipe.yaml", "--out", "NEW_FOLDER")
+        repeat = commands.aegis("train", path / "recipe.yaml", "--out", "NEW_FOLDER")
         return StreamDocument(found.kind, str(path), found.report, [repeat])
     if not (path / "recipe.yaml").is_file():
         refuse_unfinished(path, "report")
         inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
         inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
         example = next(iter(inside), "runs/quickstart")
-        there = path.exists()
-        raise AegisError(
-            f"'{path}' is no run, job or study" if there else f"nothing is at '{path}'",
-            "a folder that aegis train or aegis run wrote",
-            f"aegis report {shlex.quote(str(example))}" if there else "check the path",
-        )
+        expected = "a folder that aegis train or aegis run wrote"
+        if not path.exists():
+            raise AegisError(f"nothing is at '{path}'", expected, "check the path")
+        fix = commands.aegis("report", example)
+        raise AegisError(f"'{path}' is no run, job or study", expected, fix)
     return run_document(path, videos=True)
 
 
 def _of_table(path: Path) -> Document:
     found = table.load(path)
     if not isinstance(found, PipelineReport):
-        again = _command("aegis", "run", "RECIPE", "--out", path.parent)
+        again = commands.aegis("run", "RECIPE", "--out", path.parent)
         return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
     runs = [run_document(run) for run in table.runs(found)]
     # Each method's recipe names all methods of the job, with every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
-    again = _command("aegis", "run", recipe, "--out", "NEW_FOLDER")
+    again = commands.aegis("run", recipe, "--out", "NEW_FOLDER")
     return JobDocument("job", str(path), found, runs, _videos(path), [again])
 
 
@@ -281,24 +281,23 @@ def _commands(
     read = given if recipe.reads_anchor(method) else ()
     inputs = ("--method", method, *demos, *read, "--out", new)
     asked = ("--baseline", recipe.backbone, *(given if has_anchor else ()))
-    commands = [_command("aegis", "train", again, *inputs)]
+    told = [commands.aegis("train", again, *inputs)]
     if merge is not None:
         trained, new = new, "MERGED_FOLDER"
-        if facts["steps"] != recipe.train.steps:
+        if facts["steps"] != recipe.train.steps:  # it was merged before its training had ended
             trained = f"{trained}/checkpoints/{facts['steps']:06d}"
         own = _merging(merge, recipe, demos, anchor)
-        commands.append(_command("aegis", "merge", trained, *own, "--out", new))
+        told.append(commands.aegis("merge", trained, *own, "--out", new))
     for probe in recipe.probe.of_each_set():
         counted = (*probe.asking, "--questions", probe.questions, *_seed(probe.seed))
-        commands.append(_command("aegis", "probe", new, *counted, *asked))
+        told.append(commands.aegis("probe", new, *counted, *asked))
     if task is not None:
         episodes = ("--episodes", recipe.rollout.episodes, *_seed(recipe.rollout.seed))
-        colors = [("--colors", each) for each in recipe.rollout.colors]
-        commands += [
-            _command("aegis", "rollout", new, *episodes, *own)
-            for own in (colors if sim.has_colors(task) else [()])
-        ]
-    return commands
+        colors: list[tuple[str, ...]] = [()]  # once, where a task has none
+        if sim.has_colors(task):
+            colors = [("--colors", each) for each in recipe.rollout.colors]
+        told += [commands.aegis("rollout", new, *episodes, *of_them) for of_them in colors]
+    return told
 
 
 def _merging(
@@ -323,6 +322,7 @@ def _merging(
     if "anchor" in merge:
         yield from ("--anchor", anchor)
     elif "vqa" in merge:
+        # Against the defaults of `aegis merge`; what is None here is always told.
         for name, default in (("vqa", None), ("ask", "{}"), ("samples", None), ("temperature", 1)):
             if merge[name] != default:
                 yield from (f"--{name}", merge[name])
@@ -340,12 +340,9 @@ def _beside(path: Path, name: str) -> str:
     return str(found) if found.is_file() else name.partition(".")[0].upper()
 
 
-def _command(*words: object) -> str:
-    return shlex.join(str(word) for word in words)
-
-
 def _videos(path: Path) -> list[Video]:
     """The films in a folder, in those right below it, and in the merged runs in these."""
+    # No deeper: a run's checkpoints and a job's data hold thousands of files, and no film.
     listed = [*path.glob("*"), *path.glob("*/*"), *path.glob(f"*/{folder.MERGED}/*")]
     found = sorted(p for p in listed if p.suffix.lower() in _VIDEOS and p.is_file())
     return [Video(p.relative_to(path).as_posix(), p.stat().st_size) for p in found]

@@ -468,7 +468,7 @@ def test_a_view_as_markdown_has_its_titles_tables_and_notes() -> None:
         "| - |\n\n"
         "first line that goes on\n\nsecond\n"
     )
-    with pytest.raises(TypeError, match="no Markdown for a str"):
+    with pytest.raises(TypeError, match="neither a table nor a text: a str"):
         markdown("text")
 
 

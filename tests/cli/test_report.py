@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -251,6 +252,17 @@ def test_texts_of_artifacts_are_no_markup(aegis, tmp_path: Path) -> None:
     text = (job / "report.html").read_text(encoding="utf-8")
     assert "<script" not in text and "\x1b" not in text
     assert page.said.count("<script>alert('x')</script>") >= 3
+
+
+def test_a_folder_whose_name_is_not_utf8_has_a_page(aegis, tmp_path: Path) -> None:
+    """Python has such a byte as half of a surrogate pair, which UTF-8 cannot write."""
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    files.save_json(folder / "table.json", found(("naive", "x")).to_json())
+    code, _, err = aegis("report", folder)
+    assert code == 0 and r"caf\udce9" in err
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert r"caf\udce9" in text
 
 
 def test_a_large_film_is_linked(aegis, job: Path) -> None:

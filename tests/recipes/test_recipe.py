@@ -396,6 +396,11 @@ def test_a_recipe_of_the_other_command_is_named(tmp_path):
     )
     assert refusal(tmp_path, to_yaml(DualRecipe(name="x"))).fix.startswith("aegis pretrain")
     assert refusal(tmp_path, to_yaml(Recipe(name="x")), kind=DualRecipe).fix.startswith("aegis run")
+    spaced = tmp_path / "a recipe"
+    spaced.mkdir()
+    said = refusal(spaced, to_yaml(DualRecipe(name="x"))).fix
+    command, verb, path = shlex.split(said)
+    assert (command, verb) == ("aegis", "pretrain") and Path(path).parent == spaced
 
 
 @pytest.mark.parametrize(

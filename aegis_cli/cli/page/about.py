@@ -37,8 +37,10 @@ def _film(video: At, folder: Path, page: Path) -> Markup:
         place = Path(os.path.relpath(folder / name, page)).as_posix()
         link = element("a", place, href=quote(place))
         return note(link, " is too large to be part of this page, which only links it.")
-    source = f"data:{kind};base64,{base64.b64encode((folder / name).read_bytes()).decode()}"
+    encoded = base64.b64encode((folder / name).read_bytes()).decode()
+    source = f"data:{kind};base64,{encoded}"
     if kind.startswith("video"):
+        # Without `autoplay`: a page of many films would play all of them at once.
         film = element("video", src=source, controls="", muted="", loop="", playsinline="")
     else:
         film = element("img", src=source, alt=name, class_="film")
@@ -53,18 +55,20 @@ def commands(page: At) -> Markup:
 
 def machine(runs: Sequence[At]) -> Markup:
     """Where the runs were trained, and with which versions; a column for each machine."""
+    # A mapping cannot be a key, and its items as a text can.
     found: dict[str, tuple[dict[str, Any], list[str]]] = {}
     for run in runs:
         about = run["machine"].value
-        found.setdefault(str(sorted(about.items())), (about, []))[1].append(str(run["label"]))
+        _, names = found.setdefault(str(sorted(about.items())), (about, []))
+        names.append(str(run["label"]))
     known = [(about, names) for about, names in found.values() if about]
     if not known:
         return section("Machine and versions", note("Not recorded: an earlier Aegis trained this."))
     keys = list(dict.fromkeys(key for about, _ in known for key in about))
     header = ["", *(", ".join(names) if len(known) > 1 else "" for _, names in known)]
-    rows: list[list[Child]] = [
-        [key, *(str(about.get(key, "–")) for about, _ in known)] for key in keys
-    ]
+    rows: list[list[Child]] = []
+    for key in keys:
+        rows.append([key, *(str(about.get(key, "–")) for about, _ in known)])
     return section("Machine and versions", table(header, rows, left=1 + len(known)))
 
 

@@ -14,6 +14,7 @@ from aegis_cli.cli.page.html import Markup, element
 WIDTH, HEIGHT = 460, 260  # of a drawing, in its own units
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 14, 40
 _TURNED, _DIGIT = 30, 7.5  # what a turned label takes at the left, and a digit of a tick's number
+_NAME_LETTER = 7.4  # width of a letter of a mark's name, whose font no drawing knows
 _ALL = 100  # percent
 COLORS = 8  # classes c0 to c7 of the style sheet
 Point = tuple[float, float]
@@ -43,24 +44,29 @@ class Scale:
     whole: bool = False
 
     def __call__(self, value: float) -> float:
-        low, high, at = self.low, self.high, min(max(value, self.low), self.high)
+        low, high = self.low, self.high
+        at = min(max(value, low), high)  # what lies outside is drawn at the edge
         if self.log:
             low, high, at = math.log(low), math.log(high), math.log(at)
-        return self.start + (self.end - self.start) * ((at - low) / (high - low))
+        share = (at - low) / (high - low)
+        # `start` may be the larger one, as of a vertical axis: y grows downwards in SVG.
+        return self.start + (self.end - self.start) * share
 
     def ticks(self) -> list[float]:
         """Round values between the ends: powers of ten, or about five equal steps."""
         if self.log and self.high > 10 * self.low:
             first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+            # Over one or two decades the powers alone would be one tick or two.
             steps = (1, 2, 5) if last - first <= 2 else (1,)
             found = [s * 10.0**power for power in range(first, last + 1) for s in steps]
         else:
             step = round_step((self.high - self.low) / 5)
             if self.whole:
                 step = max(step, 1)
+            # With some slack, so that an end which is a multiple of the step keeps its tick.
             first = math.ceil(self.low / step - 1e-9)
             count = math.floor(self.high / step + 1e-9) - first + 1
-            found = [round((first + k) * step, 12) for k in range(count)]
+            found = [round((first + k) * step, 12) for k in range(count)]  # 0.3, not 0.30000000004
         return [value for value in found if self.low * (1 - 1e-9) <= value <= self.high] or found
 
 
@@ -86,6 +92,7 @@ def spanning(values: Sequence[float], start: float, end: float, log: bool = Fals
     if low == high:
         low, high = low - max(abs(low), 1) * 0.1, high + max(abs(high), 1) * 0.1
     room = 0.05 * (high - low)
+    # Of values that are never negative, the room below does not pretend that they might be.
     below = 0.0 if low >= 0 and low - room < 0 else low - room
     return Scale(below, high + room, start, end)
 
@@ -137,19 +144,25 @@ def color(number: int) -> str:
 
 def _axes(x: Scale, y: Scale, x_label: str, y_label: str) -> list[Markup]:
     """Grid lines, ticks and the labels of both axes."""
-    bottom, top = y.start, y.end
+    bottom = y.start
     drawn = []
     for value in y.ticks():
         drawn.append(line(x.start, y(value), x.end, y(value), "grid"))
+        # SVG places a text by its base line: some units lower it stands beside the grid line.
         drawn.append(text(x.start - 6, y(value) + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
         drawn.append(text(x(value), bottom + 16, label(value), class_="tick"))
     drawn.append(line(x.start, bottom, x.end, bottom, "axis"))
     drawn.append(text((x.start + x.end) / 2, bottom + 33, x_label, class_="label"))
-    middle = (top + bottom) / 2
-    turned = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
-    drawn.append(text(12, middle, y_label, **turned))
+    drawn.append(_turned(y, y_label))
     return drawn
+
+
+def _turned(y: Scale, label: str) -> Markup:
+    """The label of a vertical axis, which is read from below along the left edge."""
+    middle = (y.start + y.end) / 2
+    look = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
+    return text(12, middle, label, **look)
 
 
 # --- charts ---------------------------------------------------------------------------------------
@@ -172,8 +185,9 @@ def lines(
     """Lines over a common axis, of which the vertical one may be logarithmic."""
     drawn = [s for s in series if s.points]
     points = [point for s in drawn for point in s.points]
-    log = log and all(y > 0 for _, y in points)
+    log = log and all(y > 0 for _, y in points)  # 0 has no place on such an axis
     y = spanning([value for _, value in points], HEIGHT - _BOTTOM, _TOP, log)
+    # Long numbers at the ticks push the axis to the right, off its own label.
     longest = max(len(label(value)) for value in y.ticks())
     left = max(_LEFT, _TURNED + _DIGIT * longest)
     x = from_first_to_last([value for value, _ in points], left, WIDTH - _RIGHT)
@@ -228,11 +242,11 @@ def frontier(
     width, height, line_y = 760, 430, 46
     spots = [replace(spot, x_interval=_possible(spot)) for spot in spots]
     values = [value for s in spots for value in (s.y, *(s.y_interval or ()))]
-    lost = [symlog(value) for value in [*values, 0.0]]
+    lost = [symlog(value) for value in [*values, 0.0]]  # the line of no loss is always there
     across = [value for s in spots for value in (s.x, *(s.x_interval or ()))]
     room = max(2.0, 0.06 * (max(across) - min(across)))
     x = Scale(max(min(across) - room, 0), max(across) + room, _LEFT, width - 24)
-    y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)
+    y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)  # of values by `symlog`
     drawn = []
     ticks = [t for t in (0, 0.5, 1, 2, 5, 10, 20, 50, 100) if y.low <= symlog(t) <= y.high]
     for value in ticks:
@@ -240,17 +254,16 @@ def frontier(
         drawn.append(line(x.start, at, x.end, at, "grid" if value else "zero"))
         drawn.append(text(x.start - 6, at + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
-        if value <= max(*across, _ALL):
+        if value <= max(*across, _ALL):  # the room at the right is beyond 100 %
             drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
     drawn.append(line(x.start, y.end, x.end, y.end, "axis"))
     drawn.append(text((x.start + x.end) / 2, height - 8, x_label, class_="label"))
-    middle = (y.start + y.end) / 2
-    turned = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
-    drawn.append(text(12, middle, y_label, **turned))
+    drawn.append(_turned(y, y_label))
     for curve in curves:
         bent = Series(curve.name, [(a, symlog(b)) for a, b in curve.points], curve.number)
         drawn.append(element("g", _series(bent, x, y), class_="tried"))
     drawn += [_spot(spot, x, y) for spot in spots]
+    # Small marks are too many to be named, but in their tooltips.
     drawn += _names([s for s in spots if not s.small], x, y)
     return svg(*drawn, width=width, height=height, name=name)
 
@@ -269,7 +282,7 @@ def _possible(spot: Spot) -> Point | None:
 def symlog(value: float) -> float:
     """To scale up to 1, from there on by the logarithm; negative values alike."""
     size = abs(value)
-    bent = size if size <= 1 else 1 + math.log10(size) * 1.4
+    bent = size if size <= 1 else 1 + math.log10(size) * 1.4  # both are 1 where size is 1
     return math.copysign(bent, value)
 
 
@@ -293,12 +306,12 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
     taken = [box for spot in spots for box in _drawn(spot, x, y)]
     drawn = []
     for spot in spots:
-        at, down, wide = x(spot.x), y(symlog(spot.y)), 7.4 * len(spot.name)
-        tries = [
-            (at + side * 11 - (wide if side < 0 else 0), down + shift)
-            for shift in (0, -15, 15, -30, 30, -45, 45, -60, 60, -75, 75)
-            for side in (1, -1)
-        ]
+        at, down, wide = x(spot.x), y(symlog(spot.y)), _NAME_LETTER * len(spot.name)
+        # Places (left, middle) from the nearest on: to the right and the left, above and below.
+        tries = []
+        for shift in (0, -15, 15, -30, 30, -45, 45, -60, 60, -75, 75):
+            tries.append((at + 11, down + shift))
+            tries.append((at - 11 - wide, down + shift))
         inside = [t for t in tries if t[0] >= x.start and t[0] + wide <= x.end + 24]
         free = (t for t in inside if not any(_touch(_box(t, wide), other) for other in taken))
         left, middle = next(free, tries[0])
@@ -309,7 +322,7 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
 
 
 def _drawn(spot: Spot, x: Scale, y: Scale) -> list[tuple[float, float, float, float]]:
-    """What a mark takes, and each of its intervals."""
+    """What a mark takes, and each of its intervals: (left, top, right, bottom)."""
     at, down = x(spot.x), y(symlog(spot.y))
     found = [(at - 7, down - 7, at + 7, down + 7)]
     if spot.x_interval is not None:
@@ -362,6 +375,7 @@ class HeatMap:
 def heat(chart: HeatMap, name: str) -> Markup:
     """Rows of cells, the first on top; a cell without a value is left blank."""
     tall = 22 if chart.write else 15
+    # Names and means stand beside the cells, and take about 7 units a letter.
     left = 16 + 7.0 * max(len(row.name) for row in chart.rows)
     end = 10 + 7.0 * max(len(row.end) for row in chart.rows)
     width = 760.0
@@ -376,11 +390,11 @@ def heat(chart: HeatMap, name: str) -> Markup:
             said = element("title", f"{row.name}, {chart.columns[column]}: {chart.say(value)}")
             depth = f"{min(max(chart.shade(value), 0), 1):.3f}"
             x = left + column * wide
-            gap = 1 if chart.write else 0
+            gap = 1 if chart.write else 0  # thin columns without values are one surface
             cell = {"class_": "heat", "style": f"--depth:{depth}"}
             drawn.append(rectangle(x, y, wide - gap, tall - 1, said, **cell))
             if chart.write:
-                look = "cell deep" if float(depth) > 0.55 else "cell"
+                look = "cell deep" if float(depth) > 0.55 else "cell"  # light on a deep ground
                 drawn.append(text(x + wide / 2, y + tall / 2 + 4, chart.say(value), class_=look))
         drawn.append(text(width - 2, y + tall / 2 + 4, row.end, "end", class_="tick"))
     below = 6 + len(chart.rows) * tall

@@ -26,6 +26,7 @@ class At:
         if self.value is None:
             return self
         inner = self.value.get(key) if isinstance(self.value, dict) else self.value[key]
+        # A pointer has "/" between its words. "~" goes first, which the other one brings in.
         word = str(key).replace("~", "~0").replace("/", "~1")
         return At(inner, f"{self.path}/{word}")
 
@@ -35,7 +36,7 @@ class At:
         return (self[key] for key in keys)
 
     def __bool__(self) -> bool:
-        """Whether there is something."""
+        """Whether there is something; the number 0 and False are."""
         return self.value is not None and self.value not in ([], {}, ())
 
     def __str__(self) -> str:
@@ -76,13 +77,15 @@ def between(interval: At | tuple[At, At] | None, write: Callable[[At], Child]) -
     """The two ends of an interval, small; nothing for none."""
     if not interval:
         return None
-    return element(
-        "small", write(interval[0]), " to ", write(interval[1]), class_="interval", title="95 %"
-    )
+    low, high = write(interval[0]), write(interval[1])
+    return element("small", low, " to ", high, class_="interval", title="95 %")
 
 
 def farthest(*intervals: At) -> tuple[At, At] | None:
-    """The lowest lower end and the highest upper one of the intervals that are there."""
+    """The lowest lower end and the highest upper one of the intervals that are there.
+
+    Each keeps its path, so that the page still says where it came from.
+    """
     known = [interval for interval in intervals if interval]
     if not known:
         return None

@@ -5,6 +5,8 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
+from aegis_cli.cli.render.output import visible
+
 
 class Markup(str):
     """A text that is HTML already."""
@@ -12,7 +14,7 @@ class Markup(str):
     __slots__ = ()
 
 
-VOID = ("meta", "link", "img", "br", "source")
+VOID = ("meta", "link", "img", "br", "source")  # elements without an end tag
 Child = Any  # Markup, text or a number, a list of such, or None for nothing
 
 
@@ -22,11 +24,11 @@ def element(tag: str, /, *children: Child, **attributes: Any) -> Markup:
     Args:
         attributes: `class_` stands for `class`, and `_` for `-`; None leaves one out.
     """
-    written = "".join(
-        f' {key.rstrip("_").replace("_", "-")}="{escape(_plain(str(value)))}"'
-        for key, value in attributes.items()
-        if value is not None
-    )
+    written = ""
+    for key, value in attributes.items():
+        if value is not None:
+            name = key.rstrip("_").replace("_", "-")
+            written += f' {name}="{_text(value)}"'
     if tag in VOID:
         return Markup(f"<{tag}{written}>")
     return Markup(f"<{tag}{written}>{join(*children)}</{tag}>")
@@ -44,12 +46,9 @@ def _child(child: Child) -> str:
         return child
     if isinstance(child, (list, tuple)):
         return join(*child)
-    return escape(_plain(str(child)))
+    return _text(child)
 
 
-def _plain(text: str) -> str:
-    """A text whose control characters, which HTML has no place for, are written out."""
-    return "".join(
-        char.encode("unicode_escape").decode() if ord(char) < 32 and char not in "\n\t" else char
-        for char in text
-    )
+def _text(value: Any) -> str:
+    """A value as HTML, in which control characters have no place and some others a meaning."""
+    return escape(visible(str(value)))

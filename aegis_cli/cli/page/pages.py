@@ -7,6 +7,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from rich.console import RenderableType
+
 from aegis_cli.cli import render
 from aegis_cli.cli.page import about, charts, runs, studies
 from aegis_cli.cli.page.charts import HeatMap, Row, Spot
@@ -19,7 +21,8 @@ from aegis_cli.common import files
 from aegis_cli.common.version import __version__
 from aegis_cli.inspection import steps_taken
 
-# The page itself forbids what it never does, to load anything from elsewhere or to run a script.
+# The page itself forbids what it never does, to load anything from elsewhere or to run a script: a
+# browser keeps to it whatever a file's metadata may have brought in.
 _POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 
 
@@ -93,15 +96,14 @@ def _demonstrations(recipe: At) -> str:
 
 def _anchor(runs: Sequence[At]) -> str | None:
     """What the anchor was and whether a training read it; None without an anchor."""
-    used = sorted(
-        (run["anchor"] for run in runs if run["anchor"]), key=lambda a: not a["read"].value
-    )
+    used = [run["anchor"] for run in runs if run["anchor"]]
     if not used:
         return None
-    drift = (
-        "" if used[0]["read"].value else "; the drift is measured against it, no training read it"
-    )
-    return f"{used[0]['measured_on']}{drift}"
+    # One anchor serves all methods of a job, of which some may have read it.
+    told = next((anchor for anchor in used if anchor["read"].value), used[0])
+    if told["read"].value:
+        return str(told["measured_on"])
+    return f"{told['measured_on']}; the drift is measured against it, no training read it"
 
 
 def _trained(run: At, anchor: str | None) -> Markup:
@@ -131,9 +133,9 @@ def _precision(run: At) -> str:
 def _weights(recipe: At) -> list[tuple[str, str]]:
     """A line on the shares of several sets, where they are not those of their frames."""
     weights = recipe["demos"]["weights"]
-    return (
-        [("Their shares", " : ".join(f"{weight.value:g}" for weight in weights))] if weights else []
-    )
+    if not weights:
+        return []
+    return [("Their shares", " : ".join(f"{weight.value:g}" for weight in weights))]
 
 
 def _steps(run: At) -> str:
@@ -246,19 +248,21 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     shown = [c for c in _COLUMNS if any(row[c[0]].value is not None for row in rows)]
     gated = any(run["gate"].value is not None for run in own)
     header = ["Method", "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
-    cells = [
-        [
+    cells = []
+    for row, run in zip(rows, own, strict=True):  # the table's row of a method, and its run
+        cell: list[Child] = [
             run["label"],
             share(row["accuracy"]),
             [decimal(row["drop_points"]), between(row["drop_interval"], decimal)],
             decimal(row["cross_entropy"], 3),
-            *(write(row[name]) for name, _, write in shown),
-            *([verdict(run["gate"].value, "passed", "failed")] if gated else []),
         ]
-        for row, run in zip(rows, own, strict=True)
-    ]
+        cell += [write(row[name]) for name, _, write in shown]
+        if gated:
+            cell.append(verdict(run["gate"].value, "passed", "failed"))
+        cells.append(cell)
     explained = "Lost: percentage points of VQA accuracy, with the 95 % interval of one training."
     parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
+    # All methods are measured on the same frames, so that one figure is that of all.
     hold = next((row["hold_error"] for row in rows if row["hold_error"].value is not None), None)
     if hold is not None:
         parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
@@ -288,6 +292,7 @@ def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
         acted = row[name].value
         if acted is None:
             continue
+        # The table has no interval of a success, its run has; a return has none.
         ends = runs.rollout(run, "seen")["interval"].value if name == "success_seen" else None
         wide = None if ends is None else (100 * ends[0], 100 * ends[1])
         label, lost = str(row["method"]), row["drop_points"].value
@@ -322,28 +327,28 @@ def _seeds(compared: At) -> str:
 
 
 def _stream_study(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
-    compared = found["table"]
-    title = str(compared["name"])
-    streams = ", ".join(compared["streams"].value)
-    lead = f"{compared['finished']} of {compared['cells']} runs are finished, "
-    lead += f"on {streams} with seeds {_seeds(compared)}."
-    parts = [
-        _header("Study of streams", title, lead),
-        section("Results", *view(render.stream_study(report.table))),
-        about.commands(found),
-    ]
-    return title, parts
+    on = f"{', '.join(found['table']['streams'].value)} with"
+    results = render.stream_study(report.table)
+    return _streams_compared("Study of streams", found, on, results)
 
 
 def _robot_stream_study(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
+    on = f"{', '.join(found['table']['tasks'].value)}, one after the other, with"
+    results = render.robot_stream_study(report.table)
+    return _streams_compared("Study of a robot stream", found, on, results)
+
+
+def _streams_compared(
+    kind: str, found: At, on: str, results: RenderableType
+) -> tuple[str, list[Child]]:
+    """The page of a study of learners, with the tables that the terminal shows."""
     compared = found["table"]
     title = str(compared["name"])
-    tasks = ", ".join(compared["tasks"].value)
     lead = f"{compared['finished']} of {compared['cells']} runs are finished, "
-    lead += f"on {tasks}, one after the other, with seeds {_seeds(compared)}."
+    lead += f"on {on} seeds {_seeds(compared)}."
     parts = [
-        _header("Study of a robot stream", title, lead),
-        section("Results", *view(render.robot_stream_study(report.table))),
+        _header(kind, title, lead),
+        section("Results", *view(results)),
         about.commands(found),
     ]
     return title, parts
@@ -364,7 +369,7 @@ def _stream(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
 
 def _matrix(stream: At) -> list[Markup]:
     """What was reached on each task after each task, as a heat map and a table."""
-    rows = stream["oracle"] or stream["success"]
+    rows = stream["oracle"] or stream["success"]  # of images, or of robots
     if not rows:
         return []
     tasks = [str(task) for task in stream["tasks"]]

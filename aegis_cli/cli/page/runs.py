@@ -11,10 +11,10 @@ from aegis_cli.cli.page.charts import HeatMap, Row, Series, is_number
 from aegis_cli.cli.page.cursor import At, between, decimal, plain, share, whole, with_interval
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
+from aegis_cli.cli.render.layout import INSTRUCTIONS
 from aegis_cli.evaluation.results import Played, evaluated_on, told_apart
 
 _TICKS = 5  # below a heat map
-_INSTRUCTIONS = 10  # rows of a table by instruction
 
 
 def section(title: str, *children: Child) -> Markup:
@@ -58,6 +58,7 @@ def at_a_glance(run: At) -> Markup:
         accuracy = [share(vqa["accuracy"]), " %"]
         if vqa["baseline_accuracy"]:
             accuracy.append(element("small", "before: ", share(vqa["baseline_accuracy"]), " %"))
+        # The figures are those of one probe; of several sets it has to be said which one's.
         several = len(set(run["question_sets"].value)) > 1
         asked = f" on {run['question_sets'][0]}" if several else ""
         shown.append((f"VQA accuracy{asked}", accuracy))
@@ -79,8 +80,10 @@ def _acted_apart(rollouts: At) -> Iterator[tuple[str, Child]]:
     names = [_acted(played)[0] for played in each]
     for played, otherwise in zip(each, _otherwise(rollouts), strict=True):
         name, success = _acted(played)
-        told = [str(played["task"]), f"{played['episodes']} episodes", otherwise]
-        yield ", ".join([name, *filter(None, told)]) if names.count(name) > 1 else name, success
+        if names.count(name) > 1:
+            told = [str(played["task"]), f"{played['episodes']} episodes", otherwise]
+            name = ", ".join([name, *filter(None, told)])
+        yield name, success
 
 
 def _otherwise(rollouts: Iterable[At]) -> list[str]:
@@ -103,11 +106,11 @@ def successes(runs: Sequence[At]) -> Markup | None:
     each = [(run["label"], result) for run in runs for result in run["rollouts"]]
     if not each:
         return None
-    apart = _otherwise(result for _, result in each)
-    rows = [
-        (*_success(label, result["figures"]), *([otherwise] if any(apart) else []))
-        for (label, result), otherwise in zip(each, apart, strict=True)
-    ]
+    apart = _otherwise(result for _, result in each)  # all empty where all were played alike
+    rows = []
+    for (label, result), otherwise in zip(each, apart, strict=True):
+        row = _success(label, result["figures"])
+        rows.append((*row, otherwise) if any(apart) else row)
     header = (
         "Run",
         "Task",
@@ -181,9 +184,9 @@ def _by_instruction(run: At, found: At) -> Markup | None:
             _off(one),
             decimal(one["hold_error"], 3),
         )
-        for one in every[:_INSTRUCTIONS]
+        for one in every[:INSTRUCTIONS]  # the worst come first
     ]
-    which = "" if len(every) <= _INSTRUCTIONS else f"the worst {_INSTRUCTIONS} of "
+    which = "" if len(every) <= INSTRUCTIONS else f"the worst {INSTRUCTIONS} of "
     title = f"{run['label']}, {evaluated_on(found.value)}: {which}{len(every):,} instructions"
     return table(("Instruction", "Episodes", "Frames", "Relative error", "Hold's"), rows, 1, title)
 
@@ -234,16 +237,17 @@ def _by_questions(runs: Sequence[At]) -> dict[tuple[str, int, int], dict[str, At
         label = str(run["label"])
         for name, probed in zip(run["question_sets"], run["probes"], strict=True):
             figures, again = probed["figures"], 0
-            while label in found.get(key := (str(name), figures["questions"].value, again), ()):
+            count = figures["questions"].value
+            while label in found.get((str(name), count, again), ()):
                 again += 1
-            found.setdefault(key, {})[label] = figures
+            found.setdefault((str(name), count, again), {})[label] = figures
     return found
 
 
 def _family(name: str, probes: Sequence[At]) -> list[Child]:
     """A row: the family's figures in each run's probe."""
     own = [p["families"][name] for p in probes]
-    first = next(family for family in own if family)
+    first = next(family for family in own if family)  # a question's facts are those of any probe
     row: list[Child] = [name, whole(first["questions"]), share(first["majority"])]
     row.append(share(first["baseline_accuracy"]))
     for family in own:
@@ -262,8 +266,10 @@ def wrong_answers(runs: Sequence[At]) -> Markup | None:
     """Some wrong answers of each run with their images."""
     parts: list[Child] = []
     for run in runs:
-        if examples := probe(run, "wrong")["wrong"]:
-            parts.append(element("h3", run["label"]) if len(runs) > 1 else None)
+        examples = probe(run, "wrong")["wrong"]
+        if examples:
+            if len(runs) > 1:
+                parts.append(element("h3", run["label"]))
             parts.append(element("div", *map(_wrong, examples), class_="wrong"))
     if not parts:
         return None
@@ -290,6 +296,7 @@ def _wrong(example: At) -> Markup:
 
 # --- learning -------------------------------------------------------------------------------------
 
+# A field of metrics.jsonl, its title, whether its axis is logarithmic, and a factor.
 _CURVES = (
     ("loss", "Training loss", True, 1.0),
     ("validation_loss", "Validation loss", False, 1.0),
@@ -303,10 +310,10 @@ def curves(runs: Sequence[At]) -> Markup:
     """What metrics.jsonl logged, a chart for each figure that some run has."""
     drawn = []
     for name, title, log, scale in _CURVES:
-        series = [
-            Series(str(run["label"]), _points(run["metrics"].value, name, scale), number, True)
-            for number, run in enumerate(runs)
-        ]
+        series = []
+        for number, run in enumerate(runs):
+            points = _points(run["metrics"].value, name, scale)
+            series.append(Series(str(run["label"]), points, number, marks=True))
         if any(s.points for s in series):
             chart = charts.lines(series, "step", title, title, log)
             drawn.append(figure(chart))
@@ -316,6 +323,7 @@ def curves(runs: Sequence[At]) -> Markup:
 
 
 def _points(lines: Sequence[dict[str, Any]], name: str, scale: float) -> list[tuple[float, float]]:
+    """(step, value) of the lines that have the figure: not every line has every one."""
     return [(line["step"], scale * line[name]) for line in lines if is_number(line.get(name))]
 
 
@@ -323,7 +331,8 @@ def drift(runs: Sequence[At]) -> Markup | None:
     """Squared W2 distance of each layer's activations to the anchor's."""
     series, rows, names = [], [], []
     for number, run in enumerate(runs):
-        if not (layers := probe(run, "layers")["layers"]):
+        layers = probe(run, "layers")["layers"]
+        if not layers:  # no probe of it was given an anchor
             continue
         w2 = [layer["w2"] for layer in layers]
         points = [(k, at.value) for k, at in enumerate(w2) if is_number(at.value)]
@@ -354,19 +363,18 @@ def energy(runs: Sequence[At]) -> Iterator[Markup]:
             continue
         shares = [part for b in bins.value for part in b["layers"] if part > 0]
         most = max(shares, default=1.0)
+        # Four decades at most: beyond them the largest shares would all look alike.
         least = max(min(shares, default=most / 10), most / 1e4)
+        rows = []
+        for k, layer in enumerate(layers.value):
+            over_time = [b["layers"][k] or None for b in bins.value]  # 0 has no logarithm: blank
+            rows.append(Row(layer["name"], over_time, f"{100 * layer['energy_shed']:.2g} %"))
         chart = HeatMap(
-            rows=[
-                Row(
-                    layer["name"],
-                    [b["layers"][k] or None for b in bins.value],
-                    f"{100 * layer['energy_shed']:.2g} %",
-                )
-                for k, layer in enumerate(layers.value)
-            ],
+            rows=rows,
             columns=[f"steps {b['first_step']} to {b['last_step']}" for b in bins.value],
             edges=_edges(bins.value),
             x_label="training step",
+            # Bound now, for the next run has other ends.
             shade=lambda value, low=least, high=most: _log_share(value, low, high),
             say=lambda value: f"{100 * value:.3g} % shed",
         )
@@ -410,6 +418,7 @@ def _edges(bins: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
     """About five ticks: a column's number, and the step that it begins with."""
     every = max(1, round(len(bins) / _TICKS))
     found = [(float(k), str(bins[k]["first_step"])) for k in range(0, len(bins), every)]
+    # The end of the last column too, where the tick before it leaves room for its number.
     if len(bins) - found[-1][0] > every / 2:
         found.append((float(len(bins)), str(bins[-1]["last_step"])))
     return found

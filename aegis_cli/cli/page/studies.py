@@ -33,6 +33,7 @@ def frontier(compared: At, report: Any) -> Markup | None:
     """
     number = {method: place for place, method in enumerate(coloured_methods(report))}
     chosen = chosen_task(report)
+    # The document has its tasks in the report's order.
     spots = [] if chosen is None else _means(compared, report.tasks.index(chosen), number)
     tried, curves = _tried(compared, number)
     if not spots and not tried:
@@ -57,12 +58,13 @@ def _means(compared: At, task: int, number: dict[str, int]) -> list[Spot]:
     """The compared variants of one task, as far as they were rolled out."""
     found = []
     for result in compared["tasks"][task]["results"]:
-        acted = result[_SEEN] or result[_RETURN]
+        acted = result[_SEEN] or result[_RETURN]  # a task has one of them
         lost = result[_LOST]
         if not acted or not lost:
             continue
-        wide, tall = _span(acted, 100), _span(lost, 1)
         own = number.get(str(result["method"]), _REST)
+        # Shares become percent; what was lost is in percentage points already.
+        wide, tall = _span(acted, 100), _span(lost, 1)
         x, y = 100 * acted["mean"].value, lost["mean"].value
         found.append(Spot(str(result["variant"]), x, y, wide, tall, own))
     return found
@@ -77,7 +79,7 @@ def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Serie
     """The values of knobs that did not diverge, and the lines that join a variant's."""
     spots, lines = [], {}
     for point in compared["tuning"]:
-        if point["success"].value is None:
+        if point["success"].value is None:  # it diverged
             continue
         own = number.get(str(point["method"]), _REST)
         place: Point = (
@@ -98,18 +100,14 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
         asked = f", asked {task['vqa']}" if task["vqa"] else ""
         fields = [name for name in _DECLARED if any(r[name] for r in task["results"])]
         barred = any(r["bar"] for r in task["results"])
-        knobs = [knob_text(row) for row in found.results]
         turned = any(row.knob is not None for row in found.results)
+        # A column that no variant has anything for is left out: a list times False is empty.
         header = ["Variant", *["Knob"] * turned, *(_DECLARED[name].header for name in fields)]
-        rows = [
-            [
-                result["variant"],
-                *[knob] * turned,
-                *(_figure(result[name], name) for name in fields),
-                *([_bar(result)] if barred else []),
-            ]
-            for result, knob in zip(task["results"], knobs, strict=True)
-        ]
+        rows = []
+        for result, own in zip(task["results"], found.results, strict=True):
+            row: list[Child] = [result["variant"], *[knob_text(own)] * turned]
+            row += [_figure(result[name], name) for name in fields]
+            rows.append(row + [_bar(result)] * barred)
         yield section(
             f"{task['task']}{asked}",
             note(
@@ -117,7 +115,7 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
                 "t, which may reach beyond 0 and 100 %, and the crossed bootstrap. ",
                 *_before(task),
             ),
-            table(header + ["Bar"] * barred, rows, left=1 + turned),
+            table(header + ["Bar"] * barred, rows, left=1 + turned),  # the knob is a text too
             _demands(task["results"]) if barred else None,
         )
 
@@ -166,7 +164,7 @@ def _bar(result: At) -> Child:
 def _demands(results: At) -> Markup:
     """Each demand of the bar with each variant's figure."""
     barred = [result for result in results if result["bar"]]
-    demands = barred[0]["bar"]["checks"]
+    demands = barred[0]["bar"]["checks"]  # the same for every variant
     rows = []
     for number, demand in enumerate(demands):
         checks = [result["bar"]["checks"][number] for result in barred]
@@ -183,6 +181,6 @@ def _demands(results: At) -> Markup:
 def _checked(check: At) -> Sequence[Child]:
     """A demand's figure, its verdict, and below them the interval by whose end it is judged."""
     judged, value, digits = verdict(check["passed"].value), check["value"].value, 2
-    if value is not None and not check["interval"]:
+    if value is not None and not check["interval"]:  # else an end is judged, not this value
         digits = deciding_decimals(value, check["demand"].value, digits)
     return [decimal(check["value"], digits), " ", judged, between(check["interval"], decimal)]

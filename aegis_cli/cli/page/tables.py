@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.table import Table
-from rich.text import Text
 
 from aegis_cli.cli.page.html import Child, Markup, element
-from aegis_cli.cli.render.layout import paragraphs
+from aegis_cli.cli.render.layout import paragraphs, parts_of
 
 
 def table(
@@ -34,7 +33,7 @@ def table(
 
 def _cells(row: Sequence[Child], left: int) -> Iterator[Markup]:
     for i, cell in enumerate(row):
-        if isinstance(cell, Markup) and cell.startswith("<td"):
+        if isinstance(cell, Markup) and cell.startswith("<td"):  # as `shaded` makes it
             yield cell
         elif i == 0:
             yield element("th", cell, scope="row")
@@ -44,7 +43,8 @@ def _cells(row: Sequence[Child], left: int) -> Iterator[Markup]:
 
 def shaded(cell: Child, depth: float) -> Markup:
     """A cell whose ground is the deeper, the nearer `depth` is to 1."""
-    return element("td", cell, class_="shade", style=f"--depth:{min(max(depth, 0), 1):.3f}")
+    inside = min(max(depth, 0), 1)
+    return element("td", cell, class_="shade", style=f"--depth:{inside:.3f}")
 
 
 def verdict(passed: bool | None, yes: str = "yes", no: str = "no") -> Child:
@@ -62,22 +62,19 @@ def pairs(values: Sequence[tuple[str, Child]], big: bool = False) -> Markup:
 
 def view(shown: RenderableType) -> Iterator[Markup]:
     """The parts of what a terminal shows, a `Text`, a `Table`, or a `Group` of such."""
-    match shown:
-        case Group():
-            for part in shown.renderables:
-                yield from view(part)
-        case Table():
-            yield _terminal_table(shown)
-        case Text():
-            for line in paragraphs(shown):
-                yield element("h3" if shown.style == "bold" else "p", line)
-        case _:
-            raise TypeError(f"no HTML for a {type(shown).__name__}")
+    for part in parts_of(shown):
+        if isinstance(part, Table):
+            yield _terminal_table(part)
+            continue
+        for line in paragraphs(part):
+            yield element("h3" if part.style == "bold" else "p", line)
 
 
 def _terminal_table(shown: Table) -> Markup:
     header = [str(column.header) for column in shown.columns]
-    left = sum(column.justify != "right" for column in shown.columns)
-    rows = zip(*(map(str, column.cells) for column in shown.columns), strict=True)
+    left = sum(column.justify != "right" for column in shown.columns)  # texts come first
+    # rich keeps cells by column, HTML has them by row.
+    columns = [[str(cell) for cell in column.cells] for column in shown.columns]
+    rows = [list(row) for row in zip(*columns, strict=True)]
     title = str(shown.title) if shown.title else None
-    return table(header, [list(row) for row in rows], left, title)
+    return table(header, rows, left, title)

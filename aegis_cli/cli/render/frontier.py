@@ -167,11 +167,15 @@ def _named(tried: Sequence[Any], compared: Sequence[Any]) -> list[str]:
 
 def _unbeaten(spots: Sequence[tuple[str, float, float]]) -> list[str]:
     """Methods of which no other succeeds more often and loses less, the most successful first."""
-    best = [
-        (success, method)
-        for method, success, lost in spots
-        if not any(s >= success and x <= lost and (s, x) != (success, lost) for _, s, x in spots)
-    ]
+    best = []
+    for method, success, lost in spots:
+        beaten = False
+        for _, other_success, other_lost in spots:
+            as_good = other_success >= success and other_lost <= lost
+            if as_good and (other_success, other_lost) != (success, lost):
+                beaten = True
+        if not beaten:
+            best.append((success, method))
     return [method for _, method in sorted(best, reverse=True)]
 
 
@@ -192,7 +196,7 @@ def _draw_tried(axis: Any, points: Sequence[Any], color: str) -> None:
 
 def _draw_compared(axis: Any, result: Any, color: str) -> None:
     success, lost = _compared_at(result)
-    front = 4 if color == _REST else 5
+    front = 4 if color == _REST else 5  # grey lies behind what has a colour
     bars = {"xerr": _bars(_acts(result), 100), "yerr": _bars(result.drop_points, 1)}
     shade = 0.25 if color == _REST else 0.45
     look = {"ecolor": color, "elinewidth": 1.1, "alpha": shade, "fmt": "none"}
@@ -202,6 +206,7 @@ def _draw_compared(axis: Any, result: Any, color: str) -> None:
 
 
 def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
+    """The lengths of an interval's two sides [2, 1], as matplotlib has error bars."""
     if estimate.ends is None:
         return None
     low, high = estimate.ends
@@ -224,10 +229,10 @@ def _scale(axis: Any, report: Any) -> None:
         right = min(right, 101.0)
     axis.set(xlabel=acting_axis(report), ylabel=_COLUMNS[_LOST].axis, xlim=(left, right))
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)
-    axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
     axis.set_yticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
     axis.minorticks_off()
-    axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)  # ticks widened it
+    # After the ticks, which widen the axis to the last of them. The larger end is below.
+    axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
     title = f"{report.name}: VQA accuracy lost against success, {shown_tasks(report)}"
@@ -281,17 +286,18 @@ def _labels(tried: Sequence[Any], compared: Sequence[Any], colors: dict[str, str
     for name, points in _curves(tried).items():
         named = next((p for p in points if p.chosen), points[-1])
         placed.setdefault(name, (_tried_at(named), named.method))
-    names = [
-        Label(*spot, name, colors[method], *((8, False) if colors[method] == _REST else (10, True)))
-        for name, (spot, method) in placed.items()
-    ]
-    values = [
-        Label(*_tried_at(p), value_text(p.value), colors[p.method], 7, False)
-        for p in tried
-        if p.value is not None and colors[p.method] != _REST
-    ]
+    labels = []
+    for name, (spot, method) in placed.items():
+        color = colors[method]
+        size, bold = (8, False) if color == _REST else (10, True)
+        labels.append(Label(*spot, name, color, size, bold))
+    for point in tried:
+        color = colors[point.method]
+        if point.value is not None and color != _REST:
+            text = value_text(point.value)
+            labels.append(Label(*_tried_at(point), text, color, size=7, bold=False))
     # The larger a label, the harder it is to place: those go first.
-    return sorted([*names, *values], key=lambda label: -label.size)
+    return sorted(labels, key=lambda label: -label.size)
 
 
 def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, float]]:

@@ -19,11 +19,9 @@ from aegis_cli.data.episodes import as_text
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
     """The facts, then the tables that there are; tensors are listed where they are asked for."""
-    shed = {} if report.energy_shed_mean is None else {"energy_shed_mean": report.energy_shed_mean}
-    facts = _as_they_are_read(report.facts)
-    parts: list[RenderableType] = [
-        pairs({"kind": report.kind, "path": report.path, **facts, **shed})
-    ]
+    facts = {"kind": report.kind, "path": report.path, **_as_they_are_read(report.facts)}
+    facts["energy_shed_mean"] = report.energy_shed_mean  # without a line where it is None
+    parts: list[RenderableType] = [pairs(facts)]
     if report.kind == "run":
         parts += _measured(report)
     if report.tensors and not tensors:
@@ -68,10 +66,10 @@ def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     # An anchor's maps that share a spectrum are rows of its table, with the same figures.
     apart = ("planned_steps", "measured_before", "shared")
     left = {name: value for name, value in facts.items() if name not in apart}
-    if merged := facts.get("merge"):
+    merged = facts.get("merge")
+    if merged:
         # A merge whose sweep measured no validation loss has none.
-        told = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
-        left["merge"] = told
+        left["merge"] = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
     if planned is None or steps is None or steps >= planned:
         return left
     return left | {"steps": _steps_taken(steps, planned)}
@@ -92,17 +90,23 @@ def _measured(report: Any) -> list[RenderableType]:
         parts.append(_evaluated(report.open_loops))
     if report.probes:
         parts.append(_known(report.probes, report.question_sets))
-    if not parts and (into := report.facts.get("merged_into")):
-        return [Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")]
     if not parts:
-        does = "aegis probe, aegis rollout and aegis evaluate do that"
-        if before := report.facts.get("measured_before"):
-            steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
-            of = f"what is measured is of {steps}, and not of the last checkpoint"
-            return [Text(f"{of}: measure again ({does})\n")]
-        return [Text(f"nothing is measured yet: {does}")]
+        return [_not_measured(report.facts)]
     verdict = {True: "passed", False: "failed", None: "none: no drop was held to a limit"}
     return [*parts, Text(f"gate: {verdict[report.gate]}\n")]
+
+
+def _not_measured(facts: Mapping[str, Any]) -> Text:
+    """Why a run has no figures, and how it gets some."""
+    into, before = facts.get("merged_into"), facts.get("measured_before")
+    if into:
+        return Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")
+    does = "aegis probe, aegis rollout and aegis evaluate do that"
+    if before:  # the run went on since
+        steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
+        of = f"what is measured is of {steps}, and not of the last checkpoint"
+        return Text(f"{of}: measure again ({does})\n")
+    return Text(f"nothing is measured yet: {does}")
 
 
 def _played(rollouts: Sequence[Any]) -> Table:
@@ -188,9 +192,10 @@ def _spectra(what: str, sites: Sequence[Any]) -> Table:
 def _stored(site: Any) -> str:
     if site.same_as is not None:
         # It stands right above: what both names begin with says nothing.
-        first = zip(site.name.split("."), site.same_as.split("."), strict=False)
-        alike = sum(1 for _ in takewhile(lambda words: words[0] == words[1], first))
-        return f"with {'.'.join(site.same_as.split('.')[alike:])}"
+        own, other = site.name.split("."), site.same_as.split(".")
+        pairwise = zip(own, other, strict=False)
+        alike = sum(1 for _ in takewhile(lambda words: words[0] == words[1], pairwise))
+        return f"with {'.'.join(other[alike:])}"
     return "-" if site.stored is None else str(site.stored)
 
 
@@ -201,13 +206,13 @@ def _features(features: Sequence[Any]) -> Table:
     rows = []
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))
-        columns = [feature.statistics.get(name, ()) for name in shown]
+        columns = [feature.statistics.get(name, ()) for name in shown]  # one number a component
         count = max(1, *map(len, columns))
         parts = list(feature.components)
         if count == 1 and feature.dtype in ("image", "video"):
             parts = []  # without statistics, nothing is told of a picture's colours
         names = [f"{feature.name} {part}".rstrip() for part in parts]
-        names += [feature.name] * (count - len(names))
+        names += [feature.name] * (count - len(names))  # statistics of components without names
         for i, name in enumerate(names):
             figures = [number(column[i]) if i < len(column) else "-" for column in columns]
             rows.append((name, *kind, *figures))
@@ -221,9 +226,13 @@ def _as_ranges(layers: Sequence[str]) -> str:
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
+    """The course of the energy in a few lines; a report has many more bins, for a plot."""
     size = max(1, math.ceil(len(bins) / rows))
-    chunks = [bins[i : i + size] for i in range(0, len(bins), size)]
-    lines = [(_steps(c[0].first_step, c[-1].last_step), percent(_mean_shed(c), 3)) for c in chunks]
+    lines = []
+    for i in range(0, len(bins), size):
+        chunk = bins[i : i + size]
+        steps = _steps(chunk[0].first_step, chunk[-1].last_step)
+        lines.append((steps, percent(_mean_shed(chunk), 3)))
     return plain_table(("Steps", "Energy shed, mean %"), lines)
 
 
@@ -283,8 +292,9 @@ def _shown_columns(report: Any) -> dict[str, list[Cell]]:
             continue
         shown[name] = [*cells]
         if name in _BETTER and name not in apart:
-            figure, more = _BETTER[name]
-            shown[name] = marked(cells, [getattr(row, figure) for row in report.rows], more)
+            field, more_is_better = _BETTER[name]
+            values = [getattr(row, field) for row in report.rows]
+            shown[name] = marked(cells, values, more_is_better)
     return shown
 
 

@@ -51,6 +51,7 @@ def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float
     """
     from matplotlib.patheffects import withStroke
 
+    # From here on in pixels, in which a label has its size; a log scale is bent in data.
     points = [tuple(axis.transData.transform(spot)) for spot in taken]
     frame, written = Box(*axis.bbox.extents), _written(axis)
     for label in labels:
@@ -65,7 +66,7 @@ def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float
             va="bottom",
             zorder=8,
         )
-        text.set_in_layout(False)
+        text.set_in_layout(False)  # else the layout would make room, and every place be another
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         extent = text.get_window_extent()
         mark = tuple(axis.transData.transform((label.x, label.y)))
@@ -88,9 +89,10 @@ def _places(mark: tuple[float, float], width: float, height: float) -> Iterator[
     """Boxes of that size around a mark, each with its distance."""
     for reach in _REACHES:
         for k in range(_ANGLES):
-            right, up = (f(2 * math.pi * k / _ANGLES) for f in (math.cos, math.sin))
-            x = mark[0] + right * (reach + width / 2) - width / 2
-            y = mark[1] + up * (reach + height / 2) - height / 2
+            angle = 2 * math.pi * k / _ANGLES
+            # The box's centre lies on an ellipse that grows with the box.
+            x = mark[0] + math.cos(angle) * (reach + width / 2) - width / 2
+            y = mark[1] + math.sin(angle) * (reach + height / 2) - height / 2
             yield reach, Box(x, y, x + width, y + height)
 
 
@@ -101,6 +103,7 @@ def _cost(
     points: Sequence[tuple[float, float]],
     frame: Box,
 ) -> float:
+    """What a place costs; the distance in pixels is the unit of all the rest."""
     area = (box.right - box.left) * (box.high - box.low)
     overlaps = [box.overlap(other) / area for other in written]
     covered = sum(box.holds(*point) for point in points)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.wide_table import WideTable
 
+INSTRUCTIONS = 10  # rows of a table by instruction; --json has all
 _SUCCESSES = {
     "Success seen %": "success_seen",
     "Success held-out %": "success_held_out",
@@ -45,14 +47,20 @@ def marked(
         more_is_better: None for a column with no good end.
     """
     known = {value: cell for cell, value in zip(cells, values, strict=True) if value is not None}
-    if more_is_better is None or len(set(known.values())) < 2:
+    apart = len(set(known.values()))  # texts, so that what differs in unseen digits is alike
+    if more_is_better is None or apart < 2:
         return list(cells)
-    ends = known[min(known)], known[max(known)]
-    worst, best = ends if more_is_better else ends[::-1]
-    marks = {best: BEST} if len(set(known.values())) == 2 else {best: BEST, worst: WORST}
-    return [
-        Text(marks[cell] + cell, _STYLES[marks[cell]]) if cell in marks else cell for cell in cells
-    ]
+    worst, best = known[min(known)], known[max(known)]
+    if not more_is_better:
+        worst, best = best, worst
+    marks = {best: BEST}
+    if apart > 2:
+        marks[worst] = WORST
+    shown: list[Cell] = []
+    for cell in cells:
+        mark = marks.get(cell)
+        shown.append(cell if mark is None else Text(mark + cell, _STYLES[mark]))
+    return shown
 
 
 def unmarked(cell: Text) -> tuple[str, str]:
@@ -69,6 +77,7 @@ def plain_table(
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
+        # As a `Text`: rich would take what stands in brackets in a string for markup.
         table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
@@ -86,8 +95,25 @@ def number(value: float | None, significant: int = 4) -> str:
     """Four significant digits; a large number whole, as long as it can be read."""
     if value is None:
         return "-"
+    # From 9999.5 on four digits round to 10000, which `g` would write as 1e+04.
     whole = 10**significant - 0.5 <= abs(value) < 1e9
     return f"{value:,.0f}" if whole else f"{value:.{significant}g}"
+
+
+def parts_of(view: RenderableType) -> Iterator[Table | Text]:
+    """The tables and texts of what a terminal shows, in their order, out of all `Group`s.
+
+    Raises:
+        TypeError: something else, which neither Markdown nor a page has a form for.
+    """
+    match view:
+        case Group():
+            for part in view.renderables:
+                yield from parts_of(part)
+        case Table() | Text():
+            yield view
+        case _:
+            raise TypeError(f"neither a table nor a text: a {type(view).__name__}")
 
 
 def paragraphs(text: Text) -> list[str]:
@@ -98,7 +124,9 @@ def paragraphs(text: Text) -> list[str]:
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:
     """`mean ±half`: the distance of the farther end; the mean alone of a single run."""
-    if estimate is None or estimate.half is None:
-        return "-" if estimate is None else show(estimate.mean)
-    # of differences `show` writes the sign
-    return f"{show(estimate.mean)} ±{show(estimate.half).removeprefix('+')}"
+    if estimate is None:
+        return "-"
+    if estimate.half is None:
+        return show(estimate.mean)
+    half = show(estimate.half).removeprefix("+")  # of differences `show` writes the sign
+    return f"{show(estimate.mean)} ±{half}"

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import BEST, paragraphs, unmarked
+from aegis_cli.cli.render.layout import BEST, paragraphs, parts_of, unmarked
 from aegis_cli.common.files import write_text
 
 
@@ -28,29 +28,26 @@ def markdown(view: RenderableType) -> str:
     Args:
         view: a `Text`, a `Table`, or a `Group` of such.
     """
-    return "\n\n".join(_parts(view)) + "\n"
+    return "\n\n".join(_blocks(view)) + "\n"
 
 
-def _parts(view: RenderableType) -> Iterator[str]:
-    match view:
-        case Group():
-            for part in view.renderables:
-                yield from _parts(part)
-        case Table():
-            if view.title:
-                yield f"**{view.title}**"
-            yield _table(view)
-        case Text():
-            for line in paragraphs(view):
-                yield f"**{line}**" if view.style == "bold" else line
-        case _:
-            raise TypeError(f"no Markdown for a {type(view).__name__}")
+def _blocks(view: RenderableType) -> Iterator[str]:
+    for part in parts_of(view):
+        if isinstance(part, Table):
+            if part.title:
+                yield f"**{part.title}**"
+            yield _table(part)
+            continue
+        for line in paragraphs(part):
+            yield f"**{line}**" if part.style == "bold" else line
 
 
 def _table(table: Table) -> str:
     header = [str(column.header) for column in table.columns]
     rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
-    rows = zip(*(map(_cell, column.cells) for column in table.columns), strict=True)
+    # rich keeps cells by column, Markdown has them by row.
+    columns = [[_cell(cell) for cell in column.cells] for column in table.columns]
+    rows = zip(*columns, strict=True)
     return "\n".join(map(_row, (header, rules, *rows)))
 
 
@@ -63,4 +60,5 @@ def _cell(cell: RenderableType) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    escaped = [cell.replace("|", r"\|") for cell in cells]  # which would end its cell
+    return f"| {' | '.join(escaped)} |"

@@ -59,8 +59,11 @@ def _points(report: Any) -> Any:
 def _next(report: Any) -> str:
     """What to do with the finding: a strength that was chosen has to be judged on other data."""
     if report.out is not None:
-        asked = [] if report.vqa in (None, "scenes") else ["--vqa", report.vqa]
-        asked += [] if report.ask in (None, "{}") else ["--ask", report.ask]
+        asked = []  # what is not the default of `aegis probe`
+        if report.vqa not in (None, "scenes"):
+            asked += ["--vqa", report.vqa]
+        if report.ask not in (None, "{}"):
+            asked += ["--ask", report.ask]
         probe = commands.aegis("probe", report.out, "--baseline", report.base, *asked)
         return f"now ask the test questions: {probe}"
     if report.passed is False:
@@ -82,7 +85,7 @@ def merge_plot(report: Any, path: Path) -> None:
 def _frontier(report: Any) -> Any:
     drawn = figure(figsize=(6.4, 4.4), layout="constrained")
     axis = drawn.subplots()
-    field, unit, name = _task_axis(report.points[0])
+    field, unit, name = _task_axis(report.points[0])  # all points have the same figures
     across = [unit * getattr(point, field) for point in report.points]
     lost = [p.drop_points for p in report.points]
     axis.plot(across, lost, "o-", color=_COLOR, markersize=5)

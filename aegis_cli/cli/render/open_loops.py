@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import fixed, number, plain_table
+from aegis_cli.cli.render.layout import INSTRUCTIONS, fixed, number, plain_table
 from aegis_cli.cli.render.plots import figure, literal, save_figure
 from aegis_cli.cli.render.tables import pairs
 
@@ -19,7 +19,6 @@ _RECORDED, _PREDICTED = "0.25", "#0072b2"
 _TITLE_CHARACTERS = 44  # of a line of the title, for each episode beside another
 _ROWS = 16  # of the table by steps ahead
 _WIDEST = 100  # characters of an instruction
-_INSTRUCTIONS = 10  # rows of the table by instruction
 _SPLITS = {
     "validation": "the run's validation episodes",
     "other data": "all of data that the run was not trained on",
@@ -67,10 +66,12 @@ def _by_dimension(report: Any) -> Table:
         shown["Hold's RMSE"] = lambda d: number(d.hold_rmse)
     units = any(d.unit for d in report.dimensions)
     names = ("Action", "Unit") if units else ("Action",)
-    rows = [
-        (d.name, *([d.unit or "-"] if units else []), *(show(d) for show in shown.values()))
-        for d in report.dimensions
-    ]
+    rows = []
+    for dimension in report.dimensions:
+        row = [dimension.name]
+        if units:
+            row.append(dimension.unit or "-")
+        rows.append(row + [show(dimension) for show in shown.values()])
     return plain_table((*names, *shown), rows, left=len(names))
 
 
@@ -78,6 +79,7 @@ def _by_step(report: Any) -> Table:
     """At most `_ROWS` steps, spread evenly, with the first and the last."""
     count = len(report.horizon)
     rows = min(count, _ROWS)
+    # From 0 to the last one; a horizon of one step has no distance to divide.
     picked = sorted({round(i * (count - 1) / max(1, rows - 1)) for i in range(rows)})
     shown = {"Steps ahead": lambda step: str(step.step)}
     if report.fps is not None:
@@ -100,7 +102,7 @@ def _by_instruction(report: Any) -> Iterator[RenderableType]:
     if report.hold_error is not None:
         header = (*header, "Hold's")
     lines = []
-    for one in every[:_INSTRUCTIONS]:
+    for one in every[:INSTRUCTIONS]:  # the worst come first
         ends = "-"
         if one.relative_interval is not None:
             ends = " to ".join(fixed(end, 3) for end in one.relative_interval)
@@ -108,14 +110,16 @@ def _by_instruction(report: Any) -> Iterator[RenderableType]:
         line = (_short(one.instruction), f"{one.episodes:,}", f"{one.frames:,}", error, ends)
         lines.append(line if report.hold_error is None else (*line, fixed(one.hold_error, 3)))
     yield plain_table(header, lines)
-    if len(every) > _INSTRUCTIONS:
-        yield Text(f"the worst {_INSTRUCTIONS} of {len(every):,} instructions; --json has all")
+    if len(every) > INSTRUCTIONS:
+        yield Text(f"the worst {INSTRUCTIONS} of {len(every):,} instructions; --json has all")
 
 
 def _short(instruction: str) -> str:
     """An instruction as a table shows it; a long one would push the errors out of sight."""
-    said = " ".join(instruction.split())
-    return (said if len(said) <= _WIDEST else f"{said[: _WIDEST - 1]}…") or "(none)"
+    said = " ".join(instruction.split())  # on one line
+    if len(said) > _WIDEST:
+        said = f"{said[: _WIDEST - 1]}…"
+    return said or "(none)"
 
 
 def open_loop_plot(report: Any, path: Path) -> None:
@@ -152,7 +156,7 @@ def _drawn(report: Any) -> Any:
 def _draw_trace(axis: Any, trace: Any, dimension: int) -> None:
     """One dimension along one episode; each chunk is a line of its own, from a dot on."""
     axis.plot(trace.recorded[:, dimension], color=_RECORDED, linewidth=1.2)
-    predicted = trace.predicted[:, dimension]
+    predicted = trace.predicted[:, dimension]  # [T], as `recorded`, of actions chunk after chunk
     for first in range(0, len(predicted), trace.replan):
         frames = range(first, min(first + trace.replan, len(predicted)))
         axis.plot(frames, predicted[frames.start : frames.stop], color=_PREDICTED, linewidth=1.2)

@@ -34,10 +34,9 @@ def error(problem: AegisError) -> None:
     to = console(sys.stderr)
     for label, style in (("found", "bold red"), ("expected", "bold"), ("fix", "bold green")):
         text = visible(getattr(problem, label))
-        to.print(
-            Text.assemble((f"{label}:", style), "" if text.startswith("\n") else " ", text),
-            soft_wrap=True,
-        )
+        between = "" if text.startswith("\n") else " "  # several problems are a list below
+        # Not wrapped, so that a command in it can be copied, and a line is found by grep.
+        to.print(Text.assemble((f"{label}:", style), between, text), soft_wrap=True)
 
 
 def note(text: str) -> None:
@@ -59,6 +58,7 @@ def show(
         to = console(sys.stdout)
         if wide:
             to.width = _UNLIMITED
+        # Not printed right away: rich fills the last column of a table with blanks.
         with to.capture() as printed:
             to.print(table(_visible_in(report)))
         text(_without_trailing_blanks(printed.get()))
@@ -72,13 +72,14 @@ def _without_trailing_blanks(text: str) -> str:
 def visible(text: str) -> str:
     """A text whose control characters are written out, but for line ends and tabs.
 
-    A file's metadata could else move the terminal's cursor, or set its title.
+    A file's metadata could else move the terminal's cursor, or set its title. Nor can a byte of a
+    file's name that is no text, which Python has as half of a surrogate pair, be written in UTF-8.
     """
-    return "".join(_escaped(char) if _controls(char) else char for char in text)
+    return "".join(_escaped(char) if _is_unwritable(char) else char for char in text)
 
 
-def _controls(char: str) -> bool:
-    return char not in "\n\t" and unicodedata.category(char) == "Cc"
+def _is_unwritable(char: str) -> bool:
+    return char not in "\n\t" and unicodedata.category(char) in ("Cc", "Cs")
 
 
 def _escaped(char: str) -> str:
@@ -87,16 +88,22 @@ def _escaped(char: str) -> str:
 
 def _visible_in(value: Any) -> Any:
     """A report whose texts are all `visible`."""
+    # What has nothing to change is given back itself, for a report may hold large arrays.
     if isinstance(value, str):
-        return visible(value)
+        shown = visible(value)
+        return value if shown == value else shown
     if dataclasses.is_dataclass(value):
-        now = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        changed = {name: new for name, old in now.items() if (new := _visible_in(old)) is not old}
+        changed = {}
+        for field in dataclasses.fields(value):
+            old = getattr(value, field.name) if field.init else None
+            new = _visible_in(old)
+            if new is not old:
+                changed[field.name] = new
         return dataclasses.replace(value, **changed) if changed else value
     if isinstance(value, Mapping):
         items = {_visible_in(name): _visible_in(inner) for name, inner in value.items()}
         return value if items == value else items
-    if type(value) in (list, tuple):
+    if type(value) in (list, tuple):  # not a named tuple, which takes its items one by one
         parts = type(value)(_visible_in(inner) for inner in value)
         return value if parts == value else parts
     return value
@@ -113,6 +120,7 @@ def text(lines: str) -> None:
 
 def console(file: TextIO) -> Console:
     """A console on `file`: as wide as the terminal or as COLUMNS says, else very wide."""
+    # Else rich takes 80 columns for a pipe, and what reads it would find its lines broken.
     told = file.isatty() or os.environ.get("COLUMNS", "").isdigit()
     return Terminal(file=file, width=None if told else _WIDE, highlight=False)
 
@@ -120,7 +128,7 @@ def console(file: TextIO) -> Console:
 def write_any_character(stream: TextIO) -> None:
     """Let a stream replace characters that its encoding has not got, where it would raise."""
     codecs.register_error("aegis.plain", _plainly)
-    if isinstance(stream, io.TextIOWrapper):
+    if isinstance(stream, io.TextIOWrapper):  # else a test has put something in its place
         stream.reconfigure(errors="aegis.plain")
 
 
@@ -178,6 +186,7 @@ def _values(report: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
+    """A value as JSON can have it, which knows no path, no infinity and no NaN."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -22,7 +22,8 @@ def _of_job(report: Any) -> Iterator[RenderableType]:
     asked = {method: one for method, one in report.trainings.items() if one is not None}
     if asked:
         yield _trainings(asked)
-    if unknown := [method for method, one in report.trainings.items() if one is None]:
+    unknown = [method for method, one in report.trainings.items() if one is None]
+    if unknown:
         yield Text(
             f"{', '.join(unknown)}: memory, disk and hours can be told once the demonstrations and "
             "the anchor are there"

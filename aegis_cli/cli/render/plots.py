@@ -46,6 +46,7 @@ def save_figure(draw: Callable[[], Any], path: Path) -> None:
         AegisError: matplotlib missing, unknown suffix, or `path` cannot be written.
     """
     check_plot(path)
+    # Drawn in memory, for matplotlib would leave half a file where it fails.
     image = io.BytesIO()
     draw().savefig(image, format=path.suffix.lower()[1:], dpi=150)
     write_atomically(path, lambda file: file.write(image.getvalue()))
@@ -78,9 +79,10 @@ def _energy(report: Any) -> Any:
     from matplotlib.ticker import LogFormatter
 
     count, bins = len(report.layers), report.over_time
+    # Sizes in inches: the heat map grows with its rows, and its row of the grid with it.
     drawn = figure(figsize=(9.5, 3.6 + 0.24 * count), layout="constrained")
     top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * count), 0.8))
-    edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]
+    edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]  # [bins + 1]
     drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
     heat, least = _energy_of_layers(top, report, edges)
     bar = drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
@@ -95,7 +97,8 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
     from matplotlib.colors import LogNorm
 
     names = [layer.name for layer in report.layers]
-    shares = np.array([[100 * b.layers[i] for b in report.over_time] for i in range(len(names))])
+    by_bin = np.array([bin.layers for bin in report.over_time])  # [bins, layers]
+    shares = 100 * by_bin.T  # percent [layers, bins]
     least, most = _decades(shares)
     # What sheds nothing has no place on a log scale, and is the background's grey.
     axes.set_facecolor(_NOTHING)
@@ -109,7 +112,7 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
     rows, size = [i + 0.5 for i in range(len(names))], 9 if len(names) <= 24 else 6
     axes.set_yticks(rows, names, fontsize=size)
     axes.invert_yaxis()  # the first layer on top, as the data flows
-    means = axes.secondary_yaxis("right")
+    means = axes.secondary_yaxis("right")  # it has no scale of its own, and shows texts
     means.set_yticks(rows, [_percent(x.energy_shed) for x in report.layers], fontsize=size)
     means.tick_params(length=0)
     title = f"{literal(report.path)}; on the right each group's mean; grey: nothing shed"
@@ -123,6 +126,7 @@ def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float)
     from matplotlib.ticker import LogFormatter, MaxNLocator
 
     course = 100 * np.array([b.energy_shed for b in report.over_time])
+    # Nothing shed would have no place on a log scale, and stands at its lower end.
     axes.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
     axes.set_yscale("log")
     if report.energy_shed_mean:
@@ -152,7 +156,7 @@ def _decades(shares: np.ndarray) -> tuple[float, float]:
         return 0.1, 1.0
     most = float(positive.max())
     least = max(float(positive.min()), most / 10**_DECADES)
-    return min(least, most / 10), most
+    return min(least, most / 10), most  # one decade at least, where all shares are alike
 
 
 def _finding(report: Any) -> str:
@@ -209,6 +213,7 @@ def _routing(report: Any, path: str) -> Any:
     panels = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     heats = []
     for task, (axes, record) in enumerate(zip(panels, report.records, strict=False)):
+        # A map may have no router in an early task; its row is left empty.
         routed = {site.site: site for site in record.sites}
         heats.append(_task_routing(axes, task, [routed.get(name) for name in sites], count))
         axes.set_title(f"{task + 1}. {literal(record.task)}", fontsize=9)
@@ -218,7 +223,7 @@ def _routing(report: Any, path: str) -> Any:
         axes.set_visible(False)
     panels[0].set_yticks([i + 0.5 for i in range(len(sites))], sites)
     panels[0].set_xticks([i + 0.5 for i in range(count)], range(1, count + 1))
-    panels[0].invert_yaxis()
+    panels[0].invert_yaxis()  # of all panels, which share it
     title = "Routing mass (%) after each task; a column holds the experts that one task brought"
     drawn.suptitle(f"{title}\n{literal(path)}", x=0.01, ha="left", fontsize=11)
     drawn.colorbar(heats[-1], ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
@@ -230,7 +235,7 @@ def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any
     """One task's panel, with a row per map and a column per earlier or later task."""
     import numpy as np
 
-    mass = np.ma.masked_all((len(sites), count))
+    mass = np.ma.masked_all((len(sites), count))  # percent [maps, owners]; masked: no expert
     for row, site in enumerate(sites):
         pruned = 0 if site is None else len(site.pruned)
         for owner in range(count):
@@ -275,7 +280,8 @@ def _from_owner(site: Any, owner: int, count: int) -> float | None:
     """
     if site is None:
         return None
-    masses = [
-        mass for mass, of in zip(site.mass, site.owners, strict=True) if min(of, count - 1) == owner
-    ]
+    masses = []
+    for mass, of in zip(site.mass, site.owners, strict=True):
+        if min(of, count - 1) == owner:  # of nobody: a number past the last task's
+            masses.append(mass)
     return sum(masses) if masses else None

@@ -33,6 +33,7 @@ def progress(clock: Clock = time.monotonic) -> Generator[OnEvent]:
     if not sys.stderr.isatty() or console.is_dumb_terminal:
         yield Lines(sys.stderr, clock)
         return
+    # `markup=False`: a figure or a stage's name in brackets is no style.
     figures = TextColumn(
         "{task.fields[figures]}",
         markup=False,
@@ -60,8 +61,9 @@ class Pace:
         """Note how many units are done now."""
         now_s = self.clock()
         if not self.points:
-            self.first = done
+            self.first = done  # above 0 where a stage resumes
         self.points.append((now_s, done))
+        # By the second point, so that those left span the window, and there are two at least.
         while len(self.points) > 2 and now_s - self.points[1][0] >= _WINDOW_S:
             self.points.popleft()
 
@@ -85,7 +87,8 @@ class Pace:
         elif self.rate:
             parts.append(f"{_rate(self.rate)} {event.unit}/s")
             parts.append(f"{_duration((event.total - event.done) / self.rate)} left")
-        return ", ".join(parts + [f"{name} {value:.4g}" for name, value in event.metrics.items()])
+        parts += [f"{name} {value:.4g}" for name, value in event.metrics.items()]
+        return ", ".join(parts)
 
 
 class Lines:
@@ -104,8 +107,10 @@ class Lines:
         begins = last is None or _restarts(last, event)
         if begins:
             self.pace[event.stage] = Pace(self.clock)
-        self.pace[event.stage].update(event.done)
-        waited_s, share = self.clock() - shown_s, _share(event) - (_share(last) if last else 0.0)
+        pace = self.pace[event.stage]
+        pace.update(event.done)  # with every event, also those that no line tells
+        waited_s = self.clock() - shown_s
+        share = _share(event) - (_share(last) if last else 0.0)  # since the last line
         if (
             begins
             or event.done >= event.total
@@ -113,11 +118,8 @@ class Lines:
             or (share >= EVERY_SHARE and waited_s >= LEAST_S)
         ):
             self.shown[event.stage] = (self.clock(), event)
-            print(
-                f"{event.stage}: {self.pace[event.stage].figures(event)}",
-                file=self.file,
-                flush=True,
-            )
+            # At once, as whoever follows a log wants it.
+            print(f"{event.stage}: {pace.figures(event)}", file=self.file, flush=True)
 
 
 class Live:
@@ -175,6 +177,7 @@ def _warning(event: Warned) -> str:
 
 
 def _restarts(last: Progress, event: Progress) -> bool:
+    """Whether a stage of this name begins once more, as with each method of a job."""
     return event.done < last.done or last.done >= last.total
 
 

@@ -51,7 +51,7 @@ def _matrix(report: Any) -> list[RenderableType]:
 def _accuracy(report: Any) -> list[RenderableType]:
     """The accuracies with the task told and inferred, and their figures."""
     parts: list[RenderableType] = [_rows("Accuracy %, task told", report.oracle, report.tasks)]
-    if report.inferred != report.oracle:
+    if report.inferred != report.oracle:  # alike where one set of weights serves all tasks
         parts.append(_rows("Accuracy %, task inferred", report.inferred, report.tasks))
     lines = [
         (name, percent(s.transfer), percent(s.average), percent(s.last), percent(s.forgetting, 2))
@@ -66,6 +66,7 @@ def _success(report: Any) -> list[RenderableType]:
     """The successes beside what the backbone knows; tasks that have not come are '-'."""
     header = ("Success %", *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
     rows = []
+    # VQA is measured before the first task too, when there is no success yet.
     measured = zip(("", *report.tasks), ((), *report.success), report.vqa, strict=True)
     for after, found, known in measured:
         line = [f"after {after}" if after else "before", *map(percent, found)]
@@ -156,24 +157,15 @@ def routing(report: Any) -> Table:
     rows = []
     for task, record in enumerate(report.records):
         for s in record.sites:
+            # Places in the router's lists; `owners` has the number of the task that brought each.
             old = [i for i, owner in enumerate(s.owners) if owner < task]
-            new = [i for i in range(len(s.owners)) if i not in old]
-            used = [
-                (_numbers(s.experts[i] for i in part), percent(sum(s.mass[i] for i in part)))
-                for part in (old, new)
-            ]
-            counts = map(_count, (s.trained_phase1, s.trained, s.added))
-            rows.append(
-                (
-                    record.task,
-                    s.site,
-                    *used[0],
-                    *used[1],
-                    _numbers(s.pruned),
-                    _numbers(s.dropped),
-                    *counts,
-                )
-            )
+            new = [i for i, owner in enumerate(s.owners) if owner >= task]
+            row = [record.task, s.site]
+            for part in (old, new):
+                row += [_numbers(s.experts[i] for i in part), percent(sum(s.mass[i] for i in part))]
+            row += [_numbers(s.pruned), _numbers(s.dropped)]
+            row += map(_count, (s.trained_phase1, s.trained, s.added))
+            rows.append(row)
     return plain_table(header, rows, left=2)
 
 

@@ -6,7 +6,7 @@ Columns are those that the results declare: `studies/metrics.py`.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -40,13 +40,11 @@ def study(report: Any) -> RenderableType:
             f"{fixed(task.baseline_cross_entropy, 3)} nats"
         )
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
+        asked = f", asked {task.vqa}" if task.vqa else ""  # of a probe of several sets
+        fields = (*_KEPT, *_acting(task.results))
         parts += [
-            Text(f"{report.name}: {task.task}{f', asked {task.vqa}' if task.vqa else ''}", "bold"),
-            _table(
-                task.results,
-                (*_KEPT, *_acting(task.results)),
-                knob=any(r.knob for r in task.results),
-            ),
+            Text(f"{report.name}: {task.task}{asked}", "bold"),
+            _table(task.results, fields, knob=any(r.knob for r in task.results)),
             _table(task.results, _COSTS),
             *_references(task.results),
             *_against_naive(task.results),
@@ -144,8 +142,9 @@ def _table(
     declared = columns(type(shown[0]))
     fields = tuple(fields or declared)
     named = [(r.variant, knob_text(r)) if knob else (r.variant,) for r in results]
-    drawn = [_column(shown, field) for field in fields]
-    rows = [(*name, *cells) for name, cells in zip(named, zip(*drawn, strict=True), strict=True)]
+    drawn = [_column(shown, field) for field in fields]  # by column, since marks compare these
+    by_variant = zip(*drawn, strict=True)
+    rows = [(*name, *cells) for name, cells in zip(named, by_variant, strict=True)]
     names = ("Variant", "Knob") if knob else ("Variant",)
     header = (*names, *(declared[field].header for field in fields))
     return plain_table(header, rows, left=len(names), title=title)
@@ -160,10 +159,14 @@ def _column(results: Sequence[Any], field: str) -> list[Cell]:
     show = shown_as(declared)
     by_mean = marked([show(value) for value in values], values, declared.more_is_better)
     # Means that look alike share a mark, whatever their intervals.
-    return [
-        Text(unmarked(mean)[0] + cell, mean.style) if isinstance(mean, Text) else cell
-        for mean, cell in zip(by_mean, cells, strict=True)
-    ]
+    shown: list[Cell] = []
+    for mean, cell in zip(by_mean, cells, strict=True):
+        if isinstance(mean, Text):
+            mark, _ = unmarked(mean)
+            shown.append(Text(mark + cell, mean.style))
+        else:
+            shown.append(cell)
+    return shown
 
 
 def _figure(result: Any, field: str) -> str:
@@ -186,7 +189,7 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
         if column.decimals is None:
             return number(value, column.significant)
         text = fixed(value, column.decimals)
-        is_more = value is not None and value > 0 and float(text) > 0
+        is_more = value is not None and value > 0 and float(text) > 0  # also once it is rounded
         return f"+{text}" if column.signed and is_more else text
 
     return show
@@ -197,14 +200,10 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
 
 def _tried(points: Sequence[Any]) -> Table:
     """The knobs' values so far, while nothing has been compared yet."""
-    rows = [
-        (
-            p.variant,
-            "-" if p.value is None else value_text(p.value),
-            *map(percent, (p.accuracy, p.success)),
-        )
-        for p in points
-    ]
+    rows = []
+    for point in points:
+        value = "-" if point.value is None else value_text(point.value)
+        rows.append((point.variant, value, percent(point.accuracy), percent(point.success)))
     return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
 
 
@@ -225,6 +224,7 @@ def _references(results: Sequence[Any]) -> list[RenderableType]:
 def _decimals_of_step_time(result: Any) -> int:
     """Two, or as many as the bar's verdict hangs on."""
     checks = result.bar.checks if result.bar else ()
+    # The bar's check of the step time is told by its value, for names are words for a reader.
     judged = [c for c in checks if c.value is not None and c.value == result.step_time]
     return max([2, *(deciding_decimals(c.value, c.demand, 2) for c in judged)])
 
@@ -259,11 +259,11 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
         )
         # Without a bar, another naive has no VQA data either; the rest are ceilings.
         verdicts = [""] * 4 + ["yes" if r.method == "naive" else "no"]
-        if r.bar:
+        if r.bar:  # whose demands come in the order of these columns
             verdicts = [verdict_text(check.passed) for check in r.bar.checks]
-        checked = [
-            f"{figure} {verdict}".strip() for figure, verdict in zip(figures, verdicts, strict=True)
-        ]
+        checked = []
+        for figure, verdict in zip(figures, verdicts, strict=True):
+            checked.append(f"{figure} {verdict}".strip())
         rows.append((r.variant, *checked, verdict_text(r.bar.passed) if r.bar else "-"))
     return [plain_table(header, rows)]
 
@@ -299,10 +299,8 @@ def _notes(report: Any) -> list[str]:
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
-    mixed, pairs = (
-        sum(getattr(task, name) for task in report.tasks)
-        for name in ("across_versions", "compared")
-    )
+    mixed = sum(task.across_versions for task in report.tasks)
+    pairs = sum(task.compared for task in report.tasks)
     if mixed:
         notes.append(
             f"{mixed} of {pairs} paired differences are of cells that two versions of the code "
@@ -315,6 +313,23 @@ def _notes(report: Any) -> list[str]:
     return [*notes, f"files: {report.out}"]
 
 
+def _knobs(
+    points: Sequence[Any], shown: Mapping[str, Callable[[Any], str]], rule: str
+) -> list[RenderableType]:
+    """The values that were tried on validation data, and how one of them was chosen.
+
+    Args:
+        shown: header -> what is told of a value.
+    """
+    rows = []
+    for point in points:
+        figures = [show(point) for show in shown.values()]
+        chosen = "x" if point.chosen else ""
+        rows.append((point.variant, value_text(point.value), *figures, chosen))
+    header = ("Variant", "Value", *shown, "Chosen")
+    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
+
+
 def _rule(rule: Rule, place: str, within: float) -> str:
     """How knobs were chosen, in lines as long as the tables' other notes."""
     return textwrap.fill(f"knobs {rule.explain(place, within)}", 100, subsequent_indent="  ")
@@ -324,28 +339,19 @@ def _rule(rule: Rule, place: str, within: float) -> str:
 
 
 def _stream_tuning(report: Any) -> list[RenderableType]:
-    rows = [
-        (
-            p.variant,
-            value_text(p.value),
-            percent(p.last),
-            number(p.parameters),
-            "x" if p.chosen else "",
-        )
-        for p in report.tuning
-    ]
-    header = ("Variant", "Value", "Validation Last %", "Final parameters", "Chosen")
-    rule = _rule(STREAM_RULE, report.tuning_stream, report.within)
-    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
+    shown = {
+        "Validation Last %": lambda p: percent(p.last),
+        "Final parameters": lambda p: number(p.parameters),
+    }
+    return _knobs(report.tuning, shown, _rule(STREAM_RULE, report.tuning_stream, report.within))
 
 
 def _bars(results: Sequence[Any]) -> Table:
     """A line per demand, a column per variant."""
     barred = [r for r in results if r.bar]
-    rows = [
-        (check.name, *(_checked(r.bar.checks[i]) for r in barred))
-        for i, check in enumerate(barred[0].bar.checks)
-    ]
+    rows = []
+    for i, check in enumerate(barred[0].bar.checks):  # the same demands of every variant
+        rows.append((check.name, *(_checked(r.bar.checks[i]) for r in barred)))
     rows.append(("all", *(verdict_text(r.bar.passed) for r in barred)))
     return plain_table(("Demand", *(r.variant for r in barred)), rows, title="Bar")
 
@@ -361,7 +367,7 @@ def _judged(check: Any) -> str:
     shown = f"{check.value:.3g}"
     if check.interval is not None:  # judged by an end, which is another figure
         return shown
-    decimals = len(shown.partition(".")[2]) if "e" not in shown else 2
+    decimals = len(shown.partition(".")[2]) if "e" not in shown else 2  # 1e+06 has none to count
     needed = deciding_decimals(check.value, check.demand, decimals)
     return shown if needed == decimals else fixed(check.value, needed)
 
@@ -409,19 +415,11 @@ def _verdict(bar: Any) -> str:
 
 
 def _robot_tuning(report: Any) -> list[RenderableType]:
-    rows = [
-        (
-            p.variant,
-            value_text(p.value),
-            percent(p.last),
-            percent(p.accuracy),
-            "x" if p.chosen else "",
-        )
-        for p in report.tuning
-    ]
-    header = ("Variant", "Value", "Validation success %", "Validation VQA %", "Chosen")
-    rule = _rule(ROBOT_STREAM_RULE, "the stream", report.within)
-    return [plain_table(header, rows, title="Knobs"), Text(rule + "\n")]
+    shown = {
+        "Validation success %": lambda p: percent(p.last),
+        "Validation VQA %": lambda p: percent(p.accuracy),
+    }
+    return _knobs(report.tuning, shown, _rule(ROBOT_STREAM_RULE, "the stream", report.within))
 
 
 def _matrix(result: Any, tasks: Sequence[str]) -> Table:
@@ -455,7 +453,7 @@ def knob_text(result: Any) -> str:
     """The key's last word and its value, of each knob: `energy 0.999`."""
     if result.knob is None:
         return "-"
-    knobs = result.knob.split(", ")
+    knobs = result.knob.split(", ")  # as `Variant.knob` joins them; no key has a comma
     values = result.value if len(knobs) > 1 else [result.value]
     named = zip(knobs, values, strict=True)
     return ", ".join(f"{knob.rpartition('.')[2]} {value_text(value)}" for knob, value in named)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import (
+    INSTRUCTIONS,
     MARKS,
     Cell,
     acting,
@@ -29,7 +30,7 @@ _OPEN_LOOP_INSTEAD = (
     "held-out episodes over their variance in training: 1 is that of always the mean action. "
     "aegis inspect of a run has its interval"
 )
-_INSTRUCTIONS = 10  # lines of a rollout's table by instruction
+# Fields that hold a share in [0, 1], shown in percent; `_is_share` knows some more by their names.
 _SHARES = {
     "accuracy",
     "success",
@@ -52,7 +53,7 @@ def facts(report: Any) -> Table:
 
 def serving(report: Any) -> RenderableType:
     """Where a policy is served, and what a client has to send."""
-    said = report.metadata
+    said = report.metadata  # what the server sends to each client first
     images = dict.fromkeys(said["images"], "[H, W, 3] uint8, RGB")
     prompt = "text" if said["default_prompt"] is None else f"text, or '{said['default_prompt']}'"
     sent = {**images, said["state"]: f"[{said['positions']}]", said["prompt"]: prompt}
@@ -131,15 +132,20 @@ def measured(report: Any) -> RenderableType:
     each task of a set, each target colour and each instruction, where there are several.
     """
     found = {name: value for name, value in _scalars(report).items() if value is not None}
+    # What has a table below is taken out of the lines above.
+    tasks = found.pop("tasks", None)
+    colors = found.pop("target_colors", None)
+    instructions = _worst_first(found.pop("instructions", {}))
     tables: list[RenderableType] = []
-    if tasks := found.pop("tasks", None):
+    if tasks:
         tables.append(_by_part("Task", tasks))
-    if colors := found.pop("target_colors", None):
+    if colors:
         tables.append(_by_part("Target", _worst_first(colors)))
-    if instructions := _worst_first(found.pop("instructions", {})):
-        shown = dict(itertools.islice(instructions.items(), _INSTRUCTIONS))
+    if instructions:
+        shown = dict(itertools.islice(instructions.items(), INSTRUCTIONS))
         tables.append(_by_part("Instruction", shown))
-        if len(shown) < (count := len(instructions)):
+        count = len(instructions)
+        if len(shown) < count:
             tables.append(Text(f"the worst {len(shown)} of {count:,} instructions; --json has all"))
     return Group(pairs(found), *tables)
 
@@ -150,12 +156,12 @@ def _worst_first(parts: dict[str, Any]) -> dict[str, Any]:
 
 def _by_part(what: str, parts: dict[str, Any]) -> Table:
     """A line per part of the episodes: all the figures of its entry."""
-    names = [field.name for field in dataclasses.fields(next(iter(parts.values())))]
+    first = next(iter(parts.values()))  # all are of one class
+    names = [field.name for field in dataclasses.fields(first)]
     header = [(_label(name) + _unit(name, 0.0)).capitalize() for name in names]
-    rows = [
-        (part, *(_cell(getattr(entry, name), name) for name in names))
-        for part, entry in parts.items()
-    ]
+    rows = []
+    for part, entry in parts.items():
+        rows.append((part, *(_cell(getattr(entry, name), name) for name in names)))
     return plain_table((what, *header), rows)
 
 
@@ -198,20 +204,27 @@ def pipeline(report: Any) -> RenderableType:
     named = [r.method if report.merge is None else f"{r.method}, merged" for r in report.rows]
     figures = [_marked_column(report.rows, column) for column in shown]
     rows = zip(named, *figures, strict=True)
+    table = plain_table(header, rows)
+    notes = [Text(note) for note in _pipeline_notes(report, acts)]
+    return Group(Text(report.name, "bold"), table, *_other_sets(report.rows), *notes)
+
+
+def _pipeline_notes(report: Any, acts: Mapping[str, str]) -> Iterator[str]:
+    """What stands below the table of methods, a line each."""
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
-    majority = f"always the commonest answer: {percent(report.majority_accuracy)} %"
-    return Group(
-        Text(report.name, "bold"),
-        plain_table(header, rows),
-        *_other_sets(report.rows),
-        Text(f"{before}; {majority}"),
-        *([Text(MARKS)] if len(report.rows) > 1 else []),
-        *([Text(report.verdict)] if report.verdict else []),
-        *([] if report.merge is None else [Text(_merged(report.merge))]),
-        *([] if _acted(report.rows, acts) else [Text(_OPEN_LOOP_INSTEAD)]),
-        *([] if (hold := _held_still(report.rows)) is None else [Text(hold)]),
-        Text(f"files: {report.out}"),
-    )
+    yield f"{before}; always the commonest answer: {percent(report.majority_accuracy)} %"
+    if len(report.rows) > 1:  # a single method is neither best nor worst
+        yield MARKS
+    if report.verdict:
+        yield report.verdict
+    if report.merge is not None:
+        yield _merged(report.merge)
+    if not _acted(report.rows, acts):
+        yield _OPEN_LOOP_INSTEAD
+    hold = _held_still(report.rows)
+    if hold is not None:
+        yield hold
+    yield f"files: {report.out}"
 
 
 def _held_still(rows: Sequence[Any]) -> str | None:
@@ -250,7 +263,7 @@ def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
     """What the methods kept of each further set of questions."""
     header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "W2²", "Before %")
     tables: list[RenderableType] = []
-    for name in rows[0].others:
+    for name in rows[0].others:  # all methods were asked the same
         shown = []
         for row in rows:
             kept = row.others[name]
@@ -287,15 +300,14 @@ def bench_shape(report: Any) -> RenderableType:
     def row(name: str, cost: Any) -> tuple[str, ...]:
         if cost.step_s is None:
             return name, "out of memory", *("-",) * 5
-        own, mfu = ("-" if x is None else percent(x) for x in (cost.own_share, cost.mfu))
         return (
             name,
             fixed(cost.step_s, 2),
             fixed(cost.step_time, 2),
-            own,
+            percent(cost.own_share),
             fixed(cost.peak_gb, 2),
             fixed(cost.peak_memory, 2),
-            mfu,
+            percent(cost.mfu),  # None where the device's peak is not known
         )
 
     header = ("Method", "s/step", "x naive", "Own %", "Peak GB", "x naive", "MFU %")
@@ -320,16 +332,11 @@ def bench_shape(report: Any) -> RenderableType:
 
 def _families(families: dict[str, Any]) -> Table:
     header = ("Family", "Questions", "Accuracy %", "95 % interval", "Majority %", "Baseline %")
-    rows = [
-        (
-            name,
-            *(
-                _cell(getattr(f, key, None), key)
-                for key in ("questions", "accuracy", "interval", "majority", "baseline_accuracy")
-            ),
-        )
-        for name, f in families.items()
-    ]
+    fields = ("questions", "accuracy", "interval", "majority", "baseline_accuracy")
+    rows = []
+    for name, family in families.items():
+        cells = [_cell(getattr(family, field, None), field) for field in fields]
+        rows.append((name, *cells))
     return plain_table(header, rows)
 
 
@@ -348,10 +355,13 @@ _NO_SCALARS = ("families", "layers", "asked")  # of a probe's report
 
 
 def _scalars(report: Any) -> dict[str, Any]:
+    """The fields that a report has a line of; the others have tables."""
     names = [field.name for field in dataclasses.fields(report) if field.name not in _NO_SCALARS]
     return {name: getattr(report, name) for name in names}
 
 
+# How a field's name ends, and the unit that stands behind its value. What begins with "_" is left
+# out of the label.
 _UNITS = {
     "_s": " s",
     "_ms": " ms",
@@ -380,15 +390,15 @@ def _unit(name: str, value: Any) -> str:
 
 
 def _is_share(name: str) -> bool:
-    return (
-        name in _SHARES or name.endswith("accuracy") or name.startswith(("energy_shed", "success"))
-    )
+    by_name = name.endswith("accuracy") or name.startswith(("energy_shed", "success"))
+    return name in _SHARES or by_name
 
 
 def _cell(value: Any, name: str = "") -> str:
+    """A value as a table shows it, without the unit that its name stands for."""
     if value is None:
         return "-"
-    if isinstance(value, bool):
+    if isinstance(value, bool):  # before `int`, of which it is one
         return "yes" if value else "no"
     if name in _SHARE_INTERVALS:
         return " to ".join(percent(v) for v in value)
@@ -400,6 +410,7 @@ def _cell(value: Any, name: str = "") -> str:
         return _list([_one_of(v) for v in value]) or "-"
     if isinstance(value, float):
         return percent(value) if _is_share(name) else number(value)
+    # A seed is no count, and is typed again as it stands.
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
 
 
@@ -416,6 +427,6 @@ def _within(value: Any) -> str:
 
 
 def _list(items: Sequence[str], most: int = 12) -> str:
-    return (
-        ", ".join(items) if len(items) <= most else f"{', '.join(items[:most])}, ... ({len(items)})"
-    )
+    if len(items) <= most:
+        return ", ".join(items)
+    return f"{', '.join(items[:most])}, ... ({len(items)})"

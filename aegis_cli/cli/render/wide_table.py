@@ -43,19 +43,24 @@ class WideTable(Table):
         for i, columns in enumerate(self._parts(free)):
             part = WideTable(self.left, None if i else self.title)
             part.rows, part.columns = self.rows, columns
+            # As a plain table, for its own way to be shown would split it once more.
             yield from Table.__rich_console__(part, console, options)
 
     def _parts(self, free: int) -> Iterator[list[Column]]:
+        """The columns of each part: those that name a line, and as many others as fit."""
         names, rest = self.columns[: self.left], self.columns[self.left :]
-        while names or rest:
+        while True:
             fitting = len(rest)
             while fitting > 1 and _least(names + rest[:fitting]) > free:
-                fitting -= 1
+                fitting -= 1  # down to one, which is shown even where it does not fit
             yield _folded(names + rest[:fitting], free)
-            names, rest = (names, rest[fitting:]) if rest[fitting:] else ([], [])
+            rest = rest[fitting:]
+            if not rest:
+                return
 
 
 def _least(columns: Sequence[Column]) -> int:
+    """The width below which some word would be broken."""
     return sum(_longest_word(c) + _BESIDE for c in columns)
 
 
@@ -66,23 +71,20 @@ def _folded(columns: Sequence[Column], free: int) -> list[Column]:
         for i, column in enumerate(columns):
             more = min(spare, max(0, wanted(column) - widths[i]))
             widths[i], spare = widths[i] + more, spare - more
-    headers = [
-        "\n".join(textwrap.wrap(str(c.header), width or 1))
-        for c, width in zip(columns, widths, strict=True)
-    ]
-    made = zip(columns, headers, widths, strict=True)
-    return [
-        replace(c, header=header, max_width=width, _index=i)
-        for i, (c, header, width) in enumerate(made)
-    ]
+    folded = []
+    for i, (column, width) in enumerate(zip(columns, widths, strict=True)):
+        # Folded here, at the very places by which `_longest_word` counts.
+        header = "\n".join(textwrap.wrap(str(column.header), width or 1))
+        # Copies, since the columns of names stand in every part; rich counts them from 0.
+        folded.append(replace(column, header=header, max_width=width, _index=i))
+    return folded
 
 
 def _longest_word(column: Column) -> int:
-    """Headers may break after a hyphen."""
-    words = [
-        *re.split(r"\s|(?<=-)", str(column.header)),
-        *(word for cell in column.cells for word in str(cell).split()),
-    ]
+    """Letters of the longest word; headers may break after a hyphen, as `textwrap` does it."""
+    words = re.split(r"\s|(?<=-)", str(column.header))
+    for cell in column.cells:
+        words += str(cell).split()
     return max(map(len, words), default=0)
 
 
