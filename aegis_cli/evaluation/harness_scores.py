@@ -172,8 +172,7 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
             "give it the name again that it was written under: it tells the task",
         )
     if not found:
-        fix = "evaluate again with --log_samples, and give the folder of --output_path"
-        raise AegisError(f"no file of samples in '{place}'", _WRITTEN, fix)
+        raise _no_samples(place)
     newest = {task: max(own) for task, own in found.items()}  # dates that sort as texts do
     for task, own in found.items():
         if len({path.parent for _, path in own}) > 1:
@@ -187,6 +186,16 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
             text = f"{len(own)} evaluations of {task} in '{place}': the newest is read"
             on_event(Warned("scores", f"{text}, '{newest[task][1].name}'"))
     return {task: path for task, (_, path) in newest.items()}
+
+
+def _no_samples(folder: Path) -> AegisError:
+    fix = "evaluate again with --log_samples, and give the folder of --output_path"
+    found = f"no file of samples in '{folder}'"
+    # VLMEvalKit keeps what each question got in tables, and not for every benchmark.
+    if next(folder.rglob("*.xlsx"), None) is not None:
+        found += ", but tables as VLMEvalKit writes them, which are not read"
+        fix = "ask both models the same benchmarks by lmms-eval with --log_samples --output_path"
+    return AegisError(found, _WRITTEN, fix)
 
 
 def _named(path: Path) -> tuple[str, str] | None:

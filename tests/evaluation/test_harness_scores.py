@@ -266,6 +266,8 @@ def test_what_holds_no_scores_of_two_models_is_refused(
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no file of samples" in refused(empty, two[1])
+    (empty / "model_MMBench_DEV_EN.xlsx").touch()
+    assert "VLMEvalKit writes them, which are not read" in refused(empty, two[1])
     assert "check the path" in refused(tmp_path / "none", two[1])
     assert "before and after" in refused(two[0], two[0])
     lmms(tmp_path / "other", "pope", rows_of({"pope_accuracy": [1.0]}))
