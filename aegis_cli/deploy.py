@@ -321,8 +321,8 @@ class DeployedPolicy:
         if given.shape != (self.positions,):
             raise AegisError(
                 f"positions of shape {given.shape}",
-                f"({self.positions},)",
-                "give what the demonstrations hold",
+                f"({self.positions},){_after_colon(self.state_names)}",
+                "give what the demonstrations hold, in their order",
             )
         if not np.isfinite(given).all():
             raise AegisError(
@@ -333,7 +333,11 @@ class DeployedPolicy:
         if not isinstance(instruction, str):
             found = f"an instruction of type {type(instruction).__name__}"
             raise AegisError(found, "a text", f"give one str; {_ORDER}")
-        return Seen([_picture(shown) for shown in self._in_order(pictures)], instruction, given)
+        shown = self._in_order(pictures)
+        several = len(self.cameras) > 1
+        names = [f" of {name}" for name in self.cameras] if several else [""]
+        found = [_picture(of, picture) for of, picture in zip(names, shown, strict=True)]
+        return Seen(found, instruction, given)
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
         """The pictures in the order in which the backbone takes them."""
@@ -382,8 +386,11 @@ def _numbers(given: Positions, what: str = "positions") -> np.ndarray:
         raise AegisError(found, f"numbers, one for each of the {what}", _ORDER) from error
 
 
-def _picture(given: np.ndarray) -> np.ndarray:
+def _picture(of: str, given: np.ndarray) -> np.ndarray:
     """One camera's picture.
+
+    Args:
+        of: which camera's it is, in an error.
 
     Raises:
         AegisError: it is none.
@@ -391,12 +398,16 @@ def _picture(given: np.ndarray) -> np.ndarray:
     found = np.asarray(given)
     is_picture = found.ndim == 3 and found.shape[2] == 3 and found.dtype == np.uint8
     if not is_picture or 0 in found.shape:
-        said = f"a picture of shape {found.shape} and type {found.dtype}"
+        said = f"a picture{of} of shape {found.shape} and type {found.dtype}"
         fix = "channels come last, values are 0 to 255"
         if is_picture:
             fix = "see whether the camera has given a frame"
         raise AegisError(said, "[H, W, 3] uint8, RGB, of at least one pixel", fix)
     return found
+
+
+def _after_colon(names: tuple[str, ...] | None) -> str:
+    return "" if names is None or not any(names) else f": {', '.join(names)}"
 
 
 def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:

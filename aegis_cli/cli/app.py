@@ -1144,7 +1144,8 @@ def serve(
     """Serve a policy by openpi's websocket protocol until Ctrl-C.
 
     The stock openpi-client connects to it. The report, printed once the server listens, says where,
-    and the keys and sizes of an observation. There is no password: on an address other than
+    and the keys and sizes of an observation. Lines on stderr say who connects, what is refused, and
+    how long the chunks took. There is no password: on an address other than
     127.0.0.1, whoever reaches the machine can ask the policy.
 
     \b
@@ -1164,7 +1165,7 @@ def serve(
 
     # Not as a `Stage`, which shows its report at its end: a server has one at its beginning.
     with stages.computing_on(device):
-        server.run(run, task, host, port, prompt, seed, precision, listening, ensemble)
+        server.run(run, task, host, port, prompt, seed, precision, listening, ensemble, render.note)
 
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")

@@ -9,6 +9,7 @@ output, 143 SIGTERM.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import os
 import shlex
@@ -25,6 +26,8 @@ from typer.core import TyperGroup
 from aegis_cli.cli import render
 from aegis_cli.common import interrupts, launch
 from aegis_cli.common.errors import AegisError, PeerLost
+from aegis_cli.recipes import Recipe
+from aegis_cli.recipes.decoding import below
 
 # What a command that goes on needs beside its own words; `run` skips what is up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
@@ -109,8 +112,29 @@ def _misused(error: Any) -> int:
 
     Click would show it where nobody looks after a stderr that cannot be written.
     """
+    _name_the_key(error)
     _say(lambda misuse: misuse.show(), error)
     return error.exit_code
+
+
+def _name_the_key(error: Any) -> None:
+    """Tell how a key of recipes is set that was given as an option of its own.
+
+    So other training programs take theirs, as in `--batch_size=8`.
+    """
+    option, context = getattr(error, "option_name", None), error.ctx
+    if option is None or context is None:
+        return
+    if not any("--set" in parameter.opts for parameter in context.command.params):
+        return
+    name = option.lstrip("-").replace("-", "_")
+    own = [name] if name in {field.name for field in dataclasses.fields(Recipe)} else []
+    last = name.rpartition(".")[2]
+    places = own or [place for place in below(last, Recipe) if name in (last, place)]
+    if places:  # batch_size is a key of several sections
+        key = min(places, key=lambda place: not place.startswith("train."))
+        error.message += f", but a key of recipes: --set {key}=..."
+        error.possibilities = None
 
 
 def ended_by(error: OSError) -> int:

@@ -12,7 +12,7 @@ import dataclasses
 import re
 import sys
 import textwrap
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,7 +72,8 @@ class ScoresReport:
     Attributes:
         before, after: where the scores were read.
         scores: one for each metric of each task, in the tasks' alphabetical order.
-        left_out: tasks that only one of the two was asked.
+        left_out: tasks of which nothing was compared: only one of the two was asked, or none of
+            their metrics is a share for each question.
         max_drop: points; None without a gate. gate: what of a drop it limits.
         passed: whether every score passes; None without a gate.
     """
@@ -96,11 +97,13 @@ class _Log:
     Attributes:
         asked: by the question's number, what was asked, and the reference answer.
         values: by metric and question, the number that the harness gave; None where it is none.
+        lines: by the question's number, how many lines without a filter's name it has.
         falling: metrics of which less is better.
     """
 
     path: Path
     asked: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    lines: Counter[str] = field(default_factory=Counter)
     values: dict[str, dict[str, float | None]] = field(default_factory=lambda: defaultdict(dict))
     falling: frozenset[str] = frozenset()
 
@@ -138,8 +141,11 @@ def run(
     reading = _Reading([path for task in tasks for path in (first[task], second[task])], on_event)
     for task in tasks:
         logs = _read(first[task], reading), _read(second[task], reading)
-        for metric in _comparable(task, logs, on_event):
-            scores.append(_drop(task, metric, logs, max_drop, gate, on_event))
+        metrics = _comparable(task, logs, on_event)
+        if not metrics:
+            lone.append(task)
+            _warn_of_nothing(task, max_drop, on_event)
+        scores += [_drop(task, metric, logs, max_drop, gate, on_event) for metric in metrics]
     if not scores:
         raise AegisError(
             f"no score of one question in common between '{before}' and '{after}'",
@@ -147,7 +153,7 @@ def run(
             "ask both models the same --tasks",
         )
     passed = None if max_drop is None else all(score.passed for score in scores)
-    return ScoresReport(str(before), str(after), scores, lone, max_drop, gate, passed)
+    return ScoresReport(str(before), str(after), scores, sorted(lone), max_drop, gate, passed)
 
 
 def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
@@ -166,8 +172,7 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
             "give it the name again that it was written under: it tells the task",
         )
     if not found:
-        fix = "evaluate again with --log_samples, and give the folder of --output_path"
-        raise AegisError(f"no file of samples in '{place}'", _WRITTEN, fix)
+        raise _no_samples(place)
     newest = {task: max(own) for task, own in found.items()}  # dates that sort as texts do
     for task, own in found.items():
         if len({path.parent for _, path in own}) > 1:
@@ -181,6 +186,16 @@ def _tasks(place: Path, on_event: OnEvent) -> dict[str, Path]:
             text = f"{len(own)} evaluations of {task} in '{place}': the newest is read"
             on_event(Warned("scores", f"{text}, '{newest[task][1].name}'"))
     return {task: path for task, (_, path) in newest.items()}
+
+
+def _no_samples(folder: Path) -> AegisError:
+    fix = "evaluate again with --log_samples, and give the folder of --output_path"
+    found = f"no file of samples in '{folder}'"
+    # VLMEvalKit keeps what each question got in tables, and not for every benchmark.
+    if next(folder.rglob("*.xlsx"), None) is not None:
+        found += ", but tables as VLMEvalKit writes them, which are not read"
+        fix = "ask both models the same benchmarks by lmms-eval with --log_samples --output_path"
+    return AegisError(found, _WRITTEN, fix)
 
 
 def _named(path: Path) -> tuple[str, str] | None:
@@ -206,6 +221,11 @@ def _warn_of_lone(tasks: Sequence[str], before: Path, after: Path, on_event: OnE
     if tasks:
         names = ", ".join(tasks)
         on_event(Warned("scores", f"not in both '{before}' and '{after}', and left out: {names}"))
+
+
+def _warn_of_nothing(task: str, max_drop: float | None, on_event: OnEvent) -> None:
+    judged = "" if max_drop is None else ", and --max-drop does not judge it"
+    on_event(Warned("scores", f"{task}: nothing of it is compared{judged}"))
 
 
 class _Reading:
@@ -238,7 +258,19 @@ def _read(path: Path, reading: _Reading) -> _Log:
     if not log.asked:
         fix = "evaluate again: the harness has written the file and no line of it"
         raise AegisError(f"no question in '{path}'", _WRITTEN, fix)
+    _check_lines(log)
     return log
+
+
+def _check_lines(log: _Log) -> None:
+    """Raise AegisError unless each question has as many lines, one for each filter of the task."""
+    if len(set(log.lines.values())) > 1:
+        (most, count), (least, fewer) = log.lines.most_common()[0], log.lines.most_common()[-1]
+        raise AegisError(
+            f"question {most} on {count} lines of '{log.path}', and question {least} on {fewer}",
+            "one line for each question, or one for each of the task's filters",
+            "evaluate again, once",
+        )
 
 
 def _add(log: _Log, number: int, line: bytes) -> None:
@@ -250,21 +282,30 @@ def _add(log: _Log, number: int, line: bytes) -> None:
     if not isinstance(row, dict) or "doc_id" not in row:
         raise AegisError(f"{where}: no question's doc_id", _WRITTEN, "evaluate again")
     question = str(row["doc_id"])
+    if "filter" not in row:
+        log.lines[question] += 1
     # lm-evaluation-harness has no text of the prompt, but its digest.
     prompt = row.get("input", row.get("prompt_hash"))
     log.asked[question] = (prompt, row.get("target"))
-    for name, value in _metrics(row):
+    for name, value in _metrics(row, log.lines[question]):
         if question in log.values[name]:
             found = f"{where}: question {question} a second time"
             raise AegisError(found, "one line for each question", "evaluate again, once")
         log.values[name][question] = value
 
 
-def _metrics(row: Mapping[str, Any]) -> Iterator[tuple[str, float | None]]:
-    """The names of a line's metrics, with the filter that an answer went through, and values."""
+def _metrics(row: Mapping[str, Any], line: int) -> Iterator[tuple[str, float | None]]:
+    """The names of a line's metrics, with the filter that an answer went through, and values.
+
+    Args:
+        line: which of the question's lines it is, from 1. lmms-eval names no filter, and writes a
+            line for each in the order that the task lists them in.
+    """
     named = row.get("metrics")
     names = named if isinstance(named, list) else [key for key in row if key not in _NO_METRIC]
     chosen = row.get("filter")
+    if "filter" not in row and line > 1:
+        chosen = f"filter {line}"
     suffix = "" if chosen in (None, "none") else f", {chosen}"
     for name in names:
         yield f"{name}{suffix}", _number(row.get(str(name)))

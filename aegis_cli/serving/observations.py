@@ -92,15 +92,15 @@ class Reader:
         # openpi's key decides: a client of its protocol may send other keys besides.
         if STATE not in message and observation.is_one(message, policy.state_names, policy.state):
             return self._lerobots(message)
-        sent = ", ".join(sorted(map(str, message))) or "nothing"
+        sent = _sent(message)
         if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
             message = {next(iter(self.images)): message[IMAGE], **message}  # its own key wins
         text = self._text(message)
         missing = [key for key in (*self.images, STATE) if key not in message]
-        if text is None:
-            missing.append(PROMPT)
-        if missing or text is None:
+        if missing:
             raise self._wrong(f"no '{missing[0]}' in an observation with {sent}")
+        if text is None:
+            raise _without_instruction(message, sent)
         named = {name: self._array(key, message[key]) for key, name in self.images.items()}
         pictures = named if len(named) > 1 else next(iter(named.values()))
         return Observation(pictures, text, self._positions(message[STATE]))
@@ -112,11 +112,7 @@ class Reader:
         seen = observation.read(robots, policy.cameras, policy.state_names, policy.state)
         text = self._text(message) if seen.task is None else seen.task
         if text is None:
-            raise AegisError(
-                f"no instruction in an observation of {', '.join(map(str, message))}",
-                f"a text at '{observation.TASK}' or '{PROMPT}'",
-                "send one, or give aegis serve --prompt",
-            )
+            raise _without_instruction(message, _sent(message))
         return Observation(seen.pictures, text, self._finite("positions", seen.positions))
 
     def _text(self, message: Mapping[Any, Any]) -> str | None:
@@ -154,6 +150,20 @@ class Reader:
         images = ", ".join(f"'{key}': [H, W, 3] uint8" for key in self.images)
         expected = f"{{{images}, '{STATE}': [{self._policy.positions}], '{PROMPT}': text}}"
         return AegisError(found, expected, "name and shape them as the server's metadata says")
+
+
+def _sent(message: Mapping[Any, Any]) -> str:
+    return ", ".join(sorted(map(str, message))) or "nothing"
+
+
+def _without_instruction(message: Mapping[Any, Any], sent: str) -> AegisError:
+    blank = [key for key in (PROMPT, observation.TASK) if message.get(key) is not None]
+    what = f"a blank '{blank[0]}'" if blank else "no instruction"
+    return AegisError(
+        f"{what} in an observation with {sent}",
+        f"a text at '{PROMPT}', or with LeRobot's keys at '{observation.TASK}'",
+        "send an instruction, or give aegis serve one by --prompt",
+    )
 
 
 def _key(camera: str) -> str:

@@ -30,6 +30,11 @@ from aegis_cli.serving.observations import PREVIOUS, Observation, Reader
 HEALTH = "/healthz"
 LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed pictures of a camera are a tenth of it
 _LOOK_S = 0.2  # how often the server looks whether it is to end
+Tell = Callable[[str], object]
+
+
+def _silently(_: str) -> None:
+    """The default listener of what happens at the server."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,7 @@ def run(
     precision: str,
     on_ready: Callable[[Serving], None],
     ensemble: float | None = None,
+    tell: Tell = _silently,
 ) -> None:
     """Serve a run's policy until a signal ends the process.
 
@@ -61,6 +67,7 @@ def run(
         seed: seeds the noise of every connection alike.
         precision, ensemble: see `load_policy`.
         on_ready: is told where, once the server listens.
+        tell: is told in a line who connects, what is refused, and who has gone.
 
     Raises:
         AegisError: no such run, an address that cannot be listened at, or a prompt that the
@@ -79,7 +86,7 @@ def run(
         def ends() -> bool:
             return signaled.number is not None  # noted, not raised: connections close in order
 
-        asyncio.run(listen(policy, host, port, prompt, on_ready, ends))
+        asyncio.run(listen(policy, host, port, prompt, on_ready, ends, tell))
 
 
 async def listen(
@@ -89,9 +96,10 @@ async def listen(
     prompt: str | None,
     on_ready: Callable[[Serving], None],
     ends: Callable[[], bool],
+    tell: Tell = _silently,
 ) -> None:
     """Serve a loaded policy until `ends` is true; then the connections are closed."""
-    answering = _Answering(policy, prompt)
+    answering = _Answering(policy, prompt, tell)
     try:
         server = await serve(
             answering.handle,
@@ -127,29 +135,61 @@ def _health(connection: ServerConnection, request: Request) -> Response | None:
     return None
 
 
+class _Visit:
+    """What is told of one connection."""
+
+    def __init__(self, connection: ServerConnection, tell: Tell) -> None:
+        host, port = connection.remote_address[:2]
+        self._name, self._tell = f"{host}:{port}", tell
+        self._chunks, self._seconds, self._refused = 0, 0.0, ""
+        tell(f"{self._name} has connected")
+
+    def answered(self, seconds: float) -> None:
+        """A chunk was sent, so many seconds after its observation had come."""
+        self._chunks, self._seconds, self._refused = self._chunks + 1, self._seconds + seconds, ""
+
+    def refused(self, error: AegisError) -> None:
+        """Tell of an error once: a robot that goes on asking has the same one at every step."""
+        if str(error) != self._refused:
+            self._refused = str(error)
+            self._tell(f"{self._name} was refused: {'; '.join(self._refused.splitlines())}")
+
+    def ended(self) -> None:
+        """Tell how many chunks the client was sent, and how long each took."""
+        each = f", {1000 * self._seconds / self._chunks:.0f} ms each" if self._chunks else ""
+        self._tell(f"{self._name} has gone after {self._chunks} chunks{each}")
+
+
 class _Answering:
     """Answers all connections; each has a policy of its own, which shares the weights.
 
     One chunk is predicted at a time: two at once would both take twice as long.
     """
 
-    def __init__(self, policy: DeployedPolicy, prompt: str | None) -> None:
+    def __init__(self, policy: DeployedPolicy, prompt: str | None, tell: Tell) -> None:
         self._policy, self.reader = policy, Reader(policy, prompt)
-        self._turn = asyncio.Lock()
+        self._turn, self._tell = asyncio.Lock(), tell
 
     async def handle(self, connection: ServerConnection) -> None:
         """Greet, then answer until the client has gone."""
-        with contextlib.suppress(ConnectionClosed):
-            await connection.send(wire.encode(self.reader.greeting()))
-            await self._converse(connection, self._policy.begin())
+        visit = _Visit(connection, self._tell)
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                await connection.send(wire.encode(self.reader.greeting()))
+                await self._converse(connection, self._policy.begin(), visit)
+        finally:
+            visit.ended()
 
-    async def _converse(self, connection: ServerConnection, policy: DeployedPolicy) -> None:
+    async def _converse(
+        self, connection: ServerConnection, policy: DeployedPolicy, visit: _Visit
+    ) -> None:
         previous_s: float | None = None
         async for message in connection:  # until the client closes it
             started = time.perf_counter()
             try:
                 answer = await self._answer(policy, message)
             except AegisError as error:  # the client's mistake, after which it may go on
+                visit.refused(error)
                 await connection.send(str(error))
                 continue
             except Exception as error:
@@ -159,6 +199,7 @@ class _Answering:
                 answer["server_timing"]["prev_total_ms"] = 1000 * previous_s
             await connection.send(wire.encode(answer))
             previous_s = time.perf_counter() - started
+            visit.answered(previous_s)
 
     async def _answer(self, policy: DeployedPolicy, message: str | bytes) -> dict[str, Any]:
         """Actions [H, A] for an observation, with the milliseconds that they took.

@@ -702,6 +702,27 @@ def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
     assert "Usage: aegis" in err and "Traceback" not in err
 
 
+@pytest.mark.parametrize(
+    ("option", "key"),
+    [
+        ("--backbone", "backbone"),
+        ("--batch_size=8", "train.batch_size"),
+        ("--batch-size", "train.batch_size"),
+        ("--train.steps=100", "train.steps"),
+        ("--camera", "demos.camera"),
+    ],
+)
+def test_a_recipes_key_that_is_given_as_an_option_is_told(option: str, key: str, aegis) -> None:
+    code, out, err = aegis("train", "reach", "--out", "x", option, "8")
+    assert (code, out) == (2, "") and f"but a key of recipes: --set {key}=..." in err
+
+
+@pytest.mark.parametrize("args", [("train", "reach", "--anchor.steps=1"), ("anchor", "--steps")])
+def test_no_key_is_told_where_none_can_be_set(args: tuple[str, ...], aegis) -> None:
+    code, _, err = aegis(*args)
+    assert code == 2 and "No such option" in err and "--set train" not in err
+
+
 class OutOfMemoryError(RuntimeError):
     """As torch's for a GPU, by name."""
 

@@ -56,6 +56,11 @@ def lm_eval(folder: Path, task: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     return path
 
 
+def filtered(number: int) -> dict[str, Any]:
+    """A line that names its filter, as that of no answer is named."""
+    return {"doc_id": number, "filter": "none", "exact_match": 1.0}
+
+
 def heard(events: list[Any]) -> str:
     return "\n".join(event.text for event in events if isinstance(event, Warned))
 
@@ -131,6 +136,29 @@ def test_both_harnesses_are_read(tmp_path: Path) -> None:
         ("gsm8k", "exact_match", 0.0, 4),
         ("gsm8k", "exact_match, strict", 1.0, 4),
     ]
+
+
+def test_several_filters_of_lmms_eval_are_told_by_their_order(tmp_path: Path) -> None:
+    # Its lines do not name the filter: gsm8k has a line of each question for each of the two.
+    right = [1.0, 0.0, 1.0, 0.0]
+    strict, flexible = (rows_of({"exact_match": v}) for v in (right, [1.0] * 4))
+    lmms(tmp_path / "a", "gsm8k", [*strict, *flexible])
+    lmms(tmp_path / "b", "gsm8k", [*strict, *strict])
+    found = harness_scores.run(tmp_path / "a", tmp_path / "b").scores
+    assert [(s.metric, s.questions, s.before, s.after) for s in found] == [
+        ("exact_match", 4, 0.5, 0.5),
+        ("exact_match, filter 2", 4, 1.0, 0.5),
+    ]
+
+
+def test_a_task_of_which_nothing_is_compared_is_told_and_listed(two: tuple[Path, Path]) -> None:
+    noted = [{"id": "validation_Art_1", "answer": "A", "parsed_pred": "B"}] * 3
+    for folder in two:
+        lmms(folder, "mmmu_val", rows_of({"mmmu_acc": noted}))
+    events = list[Any]()
+    report = harness_scores.run(*two, max_drop=50.0, on_event=events.append)
+    assert report.left_out == ["mmmu_val"]
+    assert "mmmu_val: nothing of it is compared, and --max-drop does not judge" in heard(events)
 
 
 @pytest.mark.parametrize("key", ("score", "is_correct", "correct"))
@@ -238,6 +266,8 @@ def test_what_holds_no_scores_of_two_models_is_refused(
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no file of samples" in refused(empty, two[1])
+    (empty / "model_MMBench_DEV_EN.xlsx").touch()
+    assert "VLMEvalKit writes them, which are not read" in refused(empty, two[1])
     assert "check the path" in refused(tmp_path / "none", two[1])
     assert "before and after" in refused(two[0], two[0])
     lmms(tmp_path / "other", "pope", rows_of({"pope_accuracy": [1.0]}))
@@ -250,7 +280,8 @@ def test_what_holds_no_scores_of_two_models_is_refused(
     [
         ("{", "line 11 of"),
         ("[1]", "no question's doc_id"),
-        (json.dumps(rows_of({"exact_match": [1.0]})[0]), "question 0 a second time"),
+        (json.dumps(rows_of({"exact_match": [1.0]})[0]), "question 0 on 2 lines"),
+        (json.dumps(filtered(0)), "question 0 a second time"),
     ],
 )
 def test_damaged_samples_are_refused(two: tuple[Path, Path], line: str, said: str) -> None:

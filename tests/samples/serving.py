@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -37,7 +37,9 @@ def observation(seed: int = 0, **changes: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def served(policy: DeployedPolicy, prompt: str | None = None) -> Iterator[Serving]:
+def served(
+    policy: DeployedPolicy, prompt: str | None = None, tell: Callable[[str], object] = id
+) -> Iterator[Serving]:
     """The policy at a free port of this machine, until the block ends."""
     ready: queue.Queue[Serving] = queue.Queue()
     ends = threading.Event()
@@ -45,7 +47,7 @@ def served(policy: DeployedPolicy, prompt: str | None = None) -> Iterator[Servin
 
     def work() -> None:
         try:
-            asyncio.run(listen(policy, "127.0.0.1", 0, prompt, ready.put, ends.is_set))
+            asyncio.run(listen(policy, "127.0.0.1", 0, prompt, ready.put, ends.is_set, tell))
         except BaseException as error:
             raised.append(error)
 

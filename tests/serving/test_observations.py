@@ -71,7 +71,7 @@ def test_the_greeting_names_numbers_and_rate_where_they_are_known() -> None:
     assert [unknown[key] for key in ("action_names", "state_names", "fps")] == [None] * 3
 
 
-@pytest.mark.parametrize("missing", ["observation/wrist", "observation/state", "prompt"])
+@pytest.mark.parametrize("missing", ["observation/wrist", "observation/state"])
 def test_a_missing_key_is_named_with_those_that_are_there(missing: str) -> None:
     seen = several()
     del seen[missing]
@@ -87,7 +87,7 @@ def test_a_blank_prompt_is_none(blank: str | None) -> None:
     policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
     for seen in (several(), LEROBOTS | {"task": ""}, ROBOTS):
         assert Reader(policy, "hold").read(seen | {"prompt": blank}).prompt == "hold"
-        with pytest.raises(AegisError, match="no 'prompt'|no instruction"):
+        with pytest.raises(AegisError, match="a blank '(prompt|task)'|no instruction"):
             Reader(policy).read(seen | {"prompt": blank})
 
 
@@ -144,6 +144,18 @@ def test_lerobots_observations_and_a_robots_are_read_as_openpis(
     left = {"previous_actions": np.ones((3, 2)), "delay": 2}
     moving = Reader(policy).read(seen | text | left)
     assert (moving.delay, moving.previous.tolist()) == (2, [[1, 1]] * 3)
+
+
+def test_what_does_not_fit_is_named_by_its_camera_or_joint() -> None:
+    policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
+    reader = Reader(policy)
+    with pytest.raises(AegisError, match=r"a picture of .*wrist of shape \(3, 8, 8\)"):
+        seen = reader.read(several() | {"observation/wrist": np.zeros((3, 8, 8), np.uint8)})
+        policy.predict_action_chunk(seen.pictures, seen.prompt, seen.state)
+    with pytest.raises(AegisError) as caught:
+        seen = reader.read(several() | {"observation/state": np.zeros(2)})
+        policy.predict_action_chunk(seen.pictures, seen.prompt, seen.state)
+    assert caught.value.expected == "(3,): a.pos, b.pos, c.pos"
 
 
 @pytest.mark.parametrize("seen", [LEROBOTS, ROBOTS])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -60,7 +61,7 @@ def test_the_stock_client_of_openpi_gets_the_actions_of_load_policy(naive_run: P
             seen = observation(seed, **{"observation/state": np.full(6, 0.1)})
             found = client.infer(seen)
             np.testing.assert_array_equal(found["actions"], chunk(own, seen))
-        with pytest.raises(RuntimeError, match="no 'prompt' in an observation"):
+        with pytest.raises(RuntimeError, match="no instruction in an observation"):
             client.infer({key: value for key, value in seen.items() if key != "prompt"})
         np.testing.assert_array_equal(client.infer(seen)["actions"], chunk(own, seen))
         broker = pytest.importorskip("openpi_client.action_chunk_broker")
@@ -182,6 +183,23 @@ def test_an_observation_that_does_not_fit_says_why(
         assert isinstance(answer, str) and says in answer
         lists = {"observation/state": [0.5, 0.0, 1.0], "something/else": 1}
         assert client.infer(observation(**lists))["actions"].shape == (4, 2)
+
+
+def test_the_server_tells_who_comes_what_is_refused_and_who_goes() -> None:
+    told: list[str] = []
+    with served(deployed(), tell=told.append) as serving, Client(serving.url) as client:
+        for _ in range(3):  # a robot that goes on asking
+            client.infer(observation(prompt=""))
+        client.infer(observation())
+        client.infer(observation(prompt=""))
+    (name,) = {line.split(" ")[0] for line in told}
+    assert name.startswith("127.0.0.1:")
+    said = [line.removeprefix(f"{name} ") for line in told]
+    assert said[0] == "has connected"
+    assert len(said) == 4 and all(
+        line.startswith("was refused: found: a blank 'prompt'") for line in said[1:3]
+    )
+    assert re.fullmatch(r"has gone after 1 chunks, \d+ ms each", said[3])
 
 
 @pytest.fixture(scope="module")
@@ -330,5 +348,10 @@ def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:
             with pytest.raises(ConnectionClosed):
                 client.socket.recv()
         assert process.wait(20) == 128 + signal.SIGTERM
-        said = "ended by SIGTERM; the server is closed\n"
-        assert process.stderr.read() == said and process.stdout.read() == ""
+        assert process.stdout.read() == ""
+        *visit, said = process.stderr.read().splitlines()
+        assert said == "ended by SIGTERM; the server is closed"
+        assert [line.split(" ", 1)[1] for line in visit] == [
+            "has connected",
+            "has gone after 0 chunks",
+        ]

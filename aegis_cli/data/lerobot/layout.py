@@ -79,13 +79,24 @@ class Feature:
             # Datasets name a picture's axes instead: height, width and channels.
             return ("red", "green", "blue")
         names = self.names
-        if isinstance(names, Mapping):  # {"motors": [...]}, as some datasets have them
-            lists = (value for value in names.values() if isinstance(value, list))
-            names = next(lists, None)
         count = math.prod(self.shape)
+        if isinstance(names, Mapping):
+            names = _listed(names, count)
         if isinstance(names, list) and len(names) == count:
             return tuple(map(str, names))
         return ("",) * count
+
+
+def _listed(names: Mapping[Any, Any], count: int) -> list[Any] | None:
+    """The names of so many numbers in a mapping; None where it has none.
+
+    Some datasets have {"motors": [...]}, and those of LeRobot's teleoperators that move the hand
+    {"delta_x": 0, "delta_y": 1}, a place for each name.
+    """
+    places = {place: name for name, place in names.items() if isinstance(place, int)}
+    if len(names) == count and places.keys() == set(range(count)):
+        return [places[place] for place in range(count)]
+    return next((list(value) for value in names.values() if isinstance(value, list)), None)
 
 
 @dataclass(frozen=True)

@@ -376,3 +376,20 @@ def test_an_empty_folder_is_filled_and_another_left_alone(tmp_path: Path) -> Non
     with pytest.raises(AegisError, match="exists"):
         save(tmp_path / "d")
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.parametrize(
+    ("names", "components"),
+    [
+        (["dx", "dy"], ("dx", "dy")),
+        ({"motors": ["dx", "dy"]}, ("dx", "dy")),
+        ({"dy": 1, "dx": 0}, ("dx", "dy")),  # LeRobot's teleoperators that move the hand
+        ({"dx": 0, "dy": 2}, ("", "")),
+        ({"dx": 0, "dy": 1, "dz": 2}, ("", "")),
+        ({"dx": 0, "dy": 0}, ("", "")),
+        (["state"], ("", "")),
+        (None, ("", "")),
+    ],
+)
+def test_a_features_names_are_a_list_or_places(names: Any, components: tuple[str, ...]) -> None:
+    assert layout.Feature("float32", (2,), names, False).components == components
