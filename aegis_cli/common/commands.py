@@ -7,4 +7,9 @@ import shlex
 
 def aegis(*words: object) -> str:
     """A call of `aegis` with these words, each quoted where it has to be."""
-    return shlex.join(["aegis", *map(str, words)])
+    return shell("aegis", *words)
+
+
+def shell(*words: object) -> str:
+    """A call of any program, likewise."""
+    return shlex.join(map(str, words))

@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 
 # What to do about the path of an input that is no text.
@@ -306,7 +307,9 @@ def check_writable(path: Path) -> None:
     folder = path.parent
     if not folder.is_dir():
         raise AegisError(
-            f"no folder '{folder}'", f"a folder to write '{path.name}' to", f"mkdir -p '{folder}'"
+            f"no folder '{folder}'",
+            f"a folder to write '{path.name}' to",
+            commands.shell("mkdir", "-p", folder),
         )
     if path.is_dir() or not os.access(folder, os.W_OK):
         raise AegisError(
@@ -396,7 +399,8 @@ def make_folder(path: Path) -> None:
             raise AegisError(
                 f"'{above}' is a link to '{os.readlink(above)}', and nothing is there",
                 "a link that leads to a folder",
-                f"mkdir -p '{followed(above)}', mount its disk, or choose another output",
+                commands.shell("mkdir", "-p", followed(above))
+                + ", mount its disk, or choose another output",
             )
     try:
         for _ in range(_ATTEMPTS):
@@ -457,7 +461,7 @@ def reading(path: str | Path, fix: str) -> Generator[None]:
     except OSError as error:
         problem = "it is a folder" if Path(path).is_dir() else error.strerror or error
         raise AegisError(
-            f"cannot read '{path}': {problem}", "a readable file", f"ls -ld '{path}'"
+            f"cannot read '{path}': {problem}", "a readable file", commands.shell("ls", "-ld", path)
         ) from error
 
 
@@ -465,7 +469,7 @@ def cure(folder: Path, error: OSError) -> str:
     """What to do about a folder in which something could not be written."""
     folder = _lasting(folder)
     if error.errno == errno.ENOENT:
-        return f"mkdir -p '{folder}'"
+        return commands.shell("mkdir", "-p", folder)
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return f"free space on the disk of '{folder}', or choose another output"
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):

@@ -30,7 +30,7 @@ def get(name: str) -> Method:
         AegisError: there is none.
     """
     if name not in METHODS:
-        raise AegisError(f"method '{name}'", f"one of {', '.join(METHODS)}", "choose with --method")
+        raise AegisError(f"method '{name}'", f"one of {', '.join(METHODS)}", "choose one of these")
     return METHODS[name]
 
 

@@ -58,6 +58,7 @@ _SAID = (
     "dataset",
     "base_model",
     "began_as",
+    "merge",
 )
 _UNSCALED = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
 

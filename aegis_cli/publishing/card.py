@@ -130,7 +130,8 @@ def text(
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
     # Others have the model that an earlier run began with, and not that run.
-    known = dataclasses.replace(recipe, backbone=meta.get("began_as", recipe.backbone))
+    began = meta.get("began_as", recipe.backbone)
+    known = dataclasses.replace(recipe, backbone=began, probe=_asked(found, recipe))
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {found.method}",
@@ -153,6 +154,17 @@ def text(
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
         use=_use(form, repo, known, facts["task"], cameras, _looks_by(meta, facts["task"])),
     )
+
+
+def _asked(found: InspectReport, recipe: Recipe) -> recipes.Probe:
+    """The probe that the card's first figures are of; the recipe's where none was made."""
+    first = recipe.probe.of_each_set()[0]
+    if not found.probes or not found.probes[0].settings:  # `aegis run` asks as the recipe says
+        return first
+    probed = found.probes[0]
+    keys = ("vqa", "ask", "questions", "seed")
+    told = {name: probed.settings[name] for name in keys if name in probed.settings}
+    return dataclasses.replace(first, **told, skip_bad=bool(probed.figures.get("skipped")))
 
 
 def _merged(merge: Mapping[str, Any] | None) -> str:

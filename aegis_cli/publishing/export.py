@@ -107,6 +107,8 @@ def run(
     steps, planned = warn_of_steps_left(run_path, "export", on_event)
     warn_of_a_merge(run_path, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)
+    if "merge" in meta:  # which models it was between, without where they lie here
+        meta["merge"] = without_places(meta["merge"])
     cameras = _cameras(camera, meta)
     if camera is not None:
         meta = _renamed(meta, camera)

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.version import __version__
@@ -114,7 +115,8 @@ def run(
         raise AegisError(
             f"'{run_path}', a checkpoint outside of its run",
             "a run, whose recipe and results make the model card",
-            "give the run's folder",
+            "give the run's folder, or send what aegis export wrote as it is: "
+            f"{commands.shell('hf', 'upload', repo, run_path)}",
         )
     export.warn_of_steps_left(run_path, "push", on_event)
     export.warn_of_a_merge(run_path, "push", on_event)

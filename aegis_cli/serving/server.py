@@ -139,8 +139,9 @@ class _Visit:
     """What is told of one connection."""
 
     def __init__(self, connection: ServerConnection, tell: Tell) -> None:
-        host, port = connection.remote_address[:2]
-        self._name, self._tell = f"{host}:{port}", tell
+        address = connection.remote_address  # none of a client that is gone already
+        self._name = "a client" if address is None else f"{address[0]}:{address[1]}"
+        self._tell = tell
         self._chunks, self._seconds, self._refused = 0, 0.0, ""
         tell(f"{self._name} has connected")
 
@@ -157,7 +158,8 @@ class _Visit:
     def ended(self) -> None:
         """Tell how many chunks the client was sent, and how long each took."""
         each = f", {1000 * self._seconds / self._chunks:.0f} ms each" if self._chunks else ""
-        self._tell(f"{self._name} has gone after {self._chunks} chunks{each}")
+        chunks = "1 chunk" if self._chunks == 1 else f"{self._chunks:,} chunks"
+        self._tell(f"{self._name} has gone after {chunks}{each}")
 
 
 class _Answering:

@@ -489,7 +489,7 @@ def test_interrupt_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_missing_output_folder(tmp_path: Path) -> None:
     with pytest.raises(AegisError) as caught:
         write(tmp_path / "no" / "such", "anchor")
-    assert f"mkdir -p '{tmp_path / 'no' / 'such'}'" in caught.value.fix and not list(
+    assert f"mkdir -p {tmp_path / 'no' / 'such'}" in caught.value.fix and not list(
         tmp_path.iterdir()
     )
     (tmp_path / "file").touch()

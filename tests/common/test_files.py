@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import shlex
 import signal
 import socket
 import stat
@@ -228,8 +229,14 @@ def test_a_folder_behind_a_link_that_leads_nowhere_is_not_made(name: str, tmp_pa
     with pytest.raises(AegisError) as caught:
         files.make_folder(tmp_path / name)
     assert "link to 'disk/runs'" in caught.value.found
-    assert f"mkdir -p '{tmp_path / 'disk' / 'runs'}'" in caught.value.fix
+    assert f"mkdir -p {tmp_path / 'disk' / 'runs'}" in caught.value.fix
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_command_in_an_error_can_be_pasted_whatever_the_name(tmp_path: Path) -> None:
+    with pytest.raises(AegisError) as caught:
+        files.check_writable(tmp_path / "ann's runs" / "x.safetensors")
+    assert shlex.split(caught.value.fix) == ["mkdir", "-p", str(tmp_path / "ann's runs")]
 
 
 # --- what is no regular file ----------------------------------------------------------------------

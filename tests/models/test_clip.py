@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import shutil
@@ -376,6 +377,25 @@ def test_a_folder_that_is_no_task_is_one_error(
     with pytest.raises(AegisError) as caught:
         folders.load(root, "animals", SIZE)
     assert said in caught.value.found + caught.value.expected
+
+
+@pytest.mark.parametrize("name", [folders.CLASSES, folders.TEMPLATES])
+def test_a_file_of_words_that_cannot_be_read_is_one_error(
+    name: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shutil.copytree(dataset, tmp_path / "copy")
+    (root / "animals" / name).write_text("{}")
+    whole = Path.read_bytes
+
+    def read(path: Path, *_: object, **__: object) -> bytes:
+        if path.name == name:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return whole(path)
+
+    for reading in ("read_bytes", "read_text"):
+        monkeypatch.setattr(Path, reading, read)
+    with pytest.raises(AegisError, match=f"cannot read '.*{name}': Permission denied"):
+        folders.load(root, "animals", SIZE)
 
 
 def test_words_that_the_embedded_encoder_does_not_know_have_their_files_named(

@@ -53,7 +53,7 @@ def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) ->
     assert {p.name for p in exported.iterdir()} == names
     config = json_of(exported / "config.json")
     policy = checkpoint.load_policy(exported)[0]
-    assert config["type"] == "aegis" and config["n_action_steps"] == 4
+    assert config["type"] == "aegis" and config["n_action_steps"] == 20
     assert config["chunk_size"] == policy.expert.shape.chunk
     assert list(config["input_features"]) == ["observation.images.top", "observation.state"]
     size = policy.backbone.image_size
@@ -212,6 +212,19 @@ def test_what_a_policy_learned_from_is_kept(
     for name in ("first", "second"):
         _, kept = checkpoint.load_policy(tmp_path / name)
         assert {key: kept.get(key) for key in learned} == learned
+
+
+@pytest.mark.parametrize("form", [card.LEROBOT, card.AEGIS])
+def test_what_it_was_merged_with_is_kept_without_a_folder(
+    form: str, run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, meta = checkpoint.load_policy(run_folder)
+    told = {**meta, "merge": {"method": "linear", "strength": 0.5, "base": "/home/ann/models/vlm"}}
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "load_policy", lambda _: (policy, told))
+        export.run(run_folder, tmp_path / "policy", form)
+    _, kept = checkpoint.load_policy(tmp_path / "policy")
+    assert kept["merge"] == {"method": "linear", "strength": 0.5, "base": "vlm"}
 
 
 def test_nothing_is_left_of_an_export_that_fails(

@@ -216,6 +216,20 @@ def test_a_card_names_the_set_of_each_probe() -> None:
     assert [row.split("`")[1] for row in rows] == ["scenes", "easy-vqa"]
 
 
+def test_a_cards_command_asks_what_its_first_figures_are_of(run_folder: Path) -> None:
+    recipe = recipes.load(run_folder / "recipe.yaml")
+    asked = {"vqa": "/home/ann/lab.jsonl", "ask": "{} Briefly.", "questions": 50, "seed": 3}
+    settings = {**asked, "baseline": "x", "gate": "mean"}
+    probed = results.Result("probe-lab", {"skipped": 2}, settings)
+    found = card.inspection.InspectReport("run", "x", {}, probes=(probed,))
+    known = dataclasses.replace(recipe, probe=card._asked(found, recipe))
+    command = card._probe_command(REPO, known)
+    assert "--vqa lab.jsonl --ask '{} Briefly.' --skip-bad --questions 50 --seed 3" in command
+    by_the_recipe = results.Result("probe", {}, {})
+    found = card.inspection.InspectReport("run", "x", {}, probes=(by_the_recipe,))
+    assert card._asked(found, recipe) == recipe.probe
+
+
 @pytest.mark.parametrize("hosted", [True, False])
 def test_a_card_names_the_backbone_that_came_from_the_hub_and_no_folder(
     hosted: bool,
@@ -487,4 +501,5 @@ def test_what_is_no_run_is_refused(aegis: Aegis, run_folder: Path, tmp_path: Pat
     at = checkpoint.last(run_folder).resolve()
     (alone / "backbone").mkdir(parents=True)
     (alone / checkpoint.EXPERT).write_bytes((at / checkpoint.EXPERT).read_bytes())
-    assert "outside of its run" in refused(aegis("push", alone, REPO, "--dry-run"))
+    said = refused(aegis("push", alone, REPO, "--dry-run"))
+    assert "outside of its run" in said and f"hf upload {REPO} {alone}" in said

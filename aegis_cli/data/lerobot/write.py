@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import check_utf8, cure, folder_aside, followed, put
 from aegis_cli.common.media import Mp4Writer
@@ -71,7 +72,7 @@ def check_new(folder: Path) -> None:
         raise AegisError(
             f"no folder '{folder.parent}'",
             f"a folder to write '{folder.name}' to",
-            f"mkdir -p '{folder.parent}'",
+            commands.shell("mkdir", "-p", folder.parent),
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise AegisError(

@@ -277,7 +277,8 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
     named: dict[str, str] = {}
     if path.is_file():
         try:
-            named = parse_json(path.read_text(encoding="utf-8"))
+            with reading(path, "check the path"):
+                named = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise AegisError(
                 f"'{path}' is not JSON ({error})", '{"folder": "words", …}', "correct it"

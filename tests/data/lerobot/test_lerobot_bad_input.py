@@ -486,7 +486,7 @@ def test_a_picture_that_is_none(content: bytes | None, bad: Bad, folder: Path) -
     [
         (("--format", "lerobot", "--out", "d"), "new or empty folder"),
         (("--format", "lerobot", "--out", "file"), "new or empty folder"),
-        (("--format", "lerobot", "--out", "none/d"), "mkdir -p 'none'"),
+        (("--format", "lerobot", "--out", "none/d"), "mkdir -p none"),
         (("--video", "--out", "x.safetensors"), "--format lerobot"),
     ],
 )
