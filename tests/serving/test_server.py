@@ -199,7 +199,7 @@ def test_the_server_tells_who_comes_what_is_refused_and_who_goes() -> None:
     assert len(said) == 4 and all(
         line.startswith("was refused: found: a blank 'prompt'") for line in said[1:3]
     )
-    assert re.fullmatch(r"has gone after 1 chunks, \d+ ms each", said[3])
+    assert re.fullmatch(r"has gone after 1 chunk, \d+ ms each", said[3])
 
 
 @pytest.fixture(scope="module")
