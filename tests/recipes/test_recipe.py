@@ -277,6 +277,7 @@ def test_a_typo_gets_the_close_match(text, meant, tmp_path):
             "write 'rollout.colors: [seen, held-out]', or --set 'rollout.colors=[seen, held-out]'",
         ),
         ("wholly_unknown=3", "delete 'wholly_unknown'"),
+        ("train.lr=1e-4", "did you mean 'train.backbone_lr' or 'train.expert_lr'?"),
     ],
 )
 def test_a_key_without_its_section_and_a_list_without_its_brackets_say_what_was_meant(
