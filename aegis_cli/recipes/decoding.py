@@ -153,10 +153,10 @@ def _fix(
 
 
 def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
-    """The key that was meant: of that very name elsewhere, else spelled alike or with it here."""
+    """The key that was meant: of that very name elsewhere, else spelled alike or ending so here."""
     names = [field.name for field in dataclasses.fields(kind) if not is_retired(field)]
     near = did_you_mean(name, names)
-    holding = [key for key in names if name in key.split("_")]  # of `lr` both learning rates
+    holding = [key for key in names if key.endswith(f"_{name}")]  # of `lr` both learning rates
     meant = elsewhere or ([near] if near else holding)
     said = " or ".join(f"'{prefix}{key}'" for key in meant)
     fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"

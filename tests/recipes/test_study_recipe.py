@@ -135,9 +135,9 @@ def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
             "move it to 'shared'",
         ),
         (
-            with_variant(method="lora", set={"rollout.replan": 9}),
-            "variants.x: rollout.replan: 9 with train.chunk: 8",
-            "at most 8",
+            with_variant(method="lora", set={"rollout.replan": 21}),
+            "variants.x: rollout.replan: 21 with train.chunk: 20",
+            "at most 20",
         ),
         (
             with_variant(method="ewc"),
