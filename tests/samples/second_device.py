@@ -189,15 +189,15 @@ def _reads(func: Any, args: Any, kwargs: Any) -> bool:
 
 def note_wait() -> None:
     """Count a wait within a step, by the place in Aegis, unless a model's own code waits."""
-    frames = [
-        frame
-        for frame in traceback.extract_stack()
-        if "/aegis_cli/" in frame.filename or "/transformers/" in frame.filename
-    ]
-    in_step = any(f.filename.endswith("training/step.py") for f in frames)
-    if in_step and "/transformers/" not in frames[-1].filename:
-        file = frames[-1].filename.rpartition("/aegis_cli/")[2]
-        waits[f"{file}:{frames[-1].name}"] += 1
+    # The frames alone, from the innermost on: `extract_stack` would read their lines, too.
+    callers = [frame.f_code for frame, _ in traceback.walk_stack(None)]
+    if not any(code.co_filename.endswith("training/step.py") for code in callers):
+        return
+    of_interest = ("/aegis_cli/", "/transformers/")
+    waiting = next(c for c in callers if any(name in c.co_filename for name in of_interest))
+    if "/transformers/" not in waiting.co_filename:
+        file = waiting.co_filename.rpartition("/aegis_cli/")[2]
+        waits[f"{file}:{waiting.co_name}"] += 1
 
 
 def note_copy() -> None:

@@ -69,14 +69,24 @@ def recipe(backbone: Path) -> Recipe:
 def commands(backbone: Path, demos: Path, methods: Sequence[str]) -> dict[str, list[str]]:
     """From the anchor to what is measured of a policy and of a merged one."""
     given = ["--demos", str(demos), "--anchor", ANCHOR]
-    asked = ["--samples", "12", "--batch-size", "4", "--parts", PARTS]
+    asked = ["--samples", "6", "--batch-size", "3", "--parts", PARTS]
     found = {"anchor": ["anchor", "--backbone", str(backbone), *asked, "--out", ANCHOR]}
     for method in methods:
         found[method] = ["train", "recipe.yaml", "--method", method, *given, "--out", method]
     asked = ["--baseline", str(backbone), "--questions", "14"]
     found["probe"] = ["probe", "naive", *asked, "--anchor", ANCHOR]
     found["evaluate"] = ["evaluate", "naive", "--demos", str(demos)]
-    found["merge"] = ["merge", "naive", *given, "--strength", "1", "--out", "merged"]
+    found["merge"] = [
+        "merge",
+        "naive",
+        *given,
+        "--strength",
+        "1",
+        "--frames",
+        "16",
+        "--out",
+        "merged",
+    ]
     return {name: [*arguments, "--json"] for name, arguments in found.items()}
 
 
