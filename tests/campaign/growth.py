@@ -24,7 +24,7 @@ from aegis_cli.anchors import measure as anchors  # noqa: E402
 from aegis_cli.common import artifacts  # noqa: E402
 from aegis_cli.common.events import Progress  # noqa: E402
 from aegis_cli.data import record  # noqa: E402
-from aegis_cli.recipes import Anchor  # noqa: E402
+from aegis_cli.recipes import Anchor, Rollout  # noqa: E402
 from aegis_cli.training import train  # noqa: E402
 
 
@@ -55,7 +55,7 @@ def measure(folder: Path, steps: int, points: int) -> tuple[dict[int, int], int]
         validate_every=steps,
         log_every=10,
     )
-    recipe = dataclasses.replace(recipe, task="point")
+    recipe = dataclasses.replace(recipe, task="point", rollout=Rollout(replan=2))
     found: dict[int, int] = {}
 
     def note(event: Progress) -> None:

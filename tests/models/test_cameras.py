@@ -165,7 +165,7 @@ def test_the_policy_acts_on_both(run: Path, folder: Path) -> None:
         policy.act(rows, batch.instructions, batch.proprio, torch.Generator().manual_seed(0))
         for rows in (batch.images, other)
     ]
-    assert chunks[0].shape == (3, 8, 2) and not torch.equal(*chunks)
+    assert chunks[0].shape == (3, 20, 2) and not torch.equal(*chunks)
 
 
 def test_the_policy_is_compared_with_what_both_have_seen(run: Path, folder: Path) -> None:

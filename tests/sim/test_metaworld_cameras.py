@@ -47,7 +47,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def trained(backbone: Path, dataset: Path, out: Path, camera: Any, **demos: Any) -> Path:
-    made = recipe(backbone, steps=1, validation_share=0.5, chunk=4)
+    made = recipe(backbone, steps=1, validation_share=0.5)
     made = replace(made, task=TASK, demos=Demos(camera=camera, **demos))
     train.run(made, "naive", dataset, None, out)
     return out

@@ -43,7 +43,7 @@ VARIANTS: dict[str, Any] = {
 
 def raw(backbone: Path | str, **changes: Any) -> dict[str, Any]:
     """The keys of a study that takes seconds; `changes` replace top-level keys."""
-    train_keys = {"steps": 4, "batch_size": 4, "chunk": 4, "flow_samples": 2, "warmup": 1}
+    train_keys = {"steps": 4, "batch_size": 4, "chunk": 20, "flow_samples": 2, "warmup": 1}
     keys = {
         "kind": "robot-stream-study",
         "name": "small",
@@ -55,7 +55,7 @@ def raw(backbone: Path | str, **changes: Any) -> dict[str, Any]:
             "demos": {"episodes": 3},
             "train": {**train_keys, "lr": 1e-2, "precision": "float32"},
             "expert": {"width": 16, "mlp_ratio": 1},
-            "rollout": {"episodes": 1},
+            "rollout": {"episodes": 1, "replan": 20},
             "probe": {"questions": 20},
         },
         "variants": VARIANTS,
