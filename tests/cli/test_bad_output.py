@@ -272,18 +272,16 @@ def test_a_signal_leaves_a_run_that_goes_on(place: Path, number: signal.Signals)
 
 def starting(pid: int, _: str) -> bool:
     """The first worker process is there, but has hardly begun to import anything."""
-    tasks = Path(f"/proc/{pid}/task")
-    return any(
-        "multiprocessing.spawn" in command_of(child)
-        for task in tasks.iterdir()
-        for child in (task / "children").read_text().split()
-    )
+    threads = Path(f"/proc/{pid}/task").iterdir()
+    children = [child for thread in threads for child in said_by(thread / "children").split()]
+    return any("multiprocessing.spawn" in said_by(Path(f"/proc/{pid}/cmdline")) for pid in children)
 
 
-def command_of(pid: str) -> str:
+def said_by(file: Path) -> str:
+    """What the system says of a process or a thread; nothing of one that has just ended."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
-    except OSError:  # it has just ended
+        return file.read_text(encoding="utf-8")
+    except OSError:
         return ""
 
 
