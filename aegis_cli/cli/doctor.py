@@ -74,7 +74,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
         Check("aegis", OK, __version__),
         Check("python", OK, f"{platform.python_version()} on {platform.platform(terse=True)}"),
         *_packages(),
-        _attempt("torch", _torch, "pip install 'torch>=2.9,<=2.13.0'"),
+        _attempt("torch", _torch, "pip install 'torch>=2.9'"),
         _attempt("opengl", _opengl, ""),
         _disk(Path.cwd()),
         *_extras(),
