@@ -358,17 +358,22 @@ def test_a_gradient_of_the_inputs_alone_takes_no_pass_away(anchors: dict[str, Pa
     assert len(guard.ledger) == 1
 
 
+def scaled_steps(model: nn.Module, scaler: torch.amp.GradScaler) -> None:
+    """Three steps of AdamW, of losses that a scaler has made larger."""
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    for seed in range(3):
+        scaler.scale(task_loss(model, seed)).backward()
+        scaler.step(optimizer)
+        scaler.update()
+        optimizer.zero_grad()
+
+
 def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None:
     model, guard = automatic("aegis", anchors)
     plain_steps(model)
     scaler = torch.amp.GradScaler("cpu", init_scale=1024.0, growth_interval=1000)
     other, scaled = automatic("aegis", anchors, scaler=scaler)
-    optimizer = torch.optim.AdamW(other.parameters(), lr=1e-2)
-    for seed in range(3):
-        scaler.scale(task_loss(other, seed)).backward()
-        scaler.step(optimizer)
-        scaler.update()
-        optimizer.zero_grad()
+    scaled_steps(other, scaler)
     torch.testing.assert_close(vector(other), vector(model))
     rows, others = guard.ledger.tensors(), scaled.ledger.tensors()
     for name, values in rows.items():
@@ -381,12 +386,7 @@ def test_a_scaler_that_was_not_given_shows_in_the_ledger_alone(anchors: dict[str
     for told in (True, False):
         scaler = torch.amp.GradScaler("cpu", init_scale=scale)
         model, guard = automatic("aegis", anchors, **({"scaler": scaler} if told else {}))
-        optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
-        for seed in range(3):
-            scaler.scale(task_loss(model, seed)).backward()
-            scaler.step(optimizer)
-            scaler.update()
-            optimizer.zero_grad()
+        scaled_steps(model, scaler)
         found.append((vector(model), guard.ledger.tensors()))
     (model, rows), (other, scaled) = found
     torch.testing.assert_close(other, model)
