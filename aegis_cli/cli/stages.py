@@ -122,7 +122,7 @@ LATENCY = Stage("serving.latency", render.facts)
 
 # What `train`, `pretrain` and `run` do with a recipe of each kind.
 TRAIN: dict[type, Stage] = {
-    Recipe: Stage("training.train", render.facts, shared=True),
+    Recipe: Stage("training.train", render.trained, shared=True),
     StreamRecipe: Stage("continual.train", render.stream),
     RobotStreamRecipe: Stage("continual.train", render.stream),
 }

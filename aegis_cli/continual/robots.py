@@ -35,9 +35,10 @@ from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
-from aegis_cli.evaluation import probe, rollout
+from aegis_cli.evaluation import rollout
 from aegis_cli.evaluation.rollout import Acting
 from aegis_cli.models import backbones, policy_meta
+from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
@@ -700,7 +701,7 @@ class RobotEvaluator:
         """Accuracy and cross-entropy of the backbone with no task active."""
         self._run.activate(None)
         model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
-        found = score(probe.ask(model, self._asked, batch_size, self._on_event))
+        found = score(ask(model, self._asked, batch_size, self._on_event))
         return [found.accuracy, found.cross_entropy]
 
     def _named(self, task: str) -> OnEvent:

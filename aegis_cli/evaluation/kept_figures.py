@@ -166,6 +166,7 @@ class TrainFigures:
     step_s: Number | None = None
     cameras: list[str] | None = None
     out: str | None = None
+    validation_vqa: dict[str, dict[str, Number | list[Number]]] | None = None
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
-
 from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
@@ -20,12 +18,12 @@ from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
-from aegis_cli.data.batch import Share
 from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.dataset import VQASet
-from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, grade, prediction, score
+from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, prediction, score
 from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
+from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
 from aegis_cli.training.folder import METRICS
@@ -378,33 +376,6 @@ def _warn_of_another_prompt(anchor: Path, asked: str, prompt: str, on_event: OnE
             f"part of W2 is the prompt's own; probe with --ask {shlex.quote(measured_as)}"
         )
         on_event(Warned("probe", text))
-
-
-def ask(
-    model: Backbone,
-    asked: VQASet,
-    batch_size: int,
-    on_event: OnEvent = ignore,
-    ranks: Ranks = ALONE,
-) -> list[Graded]:
-    """Every question's answer, graded.
-
-    The arithmetic is in float32, so that neither the batch size nor the number of processes shows
-    in the result.
-
-    Args:
-        ranks: the processes that ask a part of the questions each.
-    """
-    own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
-    with torch.inference_mode():
-        graded = grade(
-            model.answers,
-            own.sized(model.image_size),
-            batch_size,
-            on_event,
-        )
-    # Shares follow each other as the processes do, so that answers come in the questions' order.
-    return [one for part in ranks.gathered(graded) for one in part]
 
 
 def drift(

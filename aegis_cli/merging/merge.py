@@ -20,6 +20,7 @@ from aegis_cli.evaluation import probe, results
 from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
 from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
+from aegis_cli.models.asking import ask
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,7 @@ class _Judge:
         self._asked = read.choose(
             "validation", settings.questions, probe.PROBE_SEED, checks, on_event
         )
-        self._before = probe.ask(source.base, self._asked, self._size, on_event)
+        self._before = ask(source.base, self._asked, self._size, on_event)
 
     @property
     def questions(self) -> int:
@@ -246,7 +247,7 @@ class _Judge:
 
     def point(self, strength: float, kept: float) -> MergePoint:
         """What the backbone's weights of now are worth."""
-        after = probe.ask(self._source.backbone, self._asked, self._size)
+        after = ask(self._source.backbone, self._asked, self._size)
         report = probe.compare(after, self._before, [], None)
         performance = _performance(self._source, strength)
         assert report.drop_points is not None and report.drop_interval is not None

@@ -31,6 +31,7 @@ from aegis_cli.merging import task_factors
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.methods import ledger_file
 from aegis_cli.models import backbones
+from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.base import STORED_TYPES, Backbone
 from aegis_cli.training import checkpoint, loading, train
@@ -288,7 +289,7 @@ class ModelFolder:
         if self._asked is None:
             return {}
         asked, size = self._asked.validation, self._settings.batch_size
-        graded = probe.ask(self.backbone, asked, size, self._on_event)
+        graded = ask(self.backbone, asked, size, self._on_event)
         return {"task_accuracy": score(graded).accuracy}
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:

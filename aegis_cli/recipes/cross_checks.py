@@ -37,6 +37,10 @@ def cross_checks(
     if recipe.probe.questions > MOST_MADE and "scenes" in recipe.probe.sets:
         found = f"probe.questions: {recipe.probe.questions} with probe.vqa: scenes"
         yield Problem(found, f"at most {MOST_MADE:,}", "ask for fewer")
+    watched = recipe.probe.while_training
+    if watched is not None and watched > MOST_MADE and "scenes" in recipe.probe.sets:
+        found = f"probe.while_training: {watched} with probe.vqa: scenes"
+        yield Problem(found, f"at most {MOST_MADE:,}", "ask for fewer")
     if isinstance(recipe, RobotStreamRecipe):
         yield from _robot_checks(recipe)
     else:
@@ -143,6 +147,13 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     if recipe.probe.gate != "mean":
         found = f"probe.gate: {recipe.probe.gate} with a stream"
         yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.gate")
+    if recipe.probe.while_training is not None:
+        found = f"probe.while_training: {recipe.probe.while_training} with a stream"
+        yield Problem(
+            found,
+            "no such key: a stream asks its questions after each task",
+            "delete probe.while_training",
+        )
     if not isinstance(recipe.probe.vqa, str):
         found = f"probe.vqa: {', '.join(recipe.probe.vqa)} with a stream"
         yield Problem(found, "one set of questions", f"set probe.vqa to {recipe.probe.vqa[0]}")

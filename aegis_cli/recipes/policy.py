@@ -744,6 +744,14 @@ class Probe:
         doc="What of the drop `max_drop` limits: mean, the drop as measured, or upper, the upper "
         "end of its 95 % interval, so that too few questions cannot pass.",
     )
+    while_training: int | None = key(
+        POSITIVE,
+        default=None,
+        later=True,
+        doc="Validation questions of each set that `aegis train` asks before the first step and "
+        "with every validation loss, so that what is lost shows while it is lost: in its log and "
+        "in trackers. They are of images that neither anchors nor probes are of. Null: none.",
+    )
 
     @property
     def sets(self) -> tuple[str, ...]:

@@ -823,6 +823,7 @@ def _tuple(values: list[Any] | None) -> tuple[Any, ...] | None:
 def _probe_settings(settings: Probe) -> dict[str, Any]:
     """What a probe's record knows of its settings; records older than a key are of its default."""
     keys = dataclasses.asdict(settings)
+    del keys["while_training"]  # what a training asks is none of a probe's questions
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
     if settings.gate == results.MEAN:

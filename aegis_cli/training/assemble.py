@@ -49,6 +49,7 @@ from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.step_figures import UnreadFigures
+from aegis_cli.training.validation_vqa import ValidationQuestions
 
 
 @dataclass
@@ -67,6 +68,7 @@ class TrainingRun:
             None where each step takes its own.
         masters: the float32 weights that passes see rounded.
         began_as: as of `loading.Loaded`.
+        questions: what the backbone is asked with every validation loss; None for nothing.
     """
 
     recipe: Recipe
@@ -88,6 +90,7 @@ class TrainingRun:
     masters: Masters = NONE
     average: Average = field(default_factory=Average)
     began_as: str | None = None
+    questions: ValidationQuestions | None = None
 
     @property
     def rates(self) -> list[dict[str, Any]]:

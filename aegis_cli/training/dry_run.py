@@ -35,6 +35,7 @@ from aegis_cli.training import (
     retention,
     track,
     train,
+    validation_vqa,
 )
 from aegis_cli.training.assemble import TrainingRun
 
@@ -164,6 +165,8 @@ def _planned(
     told(Progress("dry run (loading)", 0, 1, "model"))
     training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     told(Progress("dry run (loading)", 1, 1, "model"))
+    # They are not asked here: that they can be is all that a plan needs to know.
+    validation_vqa.chosen(recipe, training.policy.backbone, told)
     held = _held(training, there)
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)

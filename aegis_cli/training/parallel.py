@@ -57,6 +57,13 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
             )
     if shards(settings, ranks):
         _check_sharding(settings, method)
+        if recipe.probe.while_training is not None:
+            raise AegisError(
+                f"probe.while_training: {recipe.probe.while_training} with train.parallel: fsdp",
+                "a model that each process has whole, to write its answers",
+                "delete probe.while_training, and aegis probe the checkpoints; or --set "
+                "train.parallel=ddp",
+            )
     if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
             f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",

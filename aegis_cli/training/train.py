@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -53,16 +53,21 @@ from aegis_cli.training import (
     longer,
     step,
     track,
+    validation_vqa,
 )
 from aegis_cli.training.assemble import TrainingRun
 from aegis_cli.training.schedule import moving_steps, rate_factor, rate_left
+from aegis_cli.training.validation_vqa import ToldOfSet, ValidationQuestions
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
-# A validation has progress of its own if steps with as many batches would take longer than this.
+# A validation has progress of its own if steps with as many batches would take longer than this;
+# so have questions whose answers took longer before training.
 _LONG_S = 20.0
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
+# What the progress shows of such a line, and under which name.
+_SHOWN = {"loss": "loss", "vqa_drop_points": "VQA drop"}
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 
@@ -73,7 +78,8 @@ class TrainReport:
 
     `energy_shed_mean` is what the projection of the gradient removes, or would where an option
     projects the update or fewer groups; None for a method that reads no anchor gradient. `cameras`
-    are those of a LeRobot folder, in their order.
+    are those of a LeRobot folder, in their order. `validation_vqa` is what the last step's weights
+    answer, by the set's name, as `validation_vqa.of_line` has it; empty where nothing was asked.
     """
 
     method: str
@@ -84,6 +90,7 @@ class TrainReport:
     step_s: float
     cameras: list[str]
     out: str
+    validation_vqa: dict[str, ToldOfSet] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -130,6 +137,8 @@ def run(
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
+        if not (goes_on and _is_finished(out, recipe)):
+            training.questions = _asked_before(training, on_event)
         if goes_on:
             restored = _restore(training, places)
             # Where all steps are behind it, `_train` takes none and reports what there is.
@@ -151,6 +160,24 @@ def run(
             files.save_json(out / machine.NAME, _machine(training))
             _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
+
+
+def _is_finished(out: Path, recipe: Recipe) -> bool:
+    """Whether all steps of a run with a checkpoint are behind it."""
+    return checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
+
+
+def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | None:
+    """The questions that are asked while the run trains, and what its model answers before.
+
+    A run that goes on asks them here too, before its checkpoint is put back.
+    """
+    backbone = run.policy.backbone
+    questions = validation_vqa.chosen(run.recipe, backbone, on_event)
+    if questions is None:
+        return None
+    with _evaluating(run.policy):
+        return questions.asked_before(backbone, run.ranks, on_event)
 
 
 def _machine(run: TrainingRun) -> dict[str, str | int]:
@@ -387,6 +414,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     """
     settings = run.recipe.train
     shown: dict[str, float] = {}
+    told: dict[str, float] = {}
     run.policy.train()
     buffers = WrittenBuffers(run.policy.backbone)
     ahead = batches_of(run, range(done, settings.steps))
@@ -408,7 +436,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 window = Window()
             if due.checkpoint:
                 _save(run, finished)
-            told = {k: shown[k] for k in ("loss",) if k in shown}
+            told |= {label: shown[name] for name, label in _SHOWN.items() if name in shown}
             on_event(Progress("train", finished, settings.steps, "steps", told))
             # All processes leave together: one that went on alone would wait for the others.
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
@@ -751,9 +779,25 @@ def _log(
             loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
+        line |= _vqa_figures(run, finished, on_event)
     if run.ranks.first:
         folder.append_metrics(run.out, line)
     return line
+
+
+def _vqa_figures(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, float]:
+    """What the backbone of a checkpoint written now answers; empty where it is not asked.
+
+    Raises:
+        Diverged: an answer's likelihood is not finite.
+    """
+    if run.questions is None:
+        return {}
+    heard = on_event if run.questions.seconds > _LONG_S else ignore
+    with run.average.in_place(), _evaluating(run.policy):
+        found = run.questions.figures(run.policy.backbone, run.ranks, heard)
+    check_finite(found, f"after step {finished}", LOWER, finished)
+    return found
 
 
 @torch.no_grad()
@@ -860,4 +904,5 @@ def _report(run: TrainingRun) -> TrainReport:
         step_s=times[len(times) // 2],  # the median: the first step pays for what is done once
         cameras=list(run.demos.cameras),
         out=str(run.out),
+        validation_vqa=validation_vqa.of_line(run.recipe, lines[-1]),
     )

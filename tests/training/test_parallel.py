@@ -97,6 +97,9 @@ def shared_runs(
         for each in (OF_THREE, OF_TWO)
     )
     changes = {"accumulate": 2, "ema_decay": 0.6}
+    watched = three["ddp", "distill"]  # three processes ask 2, 2 and 3 of the questions
+    probe = replace(watched.recipe.probe, while_training=7)
+    three["ddp", "distill"] = replace(watched, recipe=replace(watched.recipe, probe=probe))
     begun = make("aegis", out / "begun", parallel="fsdp", **changes)
     ended = make("aegis", out / "begun", parallel="ddp", **changes)
     # Its expert reads the last layer's keys and values past that layer's output.
@@ -335,6 +338,14 @@ def test_what_cannot_be_shared_is_refused(
     recipe = make(method, tmp_path, **settings).recipe
     with pytest.raises(AegisError, match=said):
         parallel.check(recipe, METHODS[method], Ranks(1, 3))
+
+
+def test_shares_of_the_weights_write_no_answers(make: Make, tmp_path: Path) -> None:
+    recipe = make("naive", tmp_path, parallel="fsdp").recipe
+    recipe = replace(recipe, probe=replace(recipe.probe, while_training=7))
+    with pytest.raises(AegisError, match="probe.while_training: 7 with train.parallel: fsdp"):
+        parallel.check(recipe, METHODS["naive"], Ranks(1, 3))
+    parallel.check(recipe, METHODS["naive"], Ranks())  # one process has all of them
 
 
 def test_a_part_of_each_share_is_no_part_of_the_batch(make: Make, tmp_path: Path) -> None:

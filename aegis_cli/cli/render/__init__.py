@@ -34,6 +34,7 @@ from aegis_cli.cli.render.tables import (
     recipe_list,
     scores,
     serving,
+    trained,
 )
 
 __all__ = [
@@ -75,5 +76,6 @@ __all__ = [
     "stream_study",
     "study",
     "text",
+    "trained",
     "write_any_character",
 ]

@@ -51,6 +51,24 @@ def facts(report: Any) -> Table:
     return pairs({name: value for name, value in values.items() if value != ()})
 
 
+def trained(report: Any) -> RenderableType:
+    """How a training ended, and what its weights answered where it asked."""
+    values = dataclasses.asdict(report)
+    asked = values.pop("validation_vqa")
+    return Group(pairs(values), *validation_vqa(asked))
+
+
+def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
+    """A table of the answers to validation questions, a line per set; none where none was asked."""
+    rows = []
+    for name, own in found.items():
+        ends = " to ".join(fixed(end, 2) for end in own["drop_interval"])
+        rows.append((name, percent(own["accuracy"]), fixed(own["drop_points"], 2), ends))
+    if rows:
+        head = ("Validation questions", "VQA %", "Drop (points)", "95 % interval")
+        yield plain_table(head, rows)
+
+
 def serving(report: Any) -> RenderableType:
     """Where a policy is served, and what a client has to send."""
     said = report.metadata  # what the server sends to each client first

@@ -32,6 +32,8 @@ def shared(
         total = len(held_out) + len(others)
         mine = dict(_told(held_out, told, on_event, 0, total))
         theirs = dict(_told(others, told, on_event, len(held_out), total))
+        if total >= _EVERY:  # what has been begun is ended
+            on_event(Progress("compare pictures", total, total, "files"))
         first = {value: picture for picture, value in reversed(theirs.items())}
         pairs = [(picture, first[value]) for picture, value in mine.items() if value in first]
         alike = {*mine.values()}

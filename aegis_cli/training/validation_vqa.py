@@ -1,0 +1,120 @@
+"""What the VLM still knows while it trains: validation questions beside the validation loss.
+
+They choose checkpoints and learning rates, so they are of images that neither an anchor nor a probe
+is of, and what they show is no result. Nothing learns from them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from aegis_cli.common.events import Event, OnEvent
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.metrics import Graded, drop_interval, score
+from aegis_cli.models.asking import ask
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import Recipe
+
+_PREFIX = "vqa_"  # of its figures in a line of metrics
+_FIGURES = ("accuracy", "cross_entropy", "drop_points", "drop_low", "drop_high")
+ToldOfSet = dict[str, Any]  # floats, and under `drop_interval` two
+
+
+@dataclass(frozen=True)
+class ValidationQuestions:
+    """The questions of each set that the recipe probes.
+
+    Attributes:
+        before: the answers of the backbone as it began to each set; empty until it was asked.
+        seconds: that these answers took.
+    """
+
+    asked: tuple[VQASet, ...]
+    batch_size: int
+    before: tuple[list[Graded], ...] = ()
+    seconds: float = 0.0
+
+    def asked_before(
+        self, backbone: Backbone, ranks: Ranks, on_event: OnEvent
+    ) -> ValidationQuestions:
+        """The same, with the answers of a backbone that has not learned yet."""
+        started = time.perf_counter()
+        before = self._answers(backbone, ranks, on_event, "VQA before training")
+        taken = time.perf_counter() - started
+        return dataclasses.replace(self, before=before, seconds=taken)
+
+    def figures(self, backbone: Backbone, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
+        """What a line of metrics says of the backbone as it is now.
+
+        Accuracies are in [0, 1], cross-entropies in nats per answer, and the drop and the ends of
+        its 95 % interval in percentage points. The first set's figures have plain names, those of
+        the others end in their number.
+        """
+        found: dict[str, float] = {}
+        now = self._answers(backbone, ranks, on_event, "VQA")
+        for number, (then, after) in enumerate(zip(self.before, now, strict=True), start=1):
+            old, new = score(then), score(after)
+            low, high = drop_interval(then, after)
+            own = {
+                "accuracy": new.accuracy,
+                "cross_entropy": new.cross_entropy,
+                "drop_points": 100 * (old.accuracy - new.accuracy),
+                "drop_low": 100 * low,
+                "drop_high": 100 * high,
+            }
+            found |= {_named(name, number): value for name, value in own.items()}
+        return found
+
+    def _answers(
+        self, backbone: Backbone, ranks: Ranks, on_event: OnEvent, stage: str
+    ) -> tuple[list[Graded], ...]:
+        def named(event: Event) -> None:
+            on_event(dataclasses.replace(event, stage=stage))
+
+        return tuple(
+            ask(backbone, questions, self.batch_size, named, ranks) for questions in self.asked
+        )
+
+
+def _named(figure: str, number: int) -> str:
+    """What a line of metrics calls a figure of the set of that number, from 1."""
+    return f"{_PREFIX}{figure}" if number == 1 else f"{_PREFIX}{figure}_{number}"
+
+
+def of_line(recipe: Recipe, line: Mapping[str, Any]) -> dict[str, ToldOfSet]:
+    """The figures that a line of metrics has of each set, by the set's name in the recipe.
+
+    They are `accuracy`, `cross_entropy`, `drop_points` and `drop_interval`, in the units of
+    `ValidationQuestions.figures`. A set of which the line has nothing is left out.
+    """
+    found: dict[str, ToldOfSet] = {}
+    for number, name in enumerate(recipe.probe.sets, start=1):
+        told = {figure: line.get(_named(figure, number)) for figure in _FIGURES}
+        if None in told.values():
+            continue
+        ends = [told.pop("drop_low"), told.pop("drop_high")]
+        found[name] = {**told, "drop_interval": ends}
+    return found
+
+
+def chosen(recipe: Recipe, backbone: Backbone, on_event: OnEvent) -> ValidationQuestions | None:
+    """The questions that a recipe's training asks; None where it asks none.
+
+    Raises:
+        AegisError: a set that cannot be read, or a question that the backbone cannot be asked.
+    """
+    probe, count = recipe.probe, recipe.probe.while_training
+    if count is None:
+        return None
+    checks = [backbone.check_text]
+    asked = []
+    for one in probe.of_each_set():
+        source = sets.read(one.only_set, one.skip_bad, on_event, one.ask)
+        asked.append(source.choose("validation", count, one.seed, checks, on_event))
+    return ValidationQuestions(tuple(asked), probe.batch_size)

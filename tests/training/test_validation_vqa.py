@@ -1,0 +1,226 @@
+"""Questions asked while a run trains: they show what is lost, and training does not notice them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    TIMES,
+    Start,
+    assert_resumes,
+    metrics,
+    stop_at,
+)
+from samples.vqa_files import write_jsonl
+
+from aegis_cli import recipes
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import Event, Progress
+from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.metrics import drop_interval, score
+from aegis_cli.inspection import folders
+from aegis_cli.models import backbones
+from aegis_cli.models.asking import ask
+from aegis_cli.recipes import Kfac, Nullspace, Probe, Recipe
+from aegis_cli.reporting import gather
+from aegis_cli.training import checkpoint, dry_run, validation_vqa
+
+COUNT = 21
+FIGURES = {f"vqa_{name}" for name in validation_vqa._FIGURES}
+
+
+@pytest.fixture
+def asking(recipe: Recipe) -> Recipe:
+    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within."""
+    return replace(
+        recipe,
+        probe=Probe(while_training=COUNT, seed=3, batch_size=8),
+        nullspace=Nullspace(every=4),
+        kfac=Kfac(every=4),
+    )
+
+
+def without(recipe: Recipe) -> Recipe:
+    return replace(recipe, probe=replace(recipe.probe, while_training=None))
+
+
+@pytest.mark.parametrize("method", ["naive", "nullspace", "kfac", "lora", "aegis"])
+def test_training_does_not_notice_the_questions(
+    method: str, asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    start(method, tmp_path / "asked", recipe=asking)
+    start(method, tmp_path / "plain", recipe=without(asking))
+    assert metrics(tmp_path / "asked", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    for name in ("backbone/model.safetensors", "expert.safetensors"):
+        one, other = (checkpoint.last(tmp_path / run) / name for run in ("asked", "plain"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+def asked_of(model: str, recipe: Recipe, name: str = "scenes") -> list[Any]:
+    """The answers of a run or a backbone to the validation questions of one set."""
+    backbone = backbones.load(model)
+    source = sets.read(name, ask=recipe.probe.ask)
+    asked = source.choose("validation", COUNT, recipe.probe.seed, [backbone.check_text])
+    return ask(backbone, asked, 64)
+
+
+@pytest.mark.parametrize("changes", [{}, {"ema_decay": 0.6}, {"accumulate": 2}], ids=str)
+@pytest.mark.parametrize("method", ["naive", "lora"])
+def test_the_figures_are_those_of_the_checkpoint(
+    method: str, changes: dict[str, Any], asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    own = replace(asking, train=replace(SETTINGS, **changes))
+    report = start(method, tmp_path / "run", recipe=own)
+    before, after = (asked_of(str(m), own) for m in (own.backbone, tmp_path / "run"))
+    line = metrics(tmp_path / "run")[-1]
+    low, high = drop_interval(before, after)
+    wanted = {
+        "accuracy": score(after).accuracy,
+        "cross_entropy": score(after).cross_entropy,
+        "drop_points": 100 * (score(before).accuracy - score(after).accuracy),
+        "drop_interval": [100 * low, 100 * high],
+    }
+    found = report.validation_vqa["scenes"]
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert found[name] == pytest.approx(value, rel=1e-5, abs=1e-9), name
+    assert score(after).cross_entropy != pytest.approx(score(before).cross_entropy, rel=1e-4)
+    assert {key for key in line if key.startswith("vqa_")} == FIGURES
+
+
+def test_they_are_asked_with_every_validation_loss_and_no_other_time(
+    asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=asking, on_event=events.append)
+    for line in metrics(tmp_path / "run"):
+        assert ("validation_loss" in line) == FIGURES.issubset(line)
+    before = [e for e in events if getattr(e, "stage", "") == "VQA before training"]
+    assert [e.done for e in before if isinstance(e, Progress)] == [0, 8, 16, COUNT]
+    shown = [e.metrics.get("VQA drop") for e in events if isinstance(e, Progress)]
+    last = metrics(tmp_path / "run")[-1]
+    assert shown[-1] == last["vqa_drop_points"]
+
+
+def test_a_run_goes_on_with_the_same_answers_before(
+    asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    assert_resumes(start, "naive", asking, tmp_path)
+    events: list[Event] = []
+    report = start("naive", tmp_path / "whole", recipe=asking, resume=True, on_event=events.append)
+    # A run that has ended tells its figures and asks nothing.
+    assert not [e for e in events if "VQA" in getattr(e, "stage", "")]
+    assert (
+        report.validation_vqa["scenes"]["accuracy"]
+        == metrics(tmp_path / "whole")[-1]["vqa_accuracy"]
+    )
+
+
+def test_a_run_may_begin_or_cease_to_ask_when_it_goes_on(
+    asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(4, KeyboardInterrupt())
+        start("naive", tmp_path / "run", recipe=without(asking), on_event=stop)
+    start("naive", tmp_path / "run", recipe=asking, resume=True)
+    start("naive", tmp_path / "whole", recipe=asking)
+    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    assert one == other
+    assert recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe).probe.while_training
+
+
+def test_each_set_has_figures_of_its_own(asking: Recipe, start: Start, tmp_path: Path) -> None:
+    path = write_jsonl(tmp_path, images=60)
+    own = replace(asking, probe=replace(asking.probe, vqa=("scenes", str(path))))
+    report = start("naive", tmp_path / "run", recipe=own)
+    assert list(report.validation_vqa) == ["scenes", str(path)]
+    line = metrics(tmp_path / "run")[-1]
+    assert {f"{name}_2" for name in FIGURES} < line.keys()
+    second = score(asked_of(str(tmp_path / "run"), own, str(path)))
+    assert line["vqa_cross_entropy_2"] == pytest.approx(second.cross_entropy, rel=1e-5)
+
+
+def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: Path) -> None:
+    report = start("naive", tmp_path / "run", recipe=asking)
+    found = folders.inspect(tmp_path / "run")
+    assert found.facts["validation_vqa"] == report.validation_vqa
+    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
+    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
+    told = early.facts["validation_vqa"]["scenes"]
+    assert told["cross_entropy"] == line["vqa_cross_entropy"]
+    drawn = gather.run_document(tmp_path / "run").metrics
+    assert [at["step"] for at in drawn if "vqa_drop_points" in at] == [3, STEPS]
+
+
+@pytest.mark.parametrize("family", ["smolvlm", "qwen2_5_vl"])
+@pytest.mark.parametrize(
+    "changes",
+    [{"weights": "bf16-master"}, {"gradient_checkpointing": True}, {"weights": "bf16"}],
+    ids=str,
+)
+def test_models_of_the_hub_are_asked_too(
+    family: str,
+    changes: dict[str, Any],
+    asking: Recipe,
+    start: Start,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+) -> None:
+    settings = replace(SETTINGS, steps=2, validate_every=2, **changes)
+    own = replace(asking, backbone=str(hf_folder(family)), train=settings)
+    start("naive", tmp_path / "run", recipe=own, anchor=None)
+    found = metrics(tmp_path / "run")[-1]["vqa_cross_entropy"]
+    wanted = score(asked_of(str(tmp_path / "run"), own)).cross_entropy
+    assert found == pytest.approx(wanted, rel=1e-2 if "weights" in changes else 1e-4)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+def test_questions_that_cannot_be_asked_are_refused_before_the_first_step(
+    asking: Recipe, start: Start, demos_file: Path, tmp_path: Path
+) -> None:
+    path = write_jsonl(tmp_path, images=1)
+    own = replace(asking, probe=replace(asking.probe, vqa=str(path)))
+    with pytest.raises(AegisError, match="no usable question for the validation"):
+        start("naive", tmp_path / "run", recipe=own)
+    assert not (tmp_path / "run" / "recipe.yaml").exists()
+    with pytest.raises(AegisError, match="no usable question for the validation"):
+        dry_run.run(own, "naive", demos_file, None, tmp_path / "run")
+
+
+def test_answers_without_a_likelihood_end_the_run(
+    asking: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = validation_vqa.ValidationQuestions.figures
+
+    def broken(*given: Any) -> dict[str, float]:
+        return figures(*given) | {"vqa_cross_entropy": float("inf")}
+
+    monkeypatch.setattr(validation_vqa.ValidationQuestions, "figures", broken)
+    with pytest.raises(Diverged, match="vqa_cross_entropy"):
+        start("naive", tmp_path / "run", recipe=asking)
+    assert all("vqa_cross_entropy" not in line for line in metrics(tmp_path / "run"))
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("recipe_file", "count", "expected"),
+    [
+        ("quickstart", 10**8, "at most 10,000,000"),
+        ("quickstart", 0, "above 0"),
+        ("igsp-robot", 7, "a stream asks its questions after each task"),
+    ],
+)
+def test_numbers_that_cannot_be_asked_are_refused(
+    recipe_file: str, count: int, expected: str
+) -> None:
+    with pytest.raises(AegisError) as refused:
+        recipes.load_training(f"recipes/{recipe_file}.yaml", [f"probe.while_training={count}"])
+    assert "probe.while_training" in refused.value.found and expected in str(refused.value)
