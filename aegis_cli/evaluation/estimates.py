@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache
 
 LEVEL = 0.95  # probability that an interval holds the expectation
-ROUNDING = 1e-9  # tolerance by which a value may miss a limit and still count as meeting it
 
 
 @dataclass(frozen=True)

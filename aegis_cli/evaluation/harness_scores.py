@@ -23,8 +23,9 @@ import numpy as np
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.data.vqa.gate import MEAN, passes
 from aegis_cli.data.vqa.metrics import mean_loss_interval
-from aegis_cli.evaluation import probe, results
+from aegis_cli.evaluation import probe
 
 # How the two harnesses name their files.
 _SAMPLES = (
@@ -112,7 +113,7 @@ def run(
     before: Path,
     after: Path,
     max_drop: float | None = None,
-    gate: str = results.MEAN,
+    gate: str = MEAN,
     on_event: OnEvent = ignore,
 ) -> ScoresReport:
     """Compare the scores of two models on the same questions.
@@ -391,7 +392,7 @@ def _drop(
     drop, interval = 100 * float(losses.mean()), (100 * low, 100 * high)
     passed = None
     if max_drop is not None:
-        passed = results.within(results.limited(drop, interval, gate), max_drop)
+        passed = passes(drop, interval, max_drop, gate)
         ask = "Ask more of the task's questions, without a limit"
         stage = f"scores of {task}"
         probe.warn_of_few_questions(len(losses), interval, max_drop, stage, on_event, ask)

@@ -20,6 +20,7 @@ from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
 from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.gate import MEAN, passes
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, prediction, score
 from aegis_cli.evaluation import results, wrong_answers
 from aegis_cli.models import backbones
@@ -100,7 +101,7 @@ def run(
     anchor: Path | None,
     max_drop: float | None,
     batch_size: int = 64,
-    gate: str = results.MEAN,
+    gate: str = MEAN,
     predictions: Path | None = None,
     skip_bad: bool = False,
     keep: bool = False,
@@ -422,7 +423,7 @@ def compare(
     max_drop: float | None,
     skipped: int = 0,
     w2_between: str | None = None,
-    gate: str = results.MEAN,
+    gate: str = MEAN,
 ) -> ProbeReport:
     """The report of two sets of answers to the same questions.
 
@@ -442,7 +443,7 @@ def compare(
     interval = None if before is None else _in_points(drop_interval(before, after))
     passed = None
     if max_drop is not None and drop is not None and interval is not None:
-        passed = results.within(results.limited(drop, interval, gate), max_drop)
+        passed = passes(drop, interval, max_drop, gate)
     by_name = {}
     for name, s in families.items():
         known_before = earlier[name].accuracy if earlier else None

@@ -22,8 +22,8 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, files, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.data.vqa.gate import passes
 from aegis_cli.evaluation import kept_figures
-from aegis_cli.evaluation.estimates import ROUNDING
 from aegis_cli.evaluation.kept_figures import OpenLoopFigures, ProbeFigures, RolloutFigures
 from aegis_cli.models import backbones
 from aegis_cli.training import checkpoint, folder, inputs, track
@@ -32,7 +32,6 @@ FOLDER = "results"
 OPEN_LOOP = "evaluate"  # what the names of its files begin with
 # Which episodes an open-loop evaluation is of.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
-MEAN, UPPER = "mean", "upper"  # what of a drop a gate limits
 _PATIENCE_S = 5.0  # with others who write there
 # What one probe of a checkpoint tells and another of the same questions may not.
 _TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
@@ -445,21 +444,7 @@ def gate(probed: Sequence[Result], settings: recipes.Probe) -> bool | None:
         # Measured by `aegis run` when its recipe had no gate, and held to the one that it has now.
         if passed is None and max_drop is not None and not result.settings and drop is not None:
             interval = result.figures.get("drop_interval")
-            passed = within(limited(drop, interval, settings.gate), max_drop)
+            passed = passes(drop, interval, max_drop, settings.gate)
         if passed is not None:
             verdicts.append(passed)
     return all(verdicts) if verdicts else None
-
-
-def limited(drop_points: float, interval: Sequence[float] | None, gate: str) -> float:
-    """What of a drop a gate limits; a drop without an interval stands for itself.
-
-    Args:
-        gate: MEAN or UPPER.
-    """
-    return drop_points if gate == MEAN or interval is None else interval[1]
-
-
-def within(drop_points: float, max_drop: float) -> bool:
-    """Whether a gate lets a drop pass; one exactly on the border does."""
-    return drop_points <= max_drop + ROUNDING

@@ -16,7 +16,8 @@ from aegis_cli.common import files, locks
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.data.vqa import sets
-from aegis_cli.evaluation import probe, results
+from aegis_cli.data.vqa.gate import MEAN, passes
+from aegis_cli.evaluation import probe
 from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
 from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
@@ -90,7 +91,7 @@ def run(
     max_drop: float | None = None,
     on_event: OnEvent = ignore,
     judged: bool = False,
-    gate: str = results.MEAN,
+    gate: str = MEAN,
 ) -> MergeReport:
     """Write the merge of one strength, or try several.
 
@@ -303,7 +304,6 @@ def _weakest(points: Sequence[MergePoint], max_drop: float | None, gate: str) ->
         return None
     passing = []
     for point in points:
-        held = results.limited(point.drop_points, point.drop_interval, gate)
-        if results.within(held, max_drop):
+        if passes(point.drop_points, point.drop_interval, max_drop, gate):
             passing.append(point.strength)
     return min(passing, default=None)

@@ -361,7 +361,8 @@ class Train:
         shapes=False,
         doc="How many of the last checkpoints stay, beside the one with the least validation loss; "
         "others are removed. Null keeps all. A validation loss counts for a checkpoint of the same "
-        "step.",
+        "step. With `probe.while_training` and `probe.max_drop` it is the best of those that lose "
+        "no more, if one does.",
     )
     log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
     # They belonged to a figure that is no longer measured.

@@ -13,7 +13,7 @@ from aegis_cli import recipes, sim
 from aegis_cli.common import files, gl, leading, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
-from aegis_cli.evaluation import results
+from aegis_cli.data.vqa.gate import passes
 from aegis_cli.models import backbones
 from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.studies.figures import PolicyFigures
@@ -221,8 +221,8 @@ def _past(row: PolicyFigures, settings: Probe) -> bool:
     if settings.max_drop is None:
         return False
     for asked in (row, *row.others.values()):
-        held = results.limited(asked.drop_points, asked.drop_interval, settings.gate)
-        if not results.within(held, settings.max_drop):
+        drop, interval = asked.drop_points, asked.drop_interval
+        if not passes(drop, interval, settings.max_drop, settings.gate):
             return True
     return False
 

@@ -22,6 +22,7 @@ from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.gate import MEAN
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.evaluation import (
     bench,
@@ -826,7 +827,7 @@ def _probe_settings(settings: Probe) -> dict[str, Any]:
     del keys["while_training"]  # what a training asks is none of a probe's questions
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
-    if settings.gate == results.MEAN:
+    if settings.gate == MEAN:
         del keys["gate"]
     return keys
 

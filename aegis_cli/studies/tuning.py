@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from aegis_cli.evaluation.estimates import ROUNDING
+from aegis_cli.common.limits import ROUNDING
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,7 @@ class TrainingRun:
         masters: the float32 weights that passes see rounded.
         began_as: as of `loading.Loaded`.
         questions: what the backbone is asked with every validation loss; None for nothing.
+        told_of_drop: whether it has been said that more is lost than the recipe allows.
     """
 
     recipe: Recipe
@@ -91,6 +92,7 @@ class TrainingRun:
     average: Average = field(default_factory=Average)
     began_as: str | None = None
     questions: ValidationQuestions | None = None
+    told_of_drop: bool = False
 
     @property
     def rates(self) -> list[dict[str, Any]]:
@@ -219,7 +221,7 @@ class TrainingRun:
         kept = self.recipe.train.keep_checkpoints
         # That of an interruption goes with the next one, and takes the place of none until then.
         if kept is not None and not going_on:
-            retention.prune(self.out, steps, kept)
+            retention.prune(self.out, steps, kept, self.recipe)
 
 
 def build(

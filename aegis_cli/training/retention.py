@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-from aegis_cli.training import checkpoint, folder
+from aegis_cli.recipes import Recipe
+from aegis_cli.training import checkpoint, folder, validation_vqa
 
 
-def prune(out: Path, step: int, count: int) -> None:
+def prune(out: Path, step: int, count: int, recipe: Recipe) -> None:
     """Remove the checkpoints before `step` but for the last ones and the best one.
 
     Later ones stay, for a user who went back to an earlier checkpoint. What is half removed
@@ -19,13 +20,14 @@ def prune(out: Path, step: int, count: int) -> None:
     Args:
         step: of the checkpoint that has just been written, which is the newest.
         count: how many of the last ones stay, that one included.
+        recipe: of the run, whose gate the best one is to pass.
 
     Raises:
         AegisError: the log is damaged, or the disk refuses.
     """
     there = {int(path.name): path for path in checkpoint.whole(out)}
     behind = sorted(number for number in there if number <= step)
-    for number in {*behind[:-count]} - {best(out, behind)}:
+    for number in {*behind[:-count]} - {best(out, behind, recipe)}:
         # A rename is one step: a checkpoint is there whole, or not at all.
         aside = there[number].with_name(f".{there[number].name}.tmp")
         with checkpoint.writing(out):
@@ -33,18 +35,22 @@ def prune(out: Path, step: int, count: int) -> None:
             shutil.rmtree(aside)
 
 
-def best(out: Path, steps: Collection[int]) -> int | None:
+def best(out: Path, steps: Collection[int], recipe: Recipe) -> int | None:
     """The one of these steps with the least validation loss; None where none has a loss.
 
-    Where losses are equal, it is the earliest step.
+    Where the recipe limits the drop, it is the best of those of which answers have shown that they
+    keep to the limit, if there are any. Where losses are equal, it is the earliest step.
     """
-    losses = {
-        line["step"]: line["validation_loss"]
-        for line in folder.read_metrics(out, "step")
-        if "validation_loss" in line
-    }
-    known = [step for step in steps if losses.get(step) is not None]
-    return min(known, key=lambda step: (losses[step], step), default=None)
+    losses: dict[int, float] = {}
+    keeping: set[int] = set()
+    for line in folder.read_metrics(out, "step"):
+        if line["step"] in steps and line.get("validation_loss") is not None:
+            losses[line["step"]] = line["validation_loss"]
+            asked = validation_vqa.of_line(recipe, line)
+            if asked and not validation_vqa.past_limit(recipe, asked):
+                keeping.add(line["step"])
+    limited = keeping if recipe.probe.max_drop is not None else set()
+    return min(limited or losses, key=lambda step: (losses[step], step), default=None)
 
 
 def most_at_once(planned: int, there: int, count: int | None) -> int:

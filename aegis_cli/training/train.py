@@ -780,6 +780,7 @@ def _log(
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
         line |= _vqa_figures(run, finished, on_event)
+        _warn_of_drop(run, line, on_event)
     if run.ranks.first:
         folder.append_metrics(run.out, line)
     return line
@@ -798,6 +799,22 @@ def _vqa_figures(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str
         found = run.questions.figures(run.policy.backbone, run.ranks, heard)
     check_finite(found, f"after step {finished}", LOWER, finished)
     return found
+
+
+def _warn_of_drop(run: TrainingRun, line: Mapping[str, float], on_event: OnEvent) -> None:
+    """Say the first time that more is lost than the recipe's gate will let pass."""
+    past = validation_vqa.past_limit(run.recipe, validation_vqa.of_line(run.recipe, line))
+    if not past or run.told_of_drop:
+        return
+    run.told_of_drop = True
+    name, told = next(iter(past.items()))
+    low, high = told["drop_interval"]
+    text = (
+        f"after step {line['step']} {told['drop_points']:.2f} points of VQA are lost ({low:.2f} to "
+        f"{high:.2f}) on validation questions of '{name}', where probe.max_drop allows "
+        f"{run.recipe.probe.max_drop:g}"
+    )
+    on_event(Warned("train", text))
 
 
 @torch.no_grad()

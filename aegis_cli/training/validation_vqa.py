@@ -16,6 +16,7 @@ from aegis_cli.common.events import Event, OnEvent
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.gate import passes
 from aegis_cli.data.vqa.metrics import Graded, drop_interval, score
 from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
@@ -100,6 +101,18 @@ def of_line(recipe: Recipe, line: Mapping[str, Any]) -> dict[str, ToldOfSet]:
             continue
         ends = [told.pop("drop_low"), told.pop("drop_high")]
         found[name] = {**told, "drop_interval": ends}
+    return found
+
+
+def past_limit(recipe: Recipe, asked: Mapping[str, ToldOfSet]) -> dict[str, ToldOfSet]:
+    """Those sets that have lost more than the recipe's gate lets pass, of what `of_line` tells."""
+    limit, gate = recipe.probe.max_drop, recipe.probe.gate
+    if limit is None:
+        return {}
+    found = {}
+    for name, told in asked.items():
+        if not passes(told["drop_points"], told["drop_interval"], limit, gate):
+            found[name] = told
     return found
 
 

@@ -25,6 +25,7 @@ from aegis_cli.common.events import Event, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import empty, merge
 from aegis_cli.data.vqa.dataset import load_scenes
+from aegis_cli.data.vqa.gate import MEAN, UPPER
 from aegis_cli.data.vqa.metrics import Graded, wilson_interval
 from aegis_cli.data.vqa.questions import FAMILIES, Question
 from aegis_cli.evaluation import probe, results
@@ -279,9 +280,9 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
 def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
     """One of ten lost: the drop is 10 points, and the interval ends at 40.42."""
     before, after = graded("1111111100"), graded("0111111100")
-    report = probe.compare(after, before, [], max_drop, gate=results.UPPER)
+    report = probe.compare(after, before, [], max_drop, gate=UPPER)
     assert report.passed is passed
-    assert probe.compare(after, before, [], max_drop, gate=results.MEAN).passed is True
+    assert probe.compare(after, before, [], max_drop, gate=MEAN).passed is True
 
 
 @pytest.mark.parametrize(("lost", "passed"), [(20, True), (21, False)])
@@ -291,7 +292,7 @@ def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> N
     assert report.drop_points > 1.0 and report.passed is passed
 
 
-@pytest.mark.parametrize("gate", [results.MEAN, results.UPPER])
+@pytest.mark.parametrize("gate", [MEAN, UPPER])
 @pytest.mark.parametrize(
     ("before", "after", "max_drop", "warns"),
     [

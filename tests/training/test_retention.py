@@ -11,9 +11,10 @@ import pytest
 from samples.training_runs import Start, assert_same_run, contents, stop_at
 
 from aegis_cli.common.events import Event, Progress
-from aegis_cli.recipes import Recipe, training_part
+from aegis_cli.recipes import Probe, Recipe, training_part
 from aegis_cli.training import checkpoint, dry_run, retention, train
 
+PLAIN = Recipe(name="plain")
 LOSSES = {2: 5.0, 4: 1.0, 6: 4.0, 8: 3.0, 10: 2.0}
 
 
@@ -139,20 +140,47 @@ def laid_out(run: Path, steps: Sequence[int], losses: dict[int, float]) -> Path:
 def test_later_checkpoints_than_the_new_one_stay(tmp_path: Path) -> None:
     """They are there where somebody went back to an earlier checkpoint."""
     run = laid_out(tmp_path, (2, 4, 6, 8), {2: 1.0, 4: 2.0})
-    retention.prune(run, 6, 1)
+    retention.prune(run, 6, 1, PLAIN)
     assert steps_in(run) == [2, 6, 8]
 
 
 def test_steps_of_seven_digits_are_later_than_those_of_six(tmp_path: Path) -> None:
     run = laid_out(tmp_path, (999_999, 1_000_000), {})
-    retention.prune(run, 1_000_000, 1)
+    retention.prune(run, 1_000_000, 1, PLAIN)
     assert steps_in(run) == [1_000_000]
 
 
 def test_of_equal_losses_the_earliest_stays(tmp_path: Path) -> None:
     run = laid_out(tmp_path, (2, 4, 6), {2: 1.0, 4: 1.0, 6: 3.0})
-    retention.prune(run, 6, 1)
+    retention.prune(run, 6, 1, PLAIN)
     assert steps_in(run) == [2, 6]
+
+
+@pytest.mark.parametrize(
+    ("gate", "drops", "stay"),
+    [
+        ("mean", {2: 0.5, 4: 4.0, 6: 1.0}, [6, 8]),
+        ("upper", {2: 0.5, 4: 4.0, 6: 1.0}, [2, 8]),  # an interval reaches a point further
+        ("mean", {2: 5.0, 4: 4.0, 6: 6.0}, [4, 8]),  # none keeps to it: the least loss
+        ("mean", {2: 0.5, 6: 1.0}, [6, 8]),  # of the one with the least loss nothing is known
+        ("mean", {}, [4, 8]),
+    ],
+)
+def test_the_best_one_loses_no_more_than_the_recipe_allows(
+    gate: str, drops: dict[int, float], stay: list[int], tmp_path: Path
+) -> None:
+    run = laid_out(tmp_path, (2, 4, 6, 8), {})
+    lines: list[dict[str, float]] = []
+    for step, loss in {2: 5.0, 4: 1.0, 6: 4.0, 8: 9.0}.items():
+        line: dict[str, float] = {"step": step, "validation_loss": loss}
+        if (drop := drops.get(step)) is not None:
+            ends = {"vqa_drop_low": drop - 1, "vqa_drop_high": drop + 1}
+            line |= {"vqa_accuracy": 0.9, "vqa_cross_entropy": 0.1, "vqa_drop_points": drop} | ends
+        lines.append(line)
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    limited = replace(PLAIN, probe=Probe(max_drop=1.5, gate=gate, while_training=100))
+    retention.prune(run, 8, 1, limited)
+    assert steps_in(run) == stay
 
 
 def test_a_dry_run_counts_those_that_are_there_at_one_time(

@@ -21,7 +21,7 @@ from samples.vqa_files import write_jsonl
 
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError, Diverged
-from aegis_cli.common.events import Event, Progress
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import drop_interval, score
 from aegis_cli.inspection import folders
@@ -178,6 +178,31 @@ def test_models_of_the_hub_are_asked_too(
     found = metrics(tmp_path / "run")[-1]["vqa_cross_entropy"]
     wanted = score(asked_of(str(tmp_path / "run"), own)).cross_entropy
     assert found == pytest.approx(wanted, rel=1e-2 if "weights" in changes else 1e-4)
+
+
+@pytest.mark.parametrize(("limit", "times"), [(0.0, 1), (100.0, 0), (None, 0)])
+def test_more_than_the_recipe_allows_is_said_once(
+    limit: float | None,
+    times: int,
+    asking: Recipe,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    figures = validation_vqa.ValidationQuestions.figures
+
+    def lost(*given: Any) -> dict[str, float]:
+        return figures(*given) | {"vqa_drop_points": 7.125}
+
+    monkeypatch.setattr(validation_vqa.ValidationQuestions, "figures", lost)
+    own = replace(asking, probe=replace(asking.probe, max_drop=limit))
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=own, on_event=events.append)
+    said = [e.text for e in events if isinstance(e, Warned) and "points of VQA" in e.text]
+    assert len(said) == times
+    for text in said:
+        assert "after step 3 7.12 points" in text and "'scenes'" in text
+        assert "probe.max_drop allows 0" in text
 
 
 # --- what is refused ------------------------------------------------------------------------------
