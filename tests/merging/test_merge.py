@@ -20,7 +20,7 @@ from samples.vqa_files import write_jsonl
 from aegis_cli import load_policy
 from aegis_cli.anchors import curvature
 from aegis_cli.common import artifacts, locks
-from aegis_cli.evaluation.results import MEAN, UPPER
+from aegis_cli.data.vqa.gate import MEAN, UPPER
 from aegis_cli.merging.merge import MergePoint, _weakest
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
