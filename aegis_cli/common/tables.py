@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import sys
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -88,7 +89,9 @@ def _workbook(path: Path) -> Iterator[Sequence[Any]]:
     import openpyxl
 
     with open(path, "rb") as file:
-        book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+        with warnings.catch_warnings():  # of styles and the like, which no cell's content needs
+            warnings.simplefilter("ignore")
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
         with contextlib.closing(book):
             yield from book.worksheets[0].iter_rows(values_only=True)
 

@@ -247,6 +247,9 @@ def _comparable(
     shared = [name for name in before.values if name in after.values]
     if not shared:
         return [], _judged_otherwise(task, logs, max_drop)
+    for log in logs:
+        for metric in [name for name in log.values if name not in shared]:
+            on_event(Warned("scores", f"{task}: {metric} is left out: only '{log.path}' has it"))
     shares: list[str] = []
     unfit: list[str] = []
     for metric in shared:

@@ -39,9 +39,9 @@ _MATCHES = "eval_match"  # how well a prediction matches each of the reference a
 # An answer counts for nothing where its distance is larger, in ANLS.
 _FARTHEST = 0.5
 # Benchmarks whose questions are asked once for each order of their options, with 1e6 added to the
-# index each time; `g_index`, where it is, says which of them are one.
+# index each time, so that its last digits stay; `g_index`, where it is, says which of them are one.
 _CIRCULAR = ("mmbench", "ccbench", "circular", "mmcr")
-_ROUND = 10**6
+_DIGITS = 6
 # By column, what VLMEvalKit writes into it where a verdict tells nothing of the model, and why.
 _DOUBTS = {
     "prediction": ("Failed to obtain answer", "without an answer, because asking the model failed"),
@@ -228,7 +228,10 @@ def _add(log: QuestionLog, task: str, judged: str, path: Path) -> None:
             which = "a row without an index" if index is None else f"two rows of index {index}"
             raise AegisError(f"{which} in '{path}'", _ROWS, _APART)
         indices.add(index)
-        log.asked.setdefault(index, _asked(row))
+        asked = _asked(row)
+        if log.asked.setdefault(index, asked) != asked:
+            found = f"index {index} is one question in '{log.path}' and another in '{path}'"
+            raise AegisError(found, f"tables of {task} alone", "take one of them out of the folder")
         if (shared := _shared(task, index, row)) is not None:
             log.alike[index] = shared
         for column, (text, doubt) in _DOUBTS.items():
@@ -255,7 +258,7 @@ def _shared(task: str, index: str, row: Mapping[str, Any]) -> str | None:
     """What a question shares with others: it is one of them in another order, or of one image."""
     group = _text(row.get("g_index"))
     if group is None and index.isdecimal() and any(part in task.lower() for part in _CIRCULAR):
-        group = str(int(index) % _ROUND)
+        group = index[-_DIGITS:].lstrip("0")
     image = _text(row.get("image_path"))
     return f"question {group}" if group is not None else image
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import random
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -361,6 +363,23 @@ def test_other_judges_are_not_compared(two: tuple[Path, Path]) -> None:
     assert f"MMStar: {why}" in refused(*two, max_drop=50)
 
 
+def test_a_judge_of_one_model_alone_is_told(two: tuple[Path, Path]) -> None:
+    evaluation(two[0], "MMStar", judged([1] * 10), "gpt-4o-mini_result")
+    events: list[Any] = []
+    (found,) = harness_scores.run(*two, on_event=events.append).scores
+    assert found.metric == f"hit, {JUDGED}"
+    assert "MMStar: hit, gpt-4o-mini_result is left out: only" in heard(events)
+
+
+def test_tables_of_two_benchmarks_are_not_taken_for_one(two: tuple[Path, Path]) -> None:
+    """Without predictions of its own, a table goes with those whose name its own begins with."""
+    for model in two:
+        rows = [{**row, "question": "Quite another?"} for row in judged([1] * 10)]
+        evaluation(model, "MMStar_V2", rows)
+        (model / RUN / f"{model.name}_MMStar_V2.tsv").unlink()
+    assert "index 0 is one question in" in refused(*two)
+
+
 def test_no_gate_passes_by_verdicts_that_the_second_model_has_not_got(
     two: tuple[Path, Path],
 ) -> None:
@@ -467,8 +486,6 @@ def cut(path: Path) -> None:
 
 
 def no_workbook(path: Path) -> None:
-    import zipfile
-
     path.unlink()
     with zipfile.ZipFile(path.with_suffix(".xlsx"), "w") as archive:
         archive.writestr("[Content_Types].xml", "<Types/>")
@@ -541,6 +558,26 @@ def test_a_folder_that_was_renamed_is_refused(two: tuple[Path, Path], tmp_path: 
     evaluation(tmp_path / "third", "MMStar", judged([1] * 10), suffix=".xlsx")
     said = refused((tmp_path / "third").rename(tmp_path / "renamed"), two[1])
     assert "does not begin with that of its model's folder" in said
+
+
+def test_an_index_of_any_length_is_taken(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        rows = [{**row, "index": f"{'9' * 5000}{row['index']}"} for row in judged([1, 0])]
+        evaluation(tmp_path / name, "MMBench_DEV_EN", rows)
+    assert harness_scores.run(tmp_path / "a", tmp_path / "b").scores[0].questions == 2
+
+
+def test_a_workbook_without_styles_is_read(two: tuple[Path, Path], tmp_path: Path) -> None:
+    """Whoever writes none makes openpyxl warn, which is no damage."""
+    evaluation(two[0], "MMStar", judged([1] * 10), suffix=".xlsx")
+    for path in two[0].rglob("*.tsv"):
+        path.unlink()
+    (path,) = two[0].rglob(f"*{JUDGED}.xlsx")
+    whole = zipfile.ZipFile(io.BytesIO(path.read_bytes()))
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in set(whole.namelist()) - {"xl/styles.xml"}:
+            archive.writestr(name, whole.read(name))
+    assert harness_scores.run(*two).scores[0].before == 1.0
 
 
 def test_what_is_not_judged_is_refused(two: tuple[Path, Path]) -> None:
