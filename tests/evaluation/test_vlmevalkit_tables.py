@@ -295,7 +295,9 @@ def test_indices_are_the_same_as_numbers_and_as_texts(tmp_path: Path) -> None:
 def test_a_folder_a_run_and_a_table_are_taken(two: tuple[Path, Path]) -> None:
     for path in two[0].rglob("*.tsv"):
         (two[0] / path.name).symlink_to(path.relative_to(two[0]))
-    expected = harness_scores.run(*two).scores
+    events: list[Any] = []
+    expected = harness_scores.run(*two, on_event=events.append).scores
+    assert heard(events) == ""  # a link is no second evaluation
     assert harness_scores.run(two[0] / RUN, two[1] / RUN).scores == expected
     assert harness_scores.run(table_of(two[0] / RUN), table_of(two[1])).scores == expected
 
@@ -567,17 +569,28 @@ def test_an_index_of_any_length_is_taken(tmp_path: Path) -> None:
     assert harness_scores.run(tmp_path / "a", tmp_path / "b").scores[0].questions == 2
 
 
-def test_a_workbook_without_styles_is_read(two: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_workbook_without_styles_is_read(two: tuple[Path, Path]) -> None:
     """Whoever writes none makes openpyxl warn, which is no damage."""
     evaluation(two[0], "MMStar", judged([1] * 10), suffix=".xlsx")
     for path in two[0].rglob("*.tsv"):
         path.unlink()
     (path,) = two[0].rglob(f"*{JUDGED}.xlsx")
     whole = zipfile.ZipFile(io.BytesIO(path.read_bytes()))
+    bare = '<styleSheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"/>'
     with zipfile.ZipFile(path, "w") as archive:
-        for name in set(whole.namelist()) - {"xl/styles.xml"}:
-            archive.writestr(name, whole.read(name))
+        for name in whole.namelist():
+            archive.writestr(name, bare if name == "xl/styles.xml" else whole.read(name))
     assert harness_scores.run(*two).scores[0].before == 1.0
+
+
+@pytest.mark.parametrize("suffix", (".xlsx", ".tsv"))
+def test_empty_rows_and_long_cells_are_taken(tmp_path: Path, suffix: str) -> None:
+    length = 200_000 if suffix == ".tsv" else 32_000  # as long as a cell of a workbook may be
+    for name in ("a", "b"):
+        rows = judged([1, 0, 1])
+        rows[0]["prediction"] = "A" * length
+        evaluation(tmp_path / name, "MMStar", [*rows, dict.fromkeys(rows[0])], suffix=suffix)
+    assert harness_scores.run(tmp_path / "a", tmp_path / "b").scores[0].questions == 3
 
 
 def test_what_is_not_judged_is_refused(two: tuple[Path, Path]) -> None:
