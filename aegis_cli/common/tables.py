@@ -75,7 +75,7 @@ def _checked(path: Path, lines: Iterator[Sequence[Any]]) -> Iterator[Sequence[An
             raise  # the system's; openpyxl has some of its own for what is no workbook
         files.refuse_pointer(path)
         found = f"'{path}' is no table, or is damaged: {in_short(error)}"
-        raise AegisError(found, f"a whole file {path.suffix}", _FIX) from error
+        raise AegisError(found, f"a whole {path.suffix} file", _FIX) from error
 
 
 def _workbook(path: Path) -> Iterator[Sequence[Any]]:

@@ -20,7 +20,7 @@ from typing import Any
 
 from aegis_cli.common import tables
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.evaluation.question_log import (
     Evaluation,
     Harness,
@@ -114,7 +114,7 @@ def find(place: Path, on_event: OnEvent) -> Tasks:
     Raises:
         AegisError: none is judged, a table cannot be read, or they are of several models.
     """
-    found = list(_tables(place))
+    found = list(_tables(place, on_event))
     models = sorted({str(table.model) for table in found})
     if len(models) > 1:
         raise AegisError(
@@ -135,13 +135,13 @@ def find(place: Path, on_event: OnEvent) -> Tasks:
     return newest(place, evaluations, on_event)
 
 
-def _tables(place: Path) -> Iterator[_Table]:
+def _tables(place: Path, on_event: OnEvent = ignore) -> Iterator[_Table]:
     """The tables of a folder that have a row for each question."""
-    for path in _files(place):
-        name = _name(path)
-        if name is None:
-            continue
+    named = [(path, name) for path in _files(place) if (name := _name(path)) is not None]
+    for number, (path, name) in enumerate(named, start=1):
         columns = tables.columns(path)
+        # To open a workbook takes seconds: all its texts stand before its first row.
+        on_event(Progress("scores", number, len(named), "tables opened"))
         if _has_predictions(columns):
             yield _Table(path, _model_folder(path), name, bool(_verdicts(columns)))
 

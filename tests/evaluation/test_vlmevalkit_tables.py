@@ -408,8 +408,11 @@ def test_reading_is_told_to_its_end(two: tuple[Path, Path], monkeypatch: Any) ->
     told: list[Any] = []
     harness_scores.run(*two, on_event=told.append)
     size = sum(table_of(model).stat().st_size for model in two)
-    shares = [(event.done, event.total) for event in told if isinstance(event, Progress)]
-    assert len(shares) == 2 and shares[-1] == (size, size)
+    progress = [event for event in told if isinstance(event, Progress)]
+    opened = [(event.done, event.total) for event in progress if event.unit == "tables opened"]
+    assert opened == [(1, 3), (2, 3), (3, 3)] * 2  # predictions, verdicts and a summary
+    read = [(event.done, event.total) for event in progress if event.unit == "bytes"]
+    assert len(read) == 2 and read[-1] == (size, size)
 
 
 # --- what is refused ------------------------------------------------------------------------------
