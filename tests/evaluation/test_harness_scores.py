@@ -158,6 +158,8 @@ def test_a_task_of_which_nothing_is_compared_is_told_and_listed(two: tuple[Path,
     events = list[Any]()
     report = harness_scores.run(*two, max_drop=50.0, on_event=events.append)
     assert report.left_out == ["mmmu_val"]
+    why = "mmmu_acc is left out: not one number a question"
+    assert report.why_left_out == {"mmmu_val": why}
     assert "mmmu_val: nothing of it is compared, and --max-drop does not judge" in heard(events)
 
 
@@ -230,6 +232,7 @@ def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, 
     assert found.after == 1.0 and found.drop_points == pytest.approx(-10)
     assert f"'{LATER}_samples_textvqa_val.jsonl'" in heard(events)
     assert "left out: pope" in heard(events) and report.left_out == ["pope"]
+    assert report.why_left_out == {"pope": f"only '{after}' has scores"}
 
 
 def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
