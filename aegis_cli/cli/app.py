@@ -909,7 +909,8 @@ def scores(
         Path,
         Argument(
             metavar="BEFORE",
-            help="Folder that lmms-eval or lm-evaluation-harness wrote with --log_samples.",
+            help="Folder that lmms-eval or lm-evaluation-harness wrote with --log_samples, or that "
+            "VLMEvalKit wrote of a model.",
         ),
     ],
     after: Annotated[
@@ -937,7 +938,7 @@ def scores(
     lmms-eval asks its benchmarks of any run or backbone as the model aegis:
     lmms-eval --model aegis --model_args pretrained=runs/x --tasks textvqa_val,pope --log_samples
     --output_path scores/x. Both models are asked the same questions, so that the drop is one of
-    pairs.
+    pairs. VLMEvalKit's tables of verdicts are read too, in .xlsx with the extra benchmarks.
 
     \b
     Example: aegis scores scores/before scores/x --max-drop 1 --gate upper

@@ -18,7 +18,7 @@ from aegis_cli.cli.app import app
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress, Warned
 from aegis_cli.data.vqa.metrics import mean_loss_interval
-from aegis_cli.evaluation import harness_scores
+from aegis_cli.evaluation import harness_scores, question_log
 
 DATE, LATER = "20260101_120000", "20260102_120000"
 
@@ -158,6 +158,8 @@ def test_a_task_of_which_nothing_is_compared_is_told_and_listed(two: tuple[Path,
     events = list[Any]()
     report = harness_scores.run(*two, max_drop=50.0, on_event=events.append)
     assert report.left_out == ["mmmu_val"]
+    why = "mmmu_acc is left out: not one number a question"
+    assert report.why_left_out == {"mmmu_val": why}
     assert "mmmu_val: nothing of it is compared, and --max-drop does not judge" in heard(events)
 
 
@@ -230,6 +232,7 @@ def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, 
     assert found.after == 1.0 and found.drop_points == pytest.approx(-10)
     assert f"'{LATER}_samples_textvqa_val.jsonl'" in heard(events)
     assert "left out: pope" in heard(events) and report.left_out == ["pope"]
+    assert report.why_left_out == {"pope": f"only '{after}' has scores"}
 
 
 def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
@@ -241,7 +244,7 @@ def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
     assert harness_scores.run(before, after, max_drop=50).passed
     lmms(before, "pope", rows_of({"pope_accuracy": [1.0]}))
     assert harness_scores.run(before, after).left_out == ["docvqa", "pope"]
-    with pytest.raises(AegisError, match="no samples in '.*after' of pope, of which '.*before'"):
+    with pytest.raises(AegisError, match="no scores in '.*after' of pope, of which '.*before'"):
         harness_scores.run(before, after, max_drop=50)
 
 
@@ -266,8 +269,6 @@ def test_what_holds_no_scores_of_two_models_is_refused(
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no file of samples" in refused(empty, two[1])
-    (empty / "model_MMBench_DEV_EN.xlsx").touch()
-    assert "VLMEvalKit writes them, which are not read" in refused(empty, two[1])
     assert "check the path" in refused(tmp_path / "none", two[1])
     assert "before and after" in refused(two[0], two[0])
     lmms(tmp_path / "other", "pope", rows_of({"pope_accuracy": [1.0]}))
@@ -329,7 +330,7 @@ def test_a_file_of_another_name_is_not_told_to_have_no_samples(two: tuple[Path, 
 
 
 def test_reading_is_told_to_its_end(two: tuple[Path, Path], monkeypatch: Any) -> None:
-    monkeypatch.setattr(harness_scores, "_TOLD_BYTES", 500)
+    monkeypatch.setattr(question_log, "_TOLD_BYTES", 500)
     told: list[Any] = []
     harness_scores.run(*two, on_event=told.append)
     size = sum(path.stat().st_size for each in two for path in each.rglob("*.jsonl"))
