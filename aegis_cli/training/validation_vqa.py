@@ -55,10 +55,11 @@ class ValidationQuestions:
 
         Accuracies are in [0, 1], cross-entropies in nats per answer, and the drop and the ends of
         its 95 % interval in percentage points. The first set's figures have plain names, those of
-        the others end in their number.
+        the others end in their number. A backbone of which nothing learns is not asked again.
         """
         found: dict[str, float] = {}
-        now = self._answers(backbone, ranks, on_event, "VQA")
+        learns = any(p.requires_grad for p in backbone.parameters())
+        now = self._answers(backbone, ranks, on_event, "VQA") if learns else self.before
         for number, (then, after) in enumerate(zip(self.before, now, strict=True), start=1):
             old, new = score(then), score(after)
             low, high = drop_interval(then, after)

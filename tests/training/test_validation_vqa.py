@@ -108,6 +108,28 @@ def test_they_are_asked_with_every_validation_loss_and_no_other_time(
     assert shown[-1] == last["vqa_drop_points"]
 
 
+@pytest.mark.parametrize(("method", "times"), [("stop-gradient", 1), ("lora", 3)])
+def test_a_model_that_stands_still_is_asked_once(
+    method: str,
+    times: int,
+    asking: Recipe,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[object] = []
+
+    def counted(*given: Any) -> Any:
+        asked.append(given)
+        return ask(*given)
+
+    monkeypatch.setattr(validation_vqa, "ask", counted)
+    report = start(method, tmp_path / "run", recipe=asking)
+    assert len(asked) == times
+    wanted = score(asked_of(str(tmp_path / "run"), asking)).cross_entropy
+    assert report.validation_vqa["scenes"]["cross_entropy"] == pytest.approx(wanted, rel=1e-5)
+
+
 def test_a_run_goes_on_with_the_same_answers_before(
     asking: Recipe, start: Start, tmp_path: Path
 ) -> None:
