@@ -9,6 +9,7 @@ import copy
 import gc
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
 os.environ.setdefault("AEGIS_DEVICE", "cpu")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
+# Else each of hundreds of processes would compile the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 import typer
@@ -58,6 +61,9 @@ pytest_plugins = [
 def pytest_configure() -> None:
     """Heed Ctrl-C, which a script's background jobs ignore, and so the processes of tests too."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # As for the processes that tests start. Every worker would compile all tests, with what pytest
+    # adds to their assertions: 25 seconds.
+    sys.dont_write_bytecode = False
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,8 @@ def test_no_other_code_sets_it() -> None:
 
 def test_tests_run_on_the_cpu_unless_somebody_chose_another_device() -> None:
     assert os.environ.get(devices.VARIABLE)
+
+
+def test_what_is_compiled_is_kept_for_the_next_process() -> None:
+    assert not sys.dont_write_bytecode
+    assert "PYTHONDONTWRITEBYTECODE" not in os.environ

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -300,7 +301,7 @@ def is_finite(tensor: Tensor) -> bool:
         return True
     # One such value makes the sum such a one, which is the faster to find. Others may have a sum
     # past the largest number, too.
-    return bool(tensor.sum().isfinite() or tensor.isfinite().all())
+    return math.isfinite(tensor.sum().item()) or bool(tensor.isfinite().all())
 
 
 def quoted(names: Iterable[str]) -> str:

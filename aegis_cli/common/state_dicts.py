@@ -120,7 +120,10 @@ def check_heads(width: int, heads: int) -> None:
 
 
 class _NothingDrawn(TorchFunctionMode):
-    """Tables are left as they are; torch would import its compiler to draw what has no memory."""
+    """Weights are left as they are: there is no memory to draw them in.
+
+    It saves a third of the time, and torch would import its compiler to draw tables.
+    """
 
     def __torch_function__(
         self,
@@ -130,7 +133,7 @@ class _NothingDrawn(TorchFunctionMode):
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
         kwargs = kwargs or {}
-        if func is nn.init.normal_:
+        if getattr(func, "__module__", None) == nn.init.__name__:
             return args[0] if args else kwargs["tensor"]
         return func(*args, **kwargs)
 

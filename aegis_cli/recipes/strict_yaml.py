@@ -5,6 +5,7 @@ A `Problem` is one mistake; `refuse` names all of them at once. Knows nothing ab
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import difflib
 import re
@@ -13,6 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import yaml
+from yaml.composer import Composer
+from yaml.resolver import BaseResolver
 
 from aegis_cli.common.errors import AegisError
 
@@ -142,6 +145,24 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_lines)
 
 
+class _LibYaml(Composer, BaseResolver):
+    """Nodes of the events that libyaml finds in a text.
+
+    They are made here, since the function of PyYAML's that makes them of libyaml's events ends the
+    process at a text that is nested too deeply.
+    """
+
+    yaml_implicit_resolvers: dict[str, Any] = {}
+
+    def __init__(self, text: str) -> None:
+        Composer.__init__(self)
+        BaseResolver.__init__(self)
+        events = yaml.cyaml.CParser(text)
+        self.check_event = events.check_event
+        self.peek_event = events.peek_event
+        self.get_event = events.get_event
+
+
 class _Dumper(yaml.SafeDumper):
     """Quotes text that YAML 1.1 or 1.2 would take for something else."""
 
@@ -159,7 +180,7 @@ for _tag, _pattern, _first in (
     ),
     ("float", r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", list("-+.")),
 ):
-    for _class in (_Loader, _Dumper):
+    for _class in (_Loader, _LibYaml, _Dumper):
         _class.add_implicit_resolver(
             f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first
         )
@@ -177,11 +198,10 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
         AegisError: the text is not YAML, or its values are nested or repeated beyond measure;
             nothing else can be judged then.
     """
-    loader = None
+    loader = _Loader("")  # what makes values of nodes
+    loader.problems = []
     try:
-        loader = _Loader(text)
-        loader.problems = []
-        node = loader.get_single_node()
+        node = _node(text)
         if node is None:  # nothing, or comments alone
             return None, loader.problems
         # Before anything is made of it: a few lines of aliases can stand for billions of values.
@@ -195,9 +215,18 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
         raise AegisError(
             f"{source}:{where} {why}", "YAML: lines of 'key: value'", "correct that line"
         ) from None
-    finally:
-        if loader is not None:
-            loader.dispose()
+
+
+def _node(text: str) -> yaml.Node | None:
+    """A text as nodes. libyaml takes a fifth of the time; what it refuses, PyYAML judges.
+
+    Raises:
+        yaml.YAMLError: the text is not YAML, in PyYAML's words.
+    """
+    if yaml.__with_libyaml__:
+        with contextlib.suppress(yaml.YAMLError, ValueError):
+            return _LibYaml(text).get_single_node()
+    return _Loader(text).get_single_node()
 
 
 def _each_its_own(value: Any) -> Any:

@@ -6,10 +6,13 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes.strict_yaml import parse
+from aegis_cli.recipes.strict_yaml import dump, line_of, parse
+
+SHIPPED = Path(__file__).parent.parent.parent / "recipes"
 
 
 def bomb(levels: int) -> str:
@@ -55,3 +58,35 @@ def test_a_text_or_list_of_another_type_is_named(value: str, tmp_path: Path) -> 
     path.write_text(f"kind: policy\nname: x\nprobe:\n  vqa: {value}\n")
     with pytest.raises(AegisError, match=r"probe.vqa: .*line 4"):
         recipes.load(path)
+
+
+def said(value: object) -> object:
+    """A value with the line of each of its keys."""
+    if isinstance(value, dict):
+        return [(name, line_of(value, name), said(inner)) for name, inner in value.items()]
+    return [said(item) for item in value] if isinstance(value, list) else value
+
+
+def test_a_recipe_is_the_same_without_libyaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = [path.read_text(encoding="utf-8") for path in SHIPPED.glob("*.yaml")]
+    assert len(texts) > 10
+    # Keys given twice, scalars of YAML 1.2, quotes, a merge, and many lines.
+    texts += ["a: no\nb: 1e-4\na: 010\nc: [2024-01-01, ~, .inf, 'x: y']\nd: &d {e: 1}\nf: {<<: *d}"]
+    texts += [dump({"words": ["yes", "über", "1.0", "a: b", "# c", "x" * 200 + " y"]}), "# nothing"]
+    with_it = [parse(text, "small.yaml") for text in texts]
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    without = [parse(text, "small.yaml") for text in texts]
+    assert [said(value) for value, _ in with_it] == [said(value) for value, _ in without]
+    assert [problems for _, problems in with_it] == [problems for _, problems in without]
+    assert any(problems for _, problems in with_it)
+
+
+def test_what_libyaml_refuses_is_told_in_pyyamls_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for there in (yaml.__with_libyaml__, False):
+        monkeypatch.setattr(yaml, "__with_libyaml__", there)
+        with pytest.raises(AegisError) as caught:
+            parse("a: 1\nb: [1, 2\nc: 3", "small.yaml")
+        found.append(caught.value.found)
+    assert found[0] == found[1]
+    assert "line 3" in found[0]

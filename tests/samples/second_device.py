@@ -4,11 +4,11 @@ PyTorch offers one name for devices of others' making. Tensors of that device ar
 what they hold is computed by the CPU. As with a GPU, no operation takes tensors of both, and a
 number of it is read by waiting. A process that has such a device keeps it:
 
-    python -m samples.second_device COMMANDS.json stand_in
+    python -m samples.second_device COMMANDS.json stand_in embedded
 
 runs the commands of the file, each a list of `aegis`'s arguments, and prints as JSON what each said
-and how often each place in Aegis waited for the device within a step of training. With `cpu` there
-is no such device.
+and how often each place in Aegis waited for the device within a step of training. With `cuda` there
+is no such device. Models of transformers need `hugging_face` in the place of `embedded`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
 from torch.utils import backend_registration as registration
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
@@ -119,7 +118,7 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
     Raises:
         Mixed: it takes tensors of both devices.
     """
-    tensors = [x for x in pytree.tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+    tensors = _tensors(args, kwargs)
     of_device = [x for x in tensors if isinstance(x, StandIn)]
     if 0 < len(of_device) < len(tensors) and "_foreach_" in str(func):
         return _one_by_one(func, args, kwargs)
@@ -150,8 +149,31 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
             return same
         return StandIn(x) if there else x
 
-    own_args, own_kwargs = pytree.tree_map(unwrap, (args, kwargs))
-    return pytree.tree_map(wrap, func(*own_args, **own_kwargs))
+    own_args = [_of_each(unwrap, x) for x in args]
+    own_kwargs = {name: _of_each(unwrap, x) for name, x in kwargs.items()}
+    return _of_each(wrap, func(*own_args, **own_kwargs))
+
+
+def _tensors(args: Any, kwargs: Any) -> list[Tensor]:
+    """The tensors that an operation takes, also those of lists.
+
+    Operations have no deeper trees. PyTorch's own functions, which look for some, would take most
+    of the time of what runs on the device.
+    """
+    found = []
+    for x in (*args, *kwargs.values()):
+        if isinstance(x, Tensor):
+            found.append(x)
+        elif isinstance(x, list | tuple):
+            found += [one for one in x if isinstance(one, Tensor)]
+    return found
+
+
+def _of_each(function: Callable[[Any], Any], x: Any) -> Any:
+    """A function of what an operation takes or gives; of each item where it is a list."""
+    if isinstance(x, list | tuple):
+        return type(x)([function(one) for one in x])
+    return function(x)
 
 
 def _one_by_one(func: Any, args: Any, kwargs: Any) -> Any:
@@ -222,8 +244,8 @@ class InReach(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        leaves = pytree.tree_leaves((args, kwargs))
-        if is_there(kwargs.get("device")) or any(isinstance(x, StandIn) for x in leaves):
+        there = any(isinstance(x, StandIn) for x in _tensors(args, kwargs))
+        if there or is_there(kwargs.get("device")):
             return compute(func, args, kwargs)
         return func(*args, **kwargs)
 
@@ -245,8 +267,12 @@ class _Module(registration._DummyBackendModule if POSSIBLE else object):  # type
 
 
 @contextlib.contextmanager
-def in_reach() -> Iterator[None]:
-    """Make the device, for the rest of the process, and let Aegis choose it within the block."""
+def in_reach(hugging_face: bool = False) -> Iterator[None]:
+    """Make the device, for the rest of the process, and let Aegis choose it within the block.
+
+    Args:
+        hugging_face: whether models of transformers are loaded, which takes long to import.
+    """
     from aegis_cli.common import devices
 
     registration._setup_privateuseone_for_python_backend(NAME, _Module())
@@ -256,7 +282,8 @@ def in_reach() -> Iterator[None]:
     makers = torch.tensor, torch.as_tensor
     torch.tensor, torch.as_tensor = map(_moved_after, makers)
     _let_threads_reach()
-    _load_outside(makers)
+    if hugging_face:
+        _load_outside(makers)
     devices.pick = lambda: torch.device(NAME, 0)
     plain, sent = devices.send, _sent_by_itself(devices.send)
     for module in list(sys.modules.values()):
@@ -319,22 +346,28 @@ def _load_outside(makers: Sequence[Callable[..., Tensor]]) -> None:
     PreTrainedModel.save_pretrained = saved
 
 
-def main(commands: Path, device: str) -> None:
-    """Run the commands one after the other, and print what each said and where its steps waited."""
+def said(commands: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+    """What each of the commands, run one after the other, said, and where its steps waited."""
     from aegis_cli.cli.app import app
 
     found = []
-    with in_reach() if device == NAME else contextlib.nullcontext():
-        for arguments in json.loads(commands.read_text(encoding="utf-8")):
-            waits.clear()
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said):
-                code = app(arguments, standalone_mode=False)
-            if code:  # what went wrong is said on stderr
-                sys.exit(code)
-            found.append({"said": json.loads(said.getvalue()), "waits": dict(waits)})
+    for arguments in commands:
+        waits.clear()
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            code = app(list(arguments), standalone_mode=False)
+        if code:  # what went wrong is said on stderr
+            sys.exit(code)
+        found.append({"said": json.loads(printed.getvalue()), "waits": dict(waits)})
+    return found
+
+
+def main(commands: Path, device: str, kind: str) -> None:
+    """Run the commands of a file on a device, and print as JSON what `said` returns."""
+    with in_reach(kind == "hugging_face") if device == NAME else contextlib.nullcontext():
+        found = said(json.loads(commands.read_text(encoding="utf-8")))
     print(json.dumps(found))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -5,6 +5,7 @@ Where there is no GPU, a stand-in, `samples.second_device`, refuses what a GPU r
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import subprocess
@@ -19,7 +20,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from samples.command import ROOT, finding
-from samples.second_device import NAME, POSSIBLE
+from samples.second_device import NAME, POSSIBLE, said
 from samples.training_runs import SETTINGS, TIMES, metrics
 
 from aegis_cli.common import devices
@@ -29,7 +30,7 @@ from aegis_cli.recipes import Cotrain, Expert, Recipe, to_yaml
 OTHERS = [NAME] * POSSIBLE + ["cuda"] * torch.cuda.is_available()
 pytestmark = pytest.mark.skipif(not OTHERS, reason="this torch takes no device of others' making")
 TESTS = Path(__file__).parent.parent
-ANCHOR = "anchor.safetensors"
+ANCHOR, RECIPE = "anchor.safetensors", "recipe.yaml"
 STEPS = 2
 PARTS = "moments,inputs,curvature,fisher"
 # What the task leaves alone moves or not by a weight that has to be known: one wait a step.
@@ -72,30 +73,33 @@ def commands(backbone: Path, demos: Path, methods: Sequence[str]) -> dict[str, l
     asked = ["--samples", "6", "--batch-size", "3", "--parts", PARTS]
     found = {"anchor": ["anchor", "--backbone", str(backbone), *asked, "--out", ANCHOR]}
     for method in methods:
-        found[method] = ["train", "recipe.yaml", "--method", method, *given, "--out", method]
+        found[method] = ["train", RECIPE, "--method", method, *given, "--out", method]
     asked = ["--baseline", str(backbone), "--questions", "14"]
     found["probe"] = ["probe", "naive", *asked, "--anchor", ANCHOR]
     found["evaluate"] = ["evaluate", "naive", "--demos", str(demos)]
-    found["merge"] = [
-        "merge",
-        "naive",
-        *given,
-        "--strength",
-        "1",
-        "--frames",
-        "16",
-        "--out",
-        "merged",
-    ]
+    found["merge"] = ["merge", "naive", *given, "--strength", "1", "--frames", "16"]
+    found["merge"] += ["--out", "merged"]
     return {name: [*arguments, "--json"] for name, arguments in found.items()}
 
 
-def run(folder: Path, jobs: dict[str, list[str]], written: Recipe, device: str) -> Run:
-    folder.mkdir()
-    (folder / "recipe.yaml").write_text(to_yaml(written))
-    (folder / "jobs.json").write_text(json.dumps(list(jobs.values())))
+def run(folder: Path, jobs: dict[str, list[str]], device: str, kind: str) -> Run:
+    if device == "cpu":
+        with contextlib.chdir(folder):
+            found = said(list(jobs.values()))
+    else:
+        found = said_by_process(folder, list(jobs.values()), device, kind)
+    each = dict(zip(jobs, found, strict=True))
+    told = {name: one["said"] for name, one in each.items()}
+    return Run(folder, told, {name: one["waits"] for name, one in each.items()})
+
+
+def said_by_process(
+    folder: Path, jobs: list[list[str]], device: str, kind: str
+) -> list[dict[str, Any]]:
+    """What `said` finds in a process of its own, since one that has the stand-in keeps it."""
+    (folder / "jobs.json").write_text(json.dumps(jobs))
     done = subprocess.run(
-        [sys.executable, "-m", "samples.second_device", "jobs.json", device],
+        [sys.executable, "-m", "samples.second_device", "jobs.json", device, kind],
         cwd=folder,
         env={
             **finding(ROOT, TESTS),
@@ -106,9 +110,7 @@ def run(folder: Path, jobs: dict[str, list[str]], written: Recipe, device: str) 
         text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    each = dict(zip(jobs, json.loads(done.stdout), strict=True))
-    said = {name: one["said"] for name, one in each.items()}
-    return Run(folder, said, {name: one["waits"] for name, one in each.items()})
+    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +127,9 @@ def both(
         backbone, methods = tiny_folder, sorted(METHODS)
         if kind == "hugging_face":
             backbone, methods = hf_folder("smolvlm"), list(OF_HF)
-        folder = tmp_path_factory.mktemp("devices") / device
-        return run(folder, commands(backbone, demos_file, methods), recipe(backbone), device)
+        folder = tmp_path_factory.mktemp(device)
+        (folder / RECIPE).write_text(to_yaml(recipe(backbone)))
+        return run(folder, commands(backbone, demos_file, methods), device, kind)
 
     return lambda device, kind: Both(on("cpu", kind), on(device, kind))
 

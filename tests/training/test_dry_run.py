@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,15 +84,34 @@ def test_the_shipped_recipes_run_on_small_stand_ins(
         )
 
 
-def test_a_dry_run_counts_what_there_is(
-    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
-) -> None:
-    settings = small(hf_folder("smolvlm"))
-    plans = {
-        method: dry_run.run(settings, method, demos_file, hf_anchor("smolvlm"), tmp_path / "out")
-        for method in ("naive", "aegis", "stop-gradient", "nullspace")
-    }
-    assert not (tmp_path / "out").exists()
+Plan = Callable[..., dry_run.DryRunReport]
+
+
+@pytest.fixture(scope="module")
+def plan(
+    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Plan:
+    """The plan of a small Hugging Face model by the method and what is set; made once.
+
+    Some tests compare the same plans, of which each takes two seconds.
+    """
+    out = tmp_path_factory.mktemp("plan") / "out"
+
+    @cache
+    def made(method: str, keeps: str = "weights", **settings: Any) -> dry_run.DryRunReport:
+        chosen = replace(
+            small(hf_folder("smolvlm"), **settings), nullspace=recipes.Nullspace(keeps=keeps)
+        )
+        anchor = None if method in ("naive", "l2sp") else hf_anchor("smolvlm")
+        planned = dry_run.run(chosen, method, demos_file, anchor, out)
+        assert not out.exists()
+        return planned
+
+    return made
+
+
+def test_a_dry_run_counts_what_there_is(plan: Plan, hf_folder: Made) -> None:
+    plans = {method: plan(method) for method in ("naive", "aegis", "stop-gradient", "nullspace")}
     plain = plans["naive"]
     backbone = backbones.load(str(hf_folder("smolvlm")))
     assert sum(plain.groups.values()) == sum(p.numel() for p in backbone.parameters())
@@ -110,31 +130,23 @@ def test_a_dry_run_counts_what_there_is(
     assert (
         plain.memory_total_mb == pytest.approx(sum(plain.memory_mb.values())) and plain.memory_fits
     )
-    alone, held = (
-        dry_run.run(settings, method, demos_file, None, tmp_path / "out")
-        for method in ("naive", "l2sp")
-    )
-    assert alone.memory_mb["method"] == 0
+    assert plain.memory_mb["method"] == 0
+    held = plan("l2sp")
     assert held.memory_mb["method"] == pytest.approx(
         4e-6 * sum(held.groups.values())
     )  # one copy of the weights
-    doubled = dataclasses.replace(settings, train=dataclasses.replace(settings.train, batch_size=8))
-    bigger = dry_run.run(doubled, "naive", demos_file, None, tmp_path / "out")
+    bigger = plan("naive", batch_size=8)
     twice = pytest.approx(2 * plain.memory_mb["activations"], rel=0.01)
     assert bigger.memory_mb["activations"] == twice
     assert bigger.epochs == pytest.approx(2 * plain.epochs)
 
 
 def test_a_dry_run_counts_a_checkpoints_copy_and_what_a_projection_remembers(
-    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+    plan: Plan, hf_folder: Made
 ) -> None:
-    settings, out = small(hf_folder("smolvlm")), tmp_path / "out"
-    by_coordinates = dataclasses.replace(settings, nullspace=recipes.Nullspace(keeps="coordinates"))
-    lora = dry_run.run(settings, "lora", demos_file, None, out).memory_mb
-    whole, coordinates = (
-        dry_run.run(chosen, "nullspace", demos_file, hf_anchor("smolvlm"), out).memory_mb
-        for chosen in (settings, by_coordinates)
-    )
+    lora = plan("lora").memory_mb
+    whole = plan("nullspace").memory_mb
+    coordinates = plan("nullspace", keeps="coordinates").memory_mb
     # A copy of the plain backbone is written, in place of a step's activations.
     plain = sum(p.nbytes for p in backbones.load(str(hf_folder("smolvlm"))).parameters()) / 1e6
     assert lora["activations"] + lora["checkpoint"] > plain
@@ -142,7 +154,7 @@ def test_a_dry_run_counts_a_checkpoints_copy_and_what_a_projection_remembers(
 
 
 def test_processes_plan_what_each_of_them_needs(
-    hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+    plan: Plan, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
 ) -> None:
     settings, out = small(hf_folder("smolvlm")), tmp_path / "out"
     anchors, plans = hf_anchor("smolvlm"), {}
@@ -151,7 +163,7 @@ def test_processes_plan_what_each_of_them_needs(
         job = Job(shared, "nullspace", demos_file, anchors, out)
         plans[way] = Planning(job, tmp_path / way)
     run_together(2, list(plans.values()))
-    alone = dry_run.run(settings, "nullspace", demos_file, anchors, out)
+    alone = plan("nullspace")
     weights = 4e-6 * alone.parameters
     for way, planned in plans.items():
         first, second = (json.loads((planned.said / f"{k}.json").read_text()) for k in (0, 1))
@@ -308,18 +320,15 @@ def test_what_a_pass_keeps_is_gone_before_the_steps_are_measured(
     assert left == [0]
 
 
-def test_rounded_weights_count_once_and_not_for_each_frame(
-    hf_folder: Made, demos_file: Path, tmp_path: Path
-) -> None:
-    kept = {}
+def test_rounded_weights_count_once_and_not_for_each_frame(plan: Plan) -> None:
+    fixed = {}
     for precision in ("float32", "bf16"):
-        for size in (4, 8):
-            settings = small(hf_folder("smolvlm"), precision=precision, batch_size=size)
-            plan = dry_run.run(settings, "naive", demos_file, None, tmp_path / "out")
-            kept[precision, size] = plan.memory_mb["activations"]
-    fixed = {p: 2 * kept[p, 4] - kept[p, 8] for p in ("float32", "bf16")}
+        given = {} if precision == "float32" else {"precision": precision}
+        four, eight = plan("naive", **given), plan("naive", batch_size=8, **given)
+        fixed[precision] = 2 * four.memory_mb["activations"] - eight.memory_mb["activations"]
     # Maps, with two bytes a number; tables and norms stay as they are.
-    assert 1e-6 * plan.trainable < fixed["bf16"] - fixed["float32"] < 2e-6 * plan.trainable
+    rounded = fixed["bf16"] - fixed["float32"]
+    assert 1e-6 * four.trainable < rounded < 2e-6 * four.trainable
 
 
 def test_what_a_pass_has_shrinks_with_passes(
