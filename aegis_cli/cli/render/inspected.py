@@ -209,8 +209,9 @@ def _features(features: Sequence[Any]) -> Table:
         columns = [feature.statistics.get(name, ()) for name in shown]  # one number a component
         count = max(1, *map(len, columns))
         parts = list(feature.components)
-        if count == 1 and feature.dtype in ("image", "video"):
-            parts = []  # without statistics, nothing is told of a picture's colours
+        if count == 1 and (feature.dtype in ("image", "video") or not any(parts)):
+            # Without statistics, nothing is told of a picture's colours or of nameless numbers.
+            parts = []
         names = [f"{feature.name} {part}".rstrip() for part in parts]
         names += [feature.name] * (count - len(names))  # statistics of components without names
         for i, name in enumerate(names):
