@@ -102,6 +102,8 @@ def _not_measured(facts: Mapping[str, Any]) -> Text:
     if into:
         return Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")
     does = "aegis probe, aegis rollout and aegis evaluate do that"
+    if facts.get("task", "") is None:  # a robot that is not simulated
+        does = "aegis probe and aegis evaluate do that"
     if before:  # the run went on since
         steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
         of = f"what is measured is of {steps}, and not of the last checkpoint"
