@@ -285,11 +285,13 @@ class DeployedPolicy:
                 "what is left of the last chunk, where actions of it are executed meanwhile",
                 "give previous=, or of a message to aegis serve previous_actions",
             )
-        if not isinstance(delay, int | np.integer) or not 0 <= delay <= len(left):
+        whole = isinstance(delay, int | np.integer) and delay >= 0
+        if not whole or delay > len(left):
+            later = "ask for the next chunk earlier, so that more are left"
             raise AegisError(
                 f"a delay of {delay} actions, where {len(left)} are left of the last chunk",
                 f"a whole number from 0 to {len(left)}",
-                "ask for the next chunk earlier, so that more are left",
+                later if whole else "count the actions that are executed meanwhile",
             )
         return Continued(torch.from_numpy(left)[None], int(delay)) if len(left) else None
 

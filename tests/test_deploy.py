@@ -198,6 +198,19 @@ def test_what_no_chunk_can_continue_is_refused(changes: dict[str, Any], said: st
         deployed().predict_action_chunk(frame(), TEXT, POSITIONS, **changes)
 
 
+@pytest.mark.parametrize(
+    ("delay", "fix"), [(3, "ask for the next chunk earlier"), (-1, "count"), (2.0, "count")]
+)
+def test_a_delay_that_is_none_has_another_cure_than_one_that_is_too_long(
+    delay: Any, fix: str
+) -> None:
+    with pytest.raises(AegisError) as caught:
+        deployed().predict_action_chunk(
+            frame(), TEXT, POSITIONS, previous=np.zeros((2, 2)), delay=delay
+        )
+    assert fix in caught.value.fix
+
+
 def test_another_instruction_drops_the_chunk_of_the_one_before() -> None:
     """What is left of a chunk is not played on, nor taken up again."""
     own, other = deployed(), deployed()

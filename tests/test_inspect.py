@@ -295,6 +295,19 @@ def test_what_is_no_artifact_is_refused(tmp_path):
     assert "neither a run nor an artifact" in refusal(tmp_path / "empty").found
 
 
+@pytest.mark.parametrize(
+    "name", ["v2_OpenEnded_mscoco_val2014_questions.json", "part.parquet", "dataset_info.json"]
+)
+def test_a_folder_of_questions_is_told_by_what_they_are_asked(name, tmp_path):
+    """A file of each form that sets of questions have: VQAv2, and Hugging Face's two."""
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / name).write_text("{}")
+    if name == "dataset_info.json":
+        (folder / "state.json").write_text("{}")
+    assert f"aegis probe MODEL --vqa '{folder}'" in refusal(folder).fix
+
+
 @pytest.mark.parametrize("name", ["plot.png", "notes.txt", "stream.json", "words"])
 def test_another_file_is_named_as_what_it_is(name, tmp_path):
     (tmp_path / name).write_text("hello")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -57,6 +58,7 @@ class LayerHooks:
         self._noted: set[int] = set()  # layers whose hidden states were given by hand
         self._calls: list[list[Tensor]] | None = None
         self._graph = False
+        _forget_compiled()
         self._handles = [
             layer.register_forward_hook(partial(self._note, i))
             for i, layer in enumerate(layers.values())
@@ -194,6 +196,16 @@ class LayerHooks:
             )
         # A layer may be called for some of the tokens at a time, as for a cached prefix first.
         return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
+
+
+def _forget_compiled() -> None:
+    """Have all that torch.compile has compiled compiled anew, since it sees no later hooks.
+
+    Code that was compiled for another model of the same class is used for this one, too.
+    """
+    # Where it is not loaded, nothing is compiled, and it loads slowly.
+    if (dynamo := sys.modules.get("torch._dynamo")) is not None:
+        dynamo.reset()
 
 
 def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pass:

@@ -629,10 +629,10 @@ def compare(
     actions, is_pad = shown.chunks(at, predicted.shape[1])
     recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
     error = predicted.double().numpy() - recorded
-    hold = None
-    if _are_positions(shown):
+    hold, places = None, _places(shown)
+    if places is not None:
         # The position at the frame, for every step of the chunk: [N, 1, A] less [N, H, A].
-        hold = shown.tensors["proprio"][at].double().numpy()[:, None] - recorded
+        hold = shown.tensors["proprio"][at][:, places].double().numpy()[:, None] - recorded
     relative = _relative(error, training_std)  # [N, H]
     held = None if hold is None else _relative(hold, training_std)
     # The episode of each valid step, in the order of `relative[valid]`.
@@ -686,11 +686,20 @@ def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float]
     return max(0.0, mean - half), mean + half  # no squared error is below 0
 
 
-def _are_positions(shown: Demonstrations) -> bool:
-    """Whether an action says which positions to take: both have the same names, one a dimension."""
-    names = shown.action_names
-    sizes = {shown.tensors[kind].shape[1] for kind in ("proprio", "actions")}
-    return any(names) and names == shown.proprio_names and sizes == {len(names)}
+def _places(shown: Demonstrations) -> list[int] | None:
+    """The position that each action says to take, which is that of its name; None where one lacks.
+
+    A robot may tell more of itself than it is told to do, such as velocities or efforts.
+    """
+    names, positions = shown.action_names, shown.proprio_names
+    named = any(names) and len(names) == shown.tensors["actions"].shape[1]
+    if not named or len(positions) != shown.tensors["proprio"].shape[1]:
+        return None
+    if names == positions:  # in one order, even where two arms use one name
+        return list(range(len(names)))
+    if any(names.count(name) != 1 or positions.count(name) != 1 for name in names):
+        return None
+    return [positions.index(name) for name in names]
 
 
 def _relative(error: np.ndarray, training_std: np.ndarray) -> np.ndarray | None:

@@ -157,7 +157,7 @@ def run(
     told = {"target": target, **settings, "anchor": None if anchor is None else str(anchor)}
     report = replace(report, asked=told)
     known = target if baseline is None else baseline
-    warn_of_little_knowledge(report, known, "probe", on_event)
+    warn_of_little_knowledge(report, known, ask, "probe", on_event)
     warn_of_few_questions(report.questions, report.drop_interval, max_drop, "probe", on_event)
     if predictions is not None and ranks.first:
         lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
@@ -221,18 +221,31 @@ def _answered(
 
 
 def warn_of_little_knowledge(
-    report: ProbeReport, model: str, stage: str, on_event: OnEvent
+    report: ProbeReport, model: str, ask: str, stage: str, on_event: OnEvent
 ) -> None:
-    """Warn where a drop says nothing, since the questions were not answered before either."""
+    """Warn where a drop says nothing, since the questions were not answered before either.
+
+    Args:
+        ask: how the questions were asked.
+    """
     known = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
     if known >= report.majority:
         return
     text = (
         f"'{model}' answers {100 * known:.1f} % of these questions, and always the commonest "
         f"answer of their family would answer {100 * report.majority:.1f} %: it can hardly lose "
-        "what it does not know. A model that answers in sentences needs e.g. --ask '{} Answer with "
-        "a single word or phrase.' (anchor.ask and probe.ask in a recipe)"
+        "what it does not know. "
     )
+    if ask == sets.PLAIN:
+        text += (
+            "A model that answers in sentences needs e.g. --ask '{} Answer with a single word or "
+            "phrase.' (anchor.ask and probe.ask in a recipe)"
+        )
+    else:
+        text += (
+            f"They were asked as '{ask}': see what it answers (--predictions of aegis probe), or "
+            "ask in the way that its own documentation has"
+        )
     on_event(Warned(stage, text))
 
 

@@ -52,7 +52,7 @@ class GuardedStepper:
         self._parts, self._averaging = parts, averaging or {}
         self._learning = LearningParameters(model)
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
-        self._count = 0
+        self._count = 0  # steps since the guard was made, or was settled
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
         self._since = _SincePass()
         self._taken: _TakenStep | None = None
@@ -221,6 +221,8 @@ class GuardedStepper:
         """Constrain the steps since the last time, whatever their turn."""
         self._end_broken_step()
         self._stepper.settle()
+        # What is saved now may be gone on with by a guard that counts from here.
+        self._count = 0
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
         """Whether an optimizer has all that learns, and no other one's step belongs to its own."""

@@ -23,7 +23,7 @@ def inspect(path: Path) -> InspectReport:
         what = f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
         fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
         if path.suffix in _OF_QUESTIONS:
-            fix += f"; questions are asked by aegis probe MODEL --vqa '{path}'"
+            fix += f"; {asked_by(path)}"
         expected = "a .safetensors file, or the folder of a run, study, dataset or model"
         raise AegisError(f"'{path}' is {what}", expected, fix)
     header = headers.read_header(path)
@@ -36,6 +36,11 @@ def inspect(path: Path) -> InspectReport:
         TensorInfo(name, spec.shape, spec.dtype, spec.unit) for name, spec in header.tensors.items()
     )
     return InspectReport(header.kind, str(path), _header_facts(header), tensors, **figures)
+
+
+def asked_by(path: Path) -> str:
+    """What to do with questions, which are no artifact."""
+    return f"questions are asked by aegis probe MODEL --vqa '{path}'"
 
 
 def _is_safetensors(path: Path) -> bool:

@@ -17,6 +17,7 @@ from aegis_cli.common.headers import Header
 from aegis_cli.continual import files as stream_files
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
+from aegis_cli.data.vqa import sets
 from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import figures, file
@@ -69,10 +70,11 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     refuse_unfinished(path, "inspect")  # a job that has no table yet
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
+    fix = commands.aegis("inspect", example)
+    if sets.is_folder(path):
+        fix += f"; {file.asked_by(path)}"
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
-    raise UnknownFolder(
-        f"{path} is neither a run nor an artifact", expected, commands.aegis("inspect", example)
-    )
+    raise UnknownFolder(f"{path} is neither a run nor an artifact", expected, fix)
 
 
 def _policy_folder(path: Path) -> InspectReport:

@@ -268,7 +268,9 @@ def _try(
     """Judge each of the strengths in turn, the weakest first, and the fine-tuned model before."""
     judge = _Judge(source, settings, on_event)
     if max_drop is not None:
-        probe.warn_of_little_knowledge(judge.baseline, source.base_name, "merge", on_event)
+        probe.warn_of_little_knowledge(
+            judge.baseline, source.base_name, settings.ask, "merge", on_event
+        )
     rising = sorted({0.0, *strengths})  # 0 is the fine-tuned model itself
     points: list[MergePoint] = []
     on_event(Progress("merge", 0, len(rising), "strengths"))

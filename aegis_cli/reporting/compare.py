@@ -13,6 +13,7 @@ from aegis_cli import inspection, recipes
 from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.data.episodes import as_text
 from aegis_cli.evaluation import results
 from aegis_cli.inspection import InspectReport
 from aegis_cli.reporting import differences
@@ -24,6 +25,8 @@ from aegis_cli.training.up_to_date import refuse_unfinished
 
 Interval = tuple[float, float] | None
 _Named = tuple[Any, results.Result]  # by what two runs' results are compared
+_FRAMES = ("episodes", "trained_on", "frames", "seed")  # the figures that say which they were
+_MOST = 60  # letters of a list of episodes in a warning
 
 
 @dataclass(frozen=True)
@@ -122,11 +125,13 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     same_frames = len({own[0] for own in evaluated if own is not None}) < 2
     same_episodes = _same_episodes([_by_colors(one) for _, one in found])
     made = Comparison(rows, same_frames, same_episodes, differences.between(facts))
-    _warn_of_differences(made, on_event)
+    _warn_of_differences(made, evaluated, on_event)
     return made
 
 
-def _warn_of_differences(made: Comparison, on_event: OnEvent) -> None:
+def _warn_of_differences(
+    made: Comparison, evaluated: Sequence[_Named | None], on_event: OnEvent
+) -> None:
     """Say in what the runs differ beside their methods."""
     if made.differs:
         text = f"the runs differ in {differences.said(made.differs)}"
@@ -135,9 +140,32 @@ def _warn_of_differences(made: Comparison, on_event: OnEvent) -> None:
         text = f"VQA is of different questions: {', '.join(made.question_sets)}"
         on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))
     if not made.same_open_loop:
-        shown = [f"{row.run}, {row.open_loop_on}" for row in made.rows if row.open_loop_on]
-        text = f"open-loop errors are not of the same frames: {'; '.join(shown)}"
+        text = f"open-loop errors are not of the same frames: {_other_frames(made, evaluated)}"
         on_event(Warned("compare", f"{text}; aegis evaluate --episodes measures each on the same"))
+
+
+def _other_frames(made: Comparison, evaluated: Sequence[_Named | None]) -> str:
+    """What each run's open-loop error is of, with the figures by which these are not the same."""
+    shown = [(row, *own) for row, own in zip(made.rows, evaluated, strict=True) if own]
+    differ = []
+    for name in _FRAMES:
+        if len({str(one.figures[name]) for _, _, one in shown}) > 1:
+            differ.append(name)
+    said = []
+    for row, (data, *_), one in shown:
+        # Two folders of one name may be all that is different.
+        told = [] if differ else [f"in {data}"]
+        told += [f"{name.replace('_', ' ')} {_short(one.figures[name])}" for name in differ]
+        said.append(f"{row.run}, {row.open_loop_on} ({', '.join(told)})")
+    return "; ".join(said)
+
+
+def _short(value: Any) -> str:
+    """A number, or a list of episodes, of which a warning names the first."""
+    if not isinstance(value, list):
+        return str(value)
+    listed = as_text(value) or "none"
+    return listed if len(listed) <= _MOST else f"{listed[:_MOST].rpartition(',')[0]},..."
 
 
 def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
@@ -210,10 +238,9 @@ def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) ->
 
 def _by_episodes(path: Path, found: InspectReport) -> dict[Any, results.Result]:
     """The run's open-loop evaluations by what has to be the same for them to be compared."""
-    named = ("episodes", "trained_on", "frames", "seed")
     by_episodes = {}
     for one in found.open_loops:
-        told = [str(one.figures[name]) for name in named]  # lists as texts, which can be keys
+        told = [str(one.figures[name]) for name in _FRAMES]  # lists as texts, which can be keys
         by_episodes[results.evaluated_data(path, one), *told] = one
     return by_episodes
 

@@ -717,7 +717,7 @@ class PolicyRunner:
         )
         probe.check_trained(report, recipe.train.steps)
         if settings.max_drop is not None:
-            probe.warn_of_little_knowledge(report, recipe.backbone, "probe", on_event)
+            probe.warn_of_little_knowledge(report, recipe.backbone, settings.ask, "probe", on_event)
         probe.warn_of_few_questions(
             report.questions, report.drop_interval, settings.max_drop, "probe", on_event
         )

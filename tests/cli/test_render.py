@@ -551,6 +551,15 @@ def test_a_long_instruction_is_cut_in_the_table_and_whole_in_json() -> None:
     assert report.to_json()["instructions"][0]["instruction"] == long.instruction
 
 
+@pytest.mark.parametrize(("task", "advised"), [("reach", True), (None, False)])
+def test_no_rollout_is_advised_of_a_robot_that_is_not_simulated(
+    task: str | None, advised: bool
+) -> None:
+    shown = text_of(render.inspect(InspectReport("run", "x", {"task": task})))
+    assert "nothing is measured yet" in shown and "aegis evaluate" in shown
+    assert ("aegis rollout" in shown) is advised
+
+
 def test_a_run_that_has_gone_on_says_which_steps_were_measured() -> None:
     shown = text_of(render.inspect(InspectReport("run", "x", {"measured_before": [200, 220]})))
     assert "what is measured is of steps 200, 220, and not of the last checkpoint" in shown

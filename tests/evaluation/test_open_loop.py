@@ -153,6 +153,7 @@ def test_the_control_rate_is_that_of_the_demonstrations(own_run: Path, demos_fil
         (("", ""), ("", ""), False),
         ((), (), False),
         (("axes",), ("axes",), False),  # of which one name stands for all
+        (("a.pos", "a.pos"), ("a.pos", "a.pos"), True),  # of two arms
     ],
 )
 def test_the_current_position_is_compared_with_where_actions_are_positions(
@@ -164,6 +165,20 @@ def test_the_current_position_is_compared_with_where_actions_are_positions(
     assert all((d.hold_rmse is not None) == held for d in found.dimensions)
     if held:
         assert found.dimensions[1].hold_rmse == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3], [3, 1, 2, 0]])
+def test_a_robot_may_tell_more_than_the_positions_that_actions_take(order: list[int]) -> None:
+    names = ("a.pos", "b.pos", "effort.a", "effort.b")
+    shown = recorded(("a.pos", "b.pos"), tuple(names[i] for i in order))
+    positions = shown.tensors["proprio"]
+    more = torch.cat([positions, torch.full_like(positions, 100.0)], dim=1)[:, order]
+    shown = dataclasses.replace(shown, tensors={**shown.tensors, "proprio": more})
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0], SPREAD)
+    alone = recorded(("a.pos", "b.pos"), ("a.pos", "b.pos"))
+    expected = open_loop.compare(alone, EVERY, alone.chunks(EVERY, CHUNK)[0], SPREAD)
+    assert found.hold_error == expected.hold_error is not None
+    assert found.dimensions[1].hold_rmse == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(("error", "warned"), [(0.2, False), (0.25, True), (0.6, True)])

@@ -424,6 +424,14 @@ def test_a_model_that_knows_less_than_the_commonest_answers_is_told(
     assert "can hardly lose" in said[broken] and "--ask" in said[broken]
 
 
+def test_whoever_says_how_questions_are_asked_is_not_advised_to(aegis, broken: Path) -> None:
+    given = ("probe", broken, "--questions", QUESTIONS, "--ask", "is {}")
+    code, _, err = aegis(*given, "--json")
+    said = " ".join(err.split())
+    assert code == 0 and "can hardly lose" in said
+    assert "--ask" not in said and "They were asked as 'is {}'" in said
+
+
 def test_it_is_asked_as_is_said(aegis, taught: Path, tmp_path: Path) -> None:
     out = tmp_path / "said.jsonl"
     given = ("probe", taught, "--questions", 7, "--predictions", out)

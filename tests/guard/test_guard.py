@@ -473,6 +473,27 @@ def test_layers_compiled_and_used_before_walk_their_graph_twice(anchor: Path) ->
     assert len(rows["step"]) == 3
 
 
+@compiling
+def test_a_model_that_was_compiled_and_used_before_is_seen_by_a_later_guard(anchor: Path) -> None:
+    """Compiled code knows the hooks that were there when it was compiled."""
+    import torch._functorch.config as config
+
+    def compile_and_use(model: nn.Module) -> None:
+        model.compile(backend="aot_eager")
+        task_loss(model, 0).backward()
+        model.zero_grad()
+
+    torch._dynamo.reset()
+    try:
+        with config.patch(donated_buffer=False):  # as an earlier guard has left it
+            found, rows = trained(anchor, compile_and_use)
+    finally:
+        torch._dynamo.reset()
+    plain, _ = trained(anchor)
+    torch.testing.assert_close(found, plain, rtol=1e-9, atol=1e-10)
+    assert len(rows["step"]) == 3
+
+
 @pytest.mark.parametrize("scale", [2.0**8, 2.0**-3])
 def test_a_scaler_changes_nothing_but_the_scale(scale: float, anchor: Path) -> None:
     """Two micro-batches a step, unscaled and clipped before it."""

@@ -471,6 +471,32 @@ def test_several_steps_are_projected_together(end: str, tmp_path: Path) -> None:
     assert torch.equal(vector(model), after)
 
 
+def test_a_guard_that_goes_on_from_settled_weights_constrains_in_the_same_turn(
+    tmp_path: Path,
+) -> None:
+    model = make()
+    path = few_questions(model, tmp_path / "anchor.safetensors")
+
+    def steps(model: nn.Module, guard: Guard, seeds: Sequence[int]) -> None:
+        optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
+        for seed in seeds:
+            guard.backward((model(*batch(seed)) - 1).square().mean())
+            guard.step(optimizer)
+            optimizer.zero_grad()
+        guard.settle()
+
+    def guarded(model: nn.Module) -> Guard:
+        return Guard(model, path, method="nullspace", vision="vision", energy=0.9, every=3)
+
+    again, guard = make(), guarded(model)
+    resumed = guarded(again)
+    steps(model, guard, range(4))
+    again.load_state_dict(model.state_dict())
+    steps(model, guard, range(4, 8))
+    steps(again, resumed, range(4, 8))
+    assert torch.equal(vector(again), vector(model))
+
+
 def test_frozen_maps_need_no_anchor_and_do_not_move(tmp_path: Path) -> None:
     model = make()
     model.vision.requires_grad_(False)

@@ -139,9 +139,17 @@ def test_open_loop_errors_on_the_same_episodes_are_compared(
     assert out.rstrip().endswith("open-loop error: on 2 chosen episodes of datasets/arm")
 
 
-@pytest.mark.parametrize("other", [{"episodes": [2]}, {"seed": 1}, {"trained_on": [1]}])
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        ({"episodes": [2]}, "(episodes 2)"),
+        ({"seed": 1}, "(seed 1)"),
+        ({"trained_on": [1]}, "(trained on 1)"),
+        ({"frames": 6}, "(frames 6)"),
+    ],
+)
 def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
-    other: dict[str, object], aegis, job: Path, monkeypatch: pytest.MonkeyPatch
+    other: dict[str, object], told: str, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where as many episodes of the same data were held out."""
     monkeypatch.chdir(job)
@@ -150,7 +158,8 @@ def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
     assert not compare.run([job]).same_open_loop
     _, out, err = aegis("compare", "naive", "aegis")
     assert "0.250" in out and "*0.250" not in out and "!0.500" not in out
-    assert "not of the same frames: naive, 1 held-out episode of datasets/arm" in err
+    assert "not of the same frames: naive, 1 held-out episode of datasets/arm (" in err
+    assert f"{told}; aegis evaluate" in err
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -162,7 +171,10 @@ def test_what_aegis_run_has_evaluated_is_told_apart_by_where_its_data_lies(
     for name, place in zip(("naive", "aegis"), places):
         files.save_json(job / name / "evaluate.json", open_loop(1))
         inputs.keep(job / name, inputs.Inputs((str(place),), None))
-    assert compare.run([job]).same_open_loop is same
+    said: list[Event] = []
+    assert compare.run([job], said.append).same_open_loop is same
+    warned = " ".join(event.text for event in said if isinstance(event, Warned))
+    assert all((f"(in {place})" in warned) is not same for place in places)
     by_hand = open_loop(1)
     results.keep(job / "aegis", "evaluate-validation-arm", by_hand, {"path": str(places[1])})
     (job / "aegis" / "evaluate.json").unlink()

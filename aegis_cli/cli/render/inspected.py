@@ -103,6 +103,8 @@ def _not_measured(facts: Mapping[str, Any]) -> Text:
     if into:
         return Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")
     does = "aegis probe, aegis rollout and aegis evaluate do that"
+    if facts.get("task", "") is None:  # a robot that is not simulated
+        does = "aegis probe and aegis evaluate do that"
     if before:  # the run went on since
         steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
         of = f"what is measured is of {steps}, and not of the last checkpoint"
@@ -210,8 +212,9 @@ def _features(features: Sequence[Any]) -> Table:
         columns = [feature.statistics.get(name, ()) for name in shown]  # one number a component
         count = max(1, *map(len, columns))
         parts = list(feature.components)
-        if count == 1 and feature.dtype in ("image", "video"):
-            parts = []  # without statistics, nothing is told of a picture's colours
+        if count == 1 and (feature.dtype in ("image", "video") or not any(parts)):
+            # Without statistics, nothing is told of a picture's colours or of nameless numbers.
+            parts = []
         names = [f"{feature.name} {part}".rstrip() for part in parts]
         names += [feature.name] * (count - len(names))  # statistics of components without names
         for i, name in enumerate(names):

@@ -73,11 +73,14 @@ class Feature:
         """The names of its numbers, or of a picture's channels.
 
         They are empty texts where it has none, or another number of them: openpi's datasets call
-        eight positions `["state"]`.
+        eight positions `["state"]`. An array, such as a depth map in the rows, has none at all: it
+        may be of hundreds of thousands of numbers.
         """
         if self.dtype in ("image", "video"):
             # Datasets name a picture's axes instead: height, width and channels.
-            return ("red", "green", "blue")
+            return ("depth",) if self.is_depth else ("red", "green", "blue")
+        if len(self.shape) > 1:
+            return ()
         names = self.names
         count = math.prod(self.shape)
         if isinstance(names, Mapping):

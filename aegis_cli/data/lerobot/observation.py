@@ -94,6 +94,7 @@ def read(
             )
         # A robot's own keys do not say what they are: pictures are what has several dimensions.
         kinds = {name: _dimensions(value) for name, value in observation.items()}
+        _check_frames(observation, kinds, cameras, state_names)
         shown = {name: observation[name] for name, count in kinds.items() if count > 1}
         shown = _known(shown, cameras)
         told = [name for name, count in kinds.items() if 0 <= count < 2 and name != TASK]
@@ -168,6 +169,29 @@ def _dimensions(value: Any) -> int:
     if isinstance(value, str):
         return -1
     return int(getattr(value, "ndim", 0))
+
+
+def _check_frames(
+    observation: Mapping[str, Any],
+    kinds: Mapping[str, int],
+    cameras: Sequence[str],
+    motors: Sequence[str],
+) -> None:
+    """Raise AegisError where a camera of the policy has given what is no picture.
+
+    Args:
+        kinds: how many dimensions each value has.
+    """
+    wanted = {layout.short(name) for name in cameras}
+    for name, count in kinds.items():
+        if layout.short(name) in wanted and count < 2 and name not in motors:
+            given = observation[name]
+            shape = f" of shape {tuple(given.shape)}" if count > 0 else ""
+            raise AegisError(
+                f"'{name}' is {type(given).__name__}{shape}",
+                "a picture: an array or a tensor [H, W, 3]",
+                "see whether the camera has given a frame; of a Pillow image, np.asarray(image)",
+            )
 
 
 def _number(name: str, value: Any) -> float:

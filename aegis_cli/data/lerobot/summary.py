@@ -21,7 +21,7 @@ class FeatureInfo:
     """One feature, `components` naming its numbers where the dataset does.
 
     `statistics` has a number a component, or a camera's channel in [0, 1]; empty where the dataset
-    holds none.
+    holds none, and for an array, which has no components.
     """
 
     name: str
@@ -54,7 +54,8 @@ def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
     stats = found.stats or {}
     features = []
     for name, own in found.info.features.items():
-        figures = _figures(found, stats.get(name, {}))
+        # Of an array LeRobot has statistics of every single number.
+        figures = _figures(found, stats.get(name, {})) if own.components else {}
         features.append(FeatureInfo(name, own.dtype, own.shape, own.components, figures))
     return tuple(features)
 

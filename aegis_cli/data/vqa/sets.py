@@ -339,6 +339,11 @@ def _reader(path: Path, split: str | None) -> Reader:
     raise _unknown(f"question set '{path}'")
 
 
+def is_folder(path: Path) -> bool:
+    """Whether a folder looks like one of questions."""
+    return any(path.glob(f"*{official.SUFFIX}")) or saved.is_dataset(path)
+
+
 def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> AegisError:
     expected = (
         "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, a folder of a "

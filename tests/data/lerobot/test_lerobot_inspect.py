@@ -64,6 +64,43 @@ def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:
     assert ["episodes", "5"] in lines
 
 
+def test_an_array_has_one_line(aegis: Any, tmp_path: Path) -> None:
+    """LeRobot has depth maps in rows too, with statistics of each pixel."""
+    folder = save(tmp_path / "d")
+    depth = {"dtype": "uint16", "shape": [480, 640], "names": None}
+    edit_info(folder, lambda info: info["features"].update({"observation.depth": depth}))
+    stats = json.loads((folder / layout.STATS).read_text())
+    stats["observation.depth"] = {"mean": [[1.0] * 640] * 480}
+    (folder / layout.STATS).write_text(json.dumps(stats))
+    features = {feature["name"]: feature for feature in inspected(aegis, folder)["features"]}
+    assert features["observation.depth"]["components"] == []
+    assert features["observation.depth"]["statistics"] == {}
+    lines = [line.split() for line in aegis("inspect", folder)[1].splitlines()]
+    (told,) = [line for line in lines if line[:1] == ["observation.depth"]]
+    assert told[1:6] == ["uint16", "480", "x", "640", "-"]
+
+
+def test_nameless_numbers_without_statistics_have_one_line(aegis: Any, tmp_path: Path) -> None:
+    folder = save(tmp_path / "d")
+    (folder / layout.STATS).unlink()
+    edit_info(folder, lambda info: info["features"]["observation.state"].update(names=None))
+    lines = [line.split() for line in aegis("inspect", folder)[1].splitlines()]
+    assert len([line for line in lines if line[:1] == ["observation.state"]]) == 1
+    assert len([line for line in lines if line[:1] == ["action"]]) == 2
+
+
+def test_a_picture_of_depth_has_no_colours(aegis: Any, tmp_path: Path) -> None:
+    folder = save(tmp_path / "d", episodes(2, ("top", "depth")))
+
+    def mark(info: dict[str, Any]) -> None:
+        info["features"]["observation.images.depth"]["info"] = {"is_depth_map": True}
+
+    edit_info(folder, mark)
+    features = {feature["name"]: feature for feature in inspected(aegis, folder)["features"]}
+    assert features["observation.images.depth"]["components"] == ["depth"]
+    assert features["observation.images.top"]["components"] == ["red", "green", "blue"]
+
+
 def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> None:
     folder = save(tmp_path / "d")
     (folder / layout.STATS).unlink()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import observation
@@ -166,6 +167,21 @@ def test_other_floats_than_lerobots_are_no_picture(given: Any, told: str) -> Non
 def test_a_motor_that_gives_no_number_is_named(value: Any) -> None:
     with pytest.raises(AegisError, match=r"'lift\.pos' is \w+"):
         observation.read(robots(**{"lift.pos": value}), CAMERAS, JOINTS)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (None, "'top' is NoneType"),  # as a camera gives that has no frame yet
+        (Image.fromarray(TOP), "'top' is Image"),
+        (TOP.reshape(-1), r"'top' is ndarray of shape \(144,\)"),  # as of a compressed one
+        ("frame.png", "'top' is str"),
+    ],
+)
+def test_a_camera_that_gives_no_picture_is_named(value: Any, told: str) -> None:
+    with pytest.raises(AegisError, match=told) as caught:
+        observation.read(robots(top=value), CAMERAS, JOINTS)
+    assert "np.asarray(image)" in caught.value.fix
 
 
 @pytest.mark.parametrize(
