@@ -9,6 +9,8 @@ from aegis_cli.data import renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
+    BELOW_ONE_EACH,
+    DIVIDES,
     EVEN,
     FOLDER_NAME,
     MADE,
@@ -288,6 +290,19 @@ class Train:
         default=0.9,
         later=True,
         doc="Momentum of `optimizer: sgd`; AdamW has none to set.",
+    )
+    betas: tuple[float, float] = key(
+        BELOW_ONE_EACH,
+        default=(0.9, 0.999),
+        later=True,
+        doc="Decays of AdamW's two moments; openpi and SmolVLA have [0.9, 0.95]. Under `optimizer: "
+        "sgd` they are those of the expert's AdamW alone.",
+    )
+    eps: float = key(
+        DIVIDES,
+        default=1e-8,
+        later=True,
+        doc="What AdamW adds to the root of the second moment, by which it divides.",
     )
     states: str = key(
         choice(*STATES),

@@ -359,22 +359,27 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
 
 
 Make = Callable[[dict[str, Any]], torch.optim.Optimizer]
+WITHOUT_MOMENTUM = {"momentum": 0.0}
+ADAMW_AS_IN_OPENPI = {"betas": (0.9, 0.95), "eps": 1e-6}
 
 
-def adamw(group: dict[str, Any]) -> torch.optim.Optimizer:
-    return torch.optim.AdamW([group], weight_decay=SETTINGS.weight_decay, fused=True)
+def adamw(group: dict[str, Any], **options: Any) -> torch.optim.Optimizer:
+    decay = SETTINGS.weight_decay
+    return torch.optim.AdamW([group], weight_decay=decay, fused=True, **options)
 
 
-def sgd(group: dict[str, Any], momentum: float) -> torch.optim.Optimizer:
+def sgd(group: dict[str, Any], momentum: float = 0.9) -> torch.optim.Optimizer:
     return torch.optim.SGD([group], momentum=momentum, weight_decay=SETTINGS.weight_decay)
 
 
 @pytest.mark.parametrize(
-    ("name", "momentum", "make"),
+    ("changes", "of_backbone", "of_expert"),
     [
-        ("adamw", 0.9, adamw),
-        ("sgd", 0.9, partial(sgd, momentum=0.9)),
-        ("sgd", 0.0, partial(sgd, momentum=0.0)),
+        ({"optimizer": "adamw"}, adamw, adamw),
+        (ADAMW_AS_IN_OPENPI, *[partial(adamw, **ADAMW_AS_IN_OPENPI)] * 2),
+        ({"optimizer": "sgd"}, sgd, adamw),
+        ({"optimizer": "sgd", **WITHOUT_MOMENTUM}, partial(sgd, **WITHOUT_MOMENTUM), adamw),
+        ({"optimizer": "sgd", **ADAMW_AS_IN_OPENPI}, sgd, partial(adamw, **ADAMW_AS_IN_OPENPI)),
     ],
 )
 def test_naive_equals_a_plain_training_loop(
@@ -383,13 +388,12 @@ def test_naive_equals_a_plain_training_loop(
     demos_file: Path,
     tiny_folder: Path,
     tmp_path: Path,
-    name: str,
-    momentum: float,
-    make: Make,
+    changes: dict[str, Any],
+    of_backbone: Make,
+    of_expert: Make,
 ) -> None:
     """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
-    chosen = replace(SETTINGS, optimizer=name, momentum=momentum)
-    start("naive", tmp_path, recipe=replace(recipe, train=chosen))
+    start("naive", tmp_path, recipe=replace(recipe, train=replace(SETTINGS, **changes)))
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
     backbone = backbones.load(str(tiny_folder))
     torch.manual_seed(recipe.seed)
@@ -397,8 +401,8 @@ def test_naive_equals_a_plain_training_loop(
     expert = policy.expert
     learning = [*backbone.parameters(), *expert.parameters()]
     optimizers = [
-        make({"params": backbone.parameters(), "lr": SETTINGS.backbone_lr}),
-        adamw({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
+        of_backbone({"params": backbone.parameters(), "lr": SETTINGS.backbone_lr}),
+        of_expert({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
     ]
     schedulers = [
         torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
