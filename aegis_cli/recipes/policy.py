@@ -63,6 +63,7 @@ AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "af
 KEPT = ("weights", "coordinates")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
+SCHEDULES = COSINE, LINEAR, CONSTANT = "cosine", "linear", "constant"
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
@@ -278,6 +279,13 @@ class Train:
     warmup: int = key(
         NOT_NEGATIVE, default=100, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates go on from their peaks: down to `final_lr_share` along a "
+        "cosine or a straight line, or constant, which stays at the peaks.",
+    )
     optimizer: str = key(
         choice(*OPTIMIZERS),
         default="adamw",
@@ -341,7 +349,7 @@ class Train:
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after the last would "
-        "have it; the last is a little above.",
+        "have it; the last is a little above. `schedule: constant` takes none.",
     )
     ema_decay: float | None = key(
         SHARE,

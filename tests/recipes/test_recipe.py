@@ -532,6 +532,25 @@ def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     assert setting.replace("=", ": ") in refusal(tmp_path, "name: x", setting, kind=kind).found
 
 
+@pytest.mark.parametrize(
+    ("setting", "found"),
+    [
+        ("train.final_lr_share=0", "train.final_lr_share: 0 with train.schedule: constant"),
+        ("kfac.growth=1", "kfac.growth: 1 with train.schedule: constant"),
+    ],
+)
+def test_a_constant_schedule_takes_nothing_that_belongs_to_a_fall(setting, found, tmp_path):
+    told = refusal(tmp_path, "name: x", "train.schedule=constant", setting)
+    assert told.found.startswith(found) and "delete " + setting.partition("=")[0] in told.fix
+    for falling in ("cosine", "linear"):
+        load(write(tmp_path, "name: x"), [f"train.schedule={falling}", setting])
+
+
+def test_a_constant_schedule_takes_the_share_that_says_the_same(tmp_path):
+    settings = ["train.schedule=constant", "train.final_lr_share=1"]
+    assert load(write(tmp_path, "name: x"), settings).train.schedule == "constant"
+
+
 def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
     found = refusal(tmp_path, "name: x\ntasks: [reach]", "probe.gate=upper", kind=RobotStreamRecipe)
     assert "probe.gate: upper with a stream" in found.found and found.fix == "delete probe.gate"
@@ -568,7 +587,8 @@ def test_a_key_that_came_later_is_no_part_of_a_record_until_it_is_used():
 
 def test_the_training_part_is_what_it_was_before_optimizers_and_refreshing():
     part = training_part(Recipe(name="x", train=Train(method="aegis")))
-    assert not {"optimizer", "momentum", "betas", "eps"} & part["train"].keys()
+    later = {"optimizer", "momentum", "betas", "eps", "schedule"}
+    assert not later & part["train"].keys()
     assert not {"idle", "refresh"} & part["aegis"].keys()
     sgd = Recipe(name="x", train=Train(method="aegis", optimizer="sgd"), aegis=Aegis(refresh=4))
     assert training_part(sgd)["train"]["optimizer"] == "sgd"

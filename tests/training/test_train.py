@@ -375,7 +375,9 @@ def sgd(group: dict[str, Any], momentum: float = 0.9) -> torch.optim.Optimizer:
 @pytest.mark.parametrize(
     ("changes", "of_backbone", "of_expert"),
     [
-        ({"optimizer": "adamw"}, adamw, adamw),
+        ({"schedule": "cosine"}, adamw, adamw),
+        ({"schedule": "linear", "final_lr_share": 0.0}, adamw, adamw),
+        ({"schedule": "constant"}, adamw, adamw),
         (ADAMW_AS_IN_OPENPI, *[partial(adamw, **ADAMW_AS_IN_OPENPI)] * 2),
         ({"optimizer": "sgd"}, sgd, adamw),
         ({"optimizer": "sgd", **WITHOUT_MOMENTUM}, partial(sgd, **WITHOUT_MOMENTUM), adamw),
@@ -393,7 +395,8 @@ def test_naive_equals_a_plain_training_loop(
     of_expert: Make,
 ) -> None:
     """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
-    start("naive", tmp_path, recipe=replace(recipe, train=replace(SETTINGS, **changes)))
+    chosen = replace(SETTINGS, **changes)
+    start("naive", tmp_path, recipe=replace(recipe, train=chosen))
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
     backbone = backbones.load(str(tiny_folder))
     torch.manual_seed(recipe.seed)
@@ -405,7 +408,7 @@ def test_naive_equals_a_plain_training_loop(
         of_expert({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
     ]
     schedulers = [
-        torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
+        torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.rate_factor(i, chosen))
         for o in optimizers
     ]
     losses = []
