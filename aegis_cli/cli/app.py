@@ -66,6 +66,7 @@ from aegis_cli.cli.options import (
     episode_numbers,
     given,
     listed_episodes,
+    made,
     names,
     not_negative,
     numbers,
@@ -1359,7 +1360,7 @@ def bench(
         int | None,
         Option(
             help="Rounds, or predictions to time; default: 9, 50, or 2 with --shape.",
-            callback=positive,
+            callback=made,
         ),
     ] = None,
     latency: Annotated[
