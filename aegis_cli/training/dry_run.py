@@ -29,6 +29,7 @@ from aegis_cli.training import (
     assemble,
     checkpoint,
     inputs,
+    loading,
     longer,
     optimizers,
     parallel,
@@ -161,9 +162,8 @@ def _planned(
     ranks.wait()
     method = methods.get(recipe.train.method)
     told = on_event if ranks.first else ignore
-    told(Progress("dry run (loading)", 0, 1, "model"))
-    training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
-    told(Progress("dry run (loading)", 1, 1, "model"))
+    with loading.told("dry run", told):
+        training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     held = _held(training, there)
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)

@@ -50,6 +50,7 @@ from aegis_cli.training import (
     eight_bit,
     folder,
     inputs,
+    loading,
     longer,
     step,
     track,
@@ -129,7 +130,8 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
-        training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
+        with loading.told("train", on_event):
+            training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if goes_on:
             restored = _restore(training, places)
             # Where all steps are behind it, `_train` takes none and reports what there is.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from torch import nn
 
 from aegis_cli.anchors import anchor_file as anchor_files
 from aegis_cli.common import artifacts, devices, files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations
@@ -169,8 +170,25 @@ def test_the_report(start: Start, tmp_path: Path) -> None:
     assert report.energy_shed_mean == pytest.approx(
         np.mean([line["energy_shed"] for line in lines])
     )
-    assert [event.done for event in events] == list(range(STEPS + 1))
+    told = [f"{event.stage} {event.done}/{event.total}" for event in events]
+    loading = ["train (loading) 0/1", "train (loading) 1/1"]
+    assert told == loading + [f"train {done}/{STEPS}" for done in range(STEPS + 1)]
     assert report.to_json()["step_s"] > 0
+
+
+def test_a_training_says_that_it_loads_before_it_does(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a pipe nothing else would: a large model and many frames take minutes."""
+    events: list[Event] = []
+
+    def load(name: str) -> NoReturn:
+        raise AegisError(f"no model '{name}' after {len(events)} events", "one", "make one")
+
+    monkeypatch.setattr(loading.backbones, "load", load)
+    with pytest.raises(AegisError, match="after 1 events"):
+        start("naive", tmp_path, on_event=events.append)
+    assert events == [Progress("train (loading)", 0, 1, "model")]
 
 
 def test_learning_rates_warm_up_and_fall(naive_run: Path) -> None:
