@@ -16,8 +16,10 @@ from aegis_cli.recipes import (
     RobotStreamStudyRecipe,
     StreamRecipe,
     StreamStudyRecipe,
+    Train,
     options,
 )
+from aegis_cli.recipes.policy import CONSTANT
 from aegis_cli.recipes.study_cells import cell
 from aegis_cli.recipes.variants import SECTIONS
 
@@ -95,12 +97,13 @@ def of_settings(
 
 def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[str]:
     train = recipe.train
-    if train.warmup >= train.steps:
+    falls = not (isinstance(train, Train) and train.schedule == CONSTANT)
+    if train.warmup > train.steps or (falls and train.warmup == train.steps):
         share = 100 * train.steps / train.warmup  # the rise is linear
+        lost = ", and never fall" if falls else ""
         yield (
             f"train.warmup: {train.warmup} with train.steps: {train.steps}: the learning rates end "
-            f"at {share:.3g} % of their peaks, where the rise ends, and never fall. Set "
-            "train.warmup lower"
+            f"at {share:.3g} % of their peaks, where the rise ends{lost}. Set train.warmup lower"
         )
 
 

@@ -66,6 +66,7 @@ from aegis_cli.cli.options import (
     episode_numbers,
     given,
     listed_episodes,
+    made,
     names,
     not_negative,
     numbers,
@@ -1207,15 +1208,23 @@ def export(
 @app.command(short_help="Send a trained policy to the Hugging Face hub.")
 def push(
     run: Annotated[
-        Path, Argument(metavar="RUN", help="A run's folder, or one of its checkpoints'.")
+        Path,
+        Argument(
+            metavar="RUN",
+            help="A run's folder, one of its checkpoints', or what aegis export wrote.",
+        ),
     ],
     repo: Annotated[
         str, Argument(metavar="ORG/NAME", help="Model repository; made if it is not there.")
     ],
     form: Annotated[
-        PolicyFormat,
-        Option("--format", help="The layout of a checkpoint, or that of LeRobot's policies."),
-    ] = PolicyFormat.aegis,
+        PolicyFormat | None,
+        Option(
+            "--format",
+            help="The layout of a checkpoint, or that of LeRobot's policies; default: aegis, or "
+            "an exported folder's own.",
+        ),
+    ] = None,
     dtype: StoredIn = Dtype.source,
     private: Annotated[
         bool, Option("--private", help="Make a private repository; refuse a public one.")
@@ -1229,13 +1238,13 @@ def push(
 
     The card has the VQA accuracy before and after with its interval, the gate's verdict, the
     success and the open-loop error, as far as aegis run, aegis probe, aegis rollout and aegis
-    evaluate have measured them.
+    evaluate have measured them. A folder of aegis export is sent with its own card.
 
     \b
     Example: aegis push runs/x your-name/reach-aegis --dry-run
     Example: aegis push runs/x your-name/reach-aegis --format lerobot --private
     """
-    stages.PUSH.run(run, repo, form.value, private, dry_run, dtype.value, as_json=as_json)
+    stages.PUSH.run(run, repo, form and form.value, private, dry_run, dtype.value, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from nothing.")
@@ -1360,7 +1369,7 @@ def bench(
         int | None,
         Option(
             help="Rounds, or predictions to time; default: 9, 50, or 2 with --shape.",
-            callback=positive,
+            callback=made,
         ),
     ] = None,
     latency: Annotated[

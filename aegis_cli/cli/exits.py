@@ -23,7 +23,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from aegis_cli.cli import render
+from aegis_cli.cli import other_trainers, render
 from aegis_cli.common import interrupts, launch
 from aegis_cli.common.errors import AegisError, PeerLost
 from aegis_cli.recipes import Recipe
@@ -120,21 +120,29 @@ def _misused(error: Any) -> int:
 def _name_the_key(error: Any) -> None:
     """Tell how a key of recipes is set that was given as an option of its own.
 
-    So other training programs take theirs, as in `--batch_size=8`.
+    So other training programs take theirs, as in `--batch_size=8`, or by names of their own.
     """
     option, context = getattr(error, "option_name", None), error.ctx
     if option is None or context is None:
         return
     if not any("--set" in parameter.opts for parameter in context.command.params):
         return
-    name = option.lstrip("-").replace("-", "_")
-    own = [name] if name in {field.name for field in dataclasses.fields(Recipe)} else []
-    last = name.rpartition(".")[2]
-    places = own or [place for place in below(last, Recipe) if name in (last, place)]
-    if places:  # batch_size is a key of several sections
-        key = min(places, key=lambda place: not place.startswith("train."))
-        error.message += f", but a key of recipes: --set {key}=..."
+    keys = _keys_for(option.lstrip("-").replace("-", "_"))
+    if keys:
+        named = "a key of recipes" if len(keys) == 1 else "keys of recipes"
+        error.message += f", but {named}: {' '.join(f'--set {key}=...' for key in keys)}"
         error.possibilities = None
+
+
+def _keys_for(name: str) -> Sequence[str]:
+    """The keys of a policy's recipe that an option of this name would set, here or elsewhere."""
+    if name in {field.name for field in dataclasses.fields(Recipe)}:
+        return (name,)
+    last = name.rpartition(".")[2]
+    places = [place for place in below(last, Recipe) if name in (last, place)]
+    if places:  # batch_size is a key of several sections
+        return (min(places, key=lambda place: not place.startswith("train.")),)
+    return other_trainers.KEYS.get(name, ())
 
 
 def ended_by(error: OSError) -> int:

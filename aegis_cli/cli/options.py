@@ -15,7 +15,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data import episodes
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.recipes import shipped
-from aegis_cli.recipes.keys import SEED, WITH_PLACE
+from aegis_cli.recipes.keys import MADE, SEED, WITH_PLACE
 
 # Each of these is what an option may say. Typer makes a list of choices of an enumeration, and
 # checks it. A stage is given the value as text.
@@ -68,6 +68,13 @@ def positive(param: typer.CallbackParam, value: int | None) -> int | None:
     """A whole number, 1 or more; None where the option was not given."""
     if value is not None and value < 1:
         raise _refused(param, f"{value}", "a whole number, 1 or more", param.default or 9)
+    return value
+
+
+def made(param: typer.CallbackParam, value: int | None) -> int | None:
+    """How many times Aegis is to do a thing; None where the option was not given."""
+    if value is not None and not MADE.accepts(value):
+        raise _refused(param, f"{value}", f"a whole number {MADE.expected}", param.default or 9)
     return value
 
 

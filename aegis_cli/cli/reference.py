@@ -46,6 +46,7 @@ _TYPES: dict[Any, str] = {
     tuple[int, ...]: "list of whole numbers",
     tuple[int, ...] | None: "list of whole numbers",
     tuple[float, ...] | None: "list of numbers",
+    tuple[float, float]: "list of two numbers",
     tuple: "list of words",
 }
 _ABOUT_RECIPES = """\

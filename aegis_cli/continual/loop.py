@@ -21,7 +21,7 @@ from aegis_cli.continual.state import AnyStreamRun, Objective
 from aegis_cli.core.identification import Flow, flow, total_variation, where_read
 from aegis_cli.core.routing import activate, traced
 from aegis_cli.training import folder
-from aegis_cli.training.schedule import BatchOrder, warmup_cosine
+from aegis_cli.training.schedule import BatchOrder, warmup_then_decay
 
 # what flows where the task has no router, since no loss reads the map
 NOTHING = Flow(torch.empty(0), torch.empty(0))
@@ -152,7 +152,7 @@ def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> f
     """
     settings, current, optimizer = run.recipe.train, run.current, training.optimizer
     assert optimizer is not None
-    factor = warmup_cosine(step, settings.steps, settings.warmup, settings.final_lr_share)
+    factor = warmup_then_decay(step, settings.steps, settings.warmup, settings.final_lr_share)
     for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
     optimizer.zero_grad()

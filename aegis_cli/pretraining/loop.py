@@ -17,7 +17,7 @@ from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.embedded_file import EmbeddedModel
 from aegis_cli.recipes import DualRecipe, PretrainRecipe, digest, every_key
 from aegis_cli.training import folder, optimizer_state
-from aegis_cli.training.schedule import warmup_cosine
+from aegis_cli.training.schedule import warmup_then_decay
 
 STATE = "state.safetensors"
 FINAL_LR_SHARE = 0.02
@@ -131,7 +131,7 @@ def train(
         if done < recipe.steps:
             on_event(Progress("pretrain", done, recipe.steps, "steps"))
         for step in range(done, recipe.steps):
-            factor = warmup_cosine(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
+            factor = warmup_then_decay(step, recipe.steps, recipe.warmup, FINAL_LR_SHARE)
             for optimizer, rates in zip(run.optimizers, peak, strict=True):
                 for group, rate in zip(optimizer.param_groups, rates, strict=True):
                     group["lr"] = rate * factor

@@ -1,4 +1,7 @@
-"""`aegis push`: a trained policy with its model card, as a model repository of the hub."""
+"""`aegis push`: a trained policy with its model card, as a model repository of the hub.
+
+What `aegis export` has written, its card edited or not, is sent as it is.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.files import write_text
 from aegis_cli.common.version import __version__
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.backbones.base import FLOAT32
 from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint
 
@@ -51,6 +56,7 @@ _OF_BACKBONE = {
     "sentencepiece.bpe.model",
 }
 _TEMPLATES = "additional_chat_templates"  # the only folder of a processor's
+_NOBODYS = re.compile(r"\bORG/[\w-]+(?:\.[\w-]+)*")  # what an export's card calls the repository
 _LONGEST = 96  # characters of a repository's name, by the hub's rules
 _NO_TOKEN = "hf auth login, or set HF_TOKEN to one of https://huggingface.co/settings/tokens"
 
@@ -85,13 +91,13 @@ class PushReport:
 def run(
     run_path: Path,
     repo: str,
-    form: str = card.AEGIS,
+    form: str | None = None,
     private: bool = False,
     dry_run: bool = False,
     dtype: str = export.SOURCE,
     on_event: OnEvent = ignore,
 ) -> PushReport:
-    """Send a run's policy, or that of a checkpoint in a run, to the hub in one commit.
+    """Send the policy of a run, of a checkpoint in a run, or of an export to the hub in one commit.
 
     A repository that is not there is created. Of its other files those go that an earlier push has
     left, in either layout or with another backbone, which would be loaded instead of the new policy
@@ -99,37 +105,102 @@ def run(
 
     Args:
         repo: ORG/NAME.
-        form: `aegis` or `lerobot`.
+        form: `aegis`, which None is for a run, or `lerobot`; an export has its own.
         private: create a private repository, and refuse one that is public.
         dry_run: check everything that needs no network, and send nothing.
         dtype: of the backbone's weights, as `export.run` takes it.
 
     Raises:
-        AegisError: no run of a policy, a damaged one, no such name, no token, or a hub that cannot
-            be reached or refuses.
+        AegisError: no run of a policy and no export, a damaged one, no such name, no token, or a
+            hub that cannot be reached or refuses.
     """
     _check_name(repo)
     export.refuse_stream(run_path)
-    at = checkpoint.chosen(run_path)
-    if checkpoint.run_of(at) is None:
-        raise AegisError(
-            f"'{run_path}', a checkpoint outside of its run",
-            "a run, whose recipe and results make the model card",
-            "give the run's folder, or send what aegis export wrote as it is: "
-            f"{commands.shell('hf', 'upload', repo, run_path)}",
-        )
-    export.warn_of_steps_left(run_path, "push", on_event)
-    export.warn_of_a_merge(run_path, "push", on_event)
+    is_exported = _is_exported(run_path)
+    if is_exported:
+        form = _own_form(run_path, form, dtype)
+    else:
+        _check_in_a_run(run_path, repo)
+        export.warn_of_steps_left(run_path, "push", on_event)
+        export.warn_of_a_merge(run_path, "push", on_event)
     # Before the export, which takes minutes: without a token nothing could be sent.
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
-        folder = Path(aside) / "policy"
-        exported = export.run(at, folder, form, repo=repo, dtype=dtype)
-        contents = _files(folder)
+        form, folder = form or card.AEGIS, Path(aside) / "policy"
+        if is_exported:
+            contents, dtype = _as_it_is(run_path, repo, folder)
+        else:
+            at = checkpoint.chosen(run_path)
+            dtype = export.run(at, folder, form, repo=repo, dtype=dtype).dtype
+            contents = _files(folder)
         url, removed = (None, ()) if api is None else _send(api, repo, contents, private)
         size = sum(path.stat().st_size for path in contents.values())
-        dtype, files = exported.dtype, tuple(sorted(contents))
+        files = tuple(sorted(contents))
         return PushReport(repo, url, form, dtype, private, files, removed, size / 1e6)
+
+
+# --- what is sent ---------------------------------------------------------------------------------
+
+
+def _is_exported(folder: Path) -> bool:
+    """Whether a folder is what `aegis export` makes of a run: a policy with its card."""
+    if not (folder / card.NAME).is_file():
+        return False
+    if lerobot_folder.is_policy(folder):
+        return True
+    # A checkpoint that was copied out of its run still has its training state.
+    is_plain = checkpoint.is_one(folder) and not (folder / checkpoint.STATE).exists()
+    return is_plain and checkpoint.run_of(folder) is None
+
+
+def _own_form(folder: Path, form: str | None, dtype: str) -> str:
+    """The layout of an exported folder.
+
+    Raises:
+        AegisError: another one is asked for, or another type of weights.
+    """
+    own = card.LEROBOT if lerobot_folder.is_policy(folder) else card.AEGIS
+    asked = f"--dtype {dtype}" if dtype != export.SOURCE else ""
+    if form not in (None, own):
+        asked = f"--format {form}"
+    if asked:
+        raise AegisError(
+            f"{asked} for '{folder}', which was exported with --format {own}",
+            "an exported policy as it is",
+            f"leave {asked.partition(' ')[0]} out, or give the run's folder",
+        )
+    return own
+
+
+def _check_in_a_run(path: Path, repo: str) -> None:
+    """Raise AegisError for a policy of which nothing makes a model card."""
+    if lerobot_folder.is_policy(path) or checkpoint.run_of(checkpoint.chosen(path)) is None:
+        raise AegisError(
+            f"'{path}', a policy outside of its run and without {card.NAME}",
+            "a run, whose recipe and results make the model card, or what aegis export wrote",
+            "give the run's folder, or send this one without a card: "
+            f"{commands.shell('hf', 'upload', repo, path)}",
+        )
+
+
+def _as_it_is(folder: Path, repo: str, aside: Path) -> tuple[dict[str, Path], str]:
+    """The files of an exported folder, and the type of its backbone's weights.
+
+    Args:
+        aside: a folder to make, for the card, whose commands get the repository's name.
+
+    Raises:
+        AegisError: a policy that is damaged, or a card that is no text.
+    """
+    meta, own = checkpoint.load_policy(folder)[1], folder / card.NAME
+    try:
+        text = own.read_text(encoding="utf-8")
+    except ValueError as error:
+        raise AegisError(f"'{own}' is no UTF-8", "a model card", "save it as UTF-8") from error
+    aside.mkdir()
+    told = aside / card.NAME
+    write_text(told, _NOBODYS.sub(repo, text))
+    return {**_files(folder), card.NAME: told}, meta.get("stored", FLOAT32)
 
 
 def _check_name(repo: str) -> None:
@@ -143,9 +214,13 @@ def _check_name(repo: str) -> None:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """The files below a folder by their paths in it."""
-    found = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): path for path in found}
+    """The files below a folder by their paths in it, but for hidden ones, such as of git."""
+    found = {}
+    for path in folder.rglob("*"):
+        own = path.relative_to(folder)
+        if path.is_file() and not any(part.startswith(".") for part in own.parts):
+            found[own.as_posix()] = path
+    return found
 
 
 # --- the hub --------------------------------------------------------------------------------------
@@ -238,6 +313,10 @@ def _reaching(repo: str) -> Generator[None]:
         raise AegisError("HF_HUB_OFFLINE, which forbids the network", "a network", fix) from error
     except HfHubHTTPError as error:
         raise _refused(repo, error) from error
+    except ValueError as error:  # of the card's head, which the client has the hub check at first
+        found = " ".join(str(error).split())
+        fix = f"correct what stands between the lines --- of {card.NAME}; nothing was committed"
+        raise AegisError(found, "a model card whose head is sound YAML", fix) from error
     except (HTTPError, OSError) as error:  # of the connection, or a time-out
         said = str(error) or type(error).__name__
         raise AegisError(

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
+from aegis_cli.recipes.policy import CONSTANT, MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -77,6 +77,9 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
         yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
+    if recipe.train.schedule == CONSTANT and recipe.kfac.growth > 0:
+        found = f"kfac.growth: {recipe.kfac.growth:g} with train.schedule: {CONSTANT}"
+        yield Problem(found, "learning rates that fall, as it grows", "delete kfac.growth")
     if recipe.probe.gate != "mean" and recipe.probe.max_drop is None:
         found = f"probe.gate: {recipe.probe.gate} without probe.max_drop"
         yield Problem(found, "a limit that the drop is held to", "set probe.max_drop")
@@ -94,6 +97,11 @@ def _train_checks(train: Train) -> Iterator[Problem]:
     if train.optimizer != "sgd" and "momentum" in changed(train):
         found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    # 1 says the same in other words.
+    if train.schedule == CONSTANT and changed(train).get("final_lr_share", 1) != 1:
+        found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
+        fix = "delete train.final_lr_share, or set it to 1"
+        yield Problem(found, "train.schedule: cosine or linear, which fall to it", fix)
     if train.relative_exclude is not None and not train.relative_actions:
         found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
         fix = "set it, or delete train.relative_exclude"

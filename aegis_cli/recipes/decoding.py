@@ -34,6 +34,7 @@ _PHRASES: dict[Any, str] = {
     str | tuple[str, ...]: "text, or a list of different words such as [a, b]",
     str | tuple[str, ...] | None: "text, or a list of different words such as [a, b]",
     tuple[float, ...] | None: "a list of numbers such as [2, 1]",
+    tuple[float, float]: "a list of two numbers such as [0.9, 0.95]",
     tuple[int, ...]: "a list of different whole numbers such as [0, 1]",
     tuple[int, ...] | None: "a list of different whole numbers such as [100, 200]",
     dict: "a section of keys and values",

@@ -12,7 +12,7 @@ import functools
 import operator
 import re
 from collections.abc import Callable
-from types import UnionType
+from types import GenericAlias, UnionType
 from typing import (
     Annotated,
     Any,
@@ -61,6 +61,9 @@ NOT_NEGATIVE = Check("0 or more", lambda v: v >= 0)
 SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
 SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
 BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
+BELOW_ONE_EACH = Check("each 0 or more and below 1", lambda v: 0 <= v < 1, repeats=True)
+# What is smaller is 0 in float32, or nearly, and a step would divide 0 by it.
+DIVIDES = Check("1e-30 or more", lambda v: v >= 1e-30)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
 NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
@@ -229,8 +232,7 @@ def _strict(hint: Any) -> Any:
         return Annotated[hint, Strict()]
     origin, args = get_origin(hint), get_args(hint)
     if origin is tuple:
-        item = _strict(args[0])
-        return tuple[item, ...]
+        return GenericAlias(tuple, tuple(map(_strict, args)))  # `tuple[X, ...]`, or of two
     if origin in (Union, UnionType):
         return functools.reduce(operator.or_, map(_strict, args))
     return dict[str, Any] if origin is dict else hint

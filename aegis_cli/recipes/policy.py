@@ -9,6 +9,8 @@ from aegis_cli.data import renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
+    BELOW_ONE_EACH,
+    DIVIDES,
     EVEN,
     FOLDER_NAME,
     MADE,
@@ -61,6 +63,7 @@ AUGMENTATIONS = ("brightness", "contrast", "saturation", "hue", "sharpness", "af
 KEPT = ("weights", "coordinates")
 TRACKERS = ("tensorboard", "trackio", "wandb")
 OPTIMIZERS = ("adamw", "sgd")
+SCHEDULES = COSINE, LINEAR, CONSTANT = "cosine", "linear", "constant"
 ANCHOR_SOURCES = ("questions", "demos")
 PENALTY_STEPS = ("gradient", "proximal")
 SITE_KINDS = ("maps", "norms", "embeddings", "stem")
@@ -276,6 +279,13 @@ class Train:
     warmup: int = key(
         NOT_NEGATIVE, default=100, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates go on from their peaks: down to `final_lr_share` along a "
+        "cosine or a straight line, or constant, which stays at the peaks.",
+    )
     optimizer: str = key(
         choice(*OPTIMIZERS),
         default="adamw",
@@ -288,6 +298,19 @@ class Train:
         default=0.9,
         later=True,
         doc="Momentum of `optimizer: sgd`; AdamW has none to set.",
+    )
+    betas: tuple[float, float] = key(
+        BELOW_ONE_EACH,
+        default=(0.9, 0.999),
+        later=True,
+        doc="Decays of AdamW's two moments; openpi and SmolVLA have [0.9, 0.95]. Under `optimizer: "
+        "sgd` they are those of the expert's AdamW alone.",
+    )
+    eps: float = key(
+        DIVIDES,
+        default=1e-8,
+        later=True,
+        doc="What AdamW adds to the root of the second moment, by which it divides.",
     )
     states: str = key(
         choice(*STATES),
@@ -326,7 +349,7 @@ class Train:
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after the last would "
-        "have it; the last is a little above.",
+        "have it; the last is a little above. `schedule: constant` takes none.",
     )
     ema_decay: float | None = key(
         SHARE,

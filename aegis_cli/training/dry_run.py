@@ -29,6 +29,7 @@ from aegis_cli.training import (
     assemble,
     checkpoint,
     inputs,
+    loading,
     longer,
     optimizers,
     parallel,
@@ -162,9 +163,8 @@ def _planned(
     ranks.wait()
     method = methods.get(recipe.train.method)
     told = on_event if ranks.first else ignore
-    told(Progress("dry run (loading)", 0, 1, "model"))
-    training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
-    told(Progress("dry run (loading)", 1, 1, "model"))
+    with loading.told("dry run", told):
+        training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     # They are not asked here: that they can be is all that a plan needs to know.
     validation_vqa.chosen(recipe, training.policy.backbone, told)
     held = _held(training, there)

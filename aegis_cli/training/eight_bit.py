@@ -52,14 +52,20 @@ def check(settings: Train, ranks: Ranks) -> None:
         )
 
 
-def adamw(groups: list[dict[str, Any]], weight_decay: float) -> Optimizer:
+def adamw(groups: list[dict[str, Any]], settings: Train) -> Optimizer:
     """AdamW of groups of parameters, each of which it marks."""
     # It warns of a kernel that has nothing to do with optimizers.
     logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
     from bitsandbytes.optim import AdamW8bit
 
     marked = [{**group, "states": STATES} for group in groups]
-    return AdamW8bit(marked, weight_decay=weight_decay, min_8bit_size=_SMALLEST)
+    return AdamW8bit(
+        marked,
+        betas=settings.betas,
+        eps=settings.eps,
+        weight_decay=settings.weight_decay,
+        min_8bit_size=_SMALLEST,
+    )
 
 
 def is_marked(group: dict[str, Any]) -> bool:

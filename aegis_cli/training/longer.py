@@ -91,9 +91,10 @@ def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
             "begin another run with it: --set backbone=… --set expert.start=…",
         )
     share = rate_factor(planned, settings)  # at the first step of the new plan
+    rises = share > rate_factor(planned - 1, settings)  # a constant schedule's do not
     text = (
-        f"'{out}' goes on from step {planned} to {settings.steps}; the learning rates rise again "
-        f"to {100 * share:.0f} % of their peaks"
+        f"'{out}' goes on from step {planned} to {settings.steps}; the learning rates "
+        f"{'rise again to' if rises else 'stay at'} {100 * share:.0f} % of their peaks"
     )
     on_event(Warned("train", text))
 

@@ -73,9 +73,15 @@ def _group(name: str, parameters: list[nn.Parameter], rate: float) -> dict[str, 
 
 def _adamw(groups: Groups, settings: Train) -> Optimizer:
     if settings.states == eight_bit.STATES:
-        return eight_bit.adamw(groups, settings.weight_decay)
+        return eight_bit.adamw(groups, settings)
     # Of PyTorch's AdamW only the fused one heeds `found_inf`, by which step_figures.py stops it.
-    return torch.optim.AdamW(groups, weight_decay=settings.weight_decay, fused=True)
+    return torch.optim.AdamW(
+        groups,
+        betas=settings.betas,
+        eps=settings.eps,
+        weight_decay=settings.weight_decay,
+        fused=True,
+    )
 
 
 def _sgd(groups: Groups, settings: Train) -> Optimizer:

@@ -8,25 +8,35 @@ from collections.abc import Sequence
 import numpy as np
 
 from aegis_cli.recipes import Train
+from aegis_cli.recipes.policy import CONSTANT, COSINE, LINEAR
 
 
-def warmup_cosine(step: int, steps: int, warmup: int, final_share: float) -> float:
+def warmup_then_decay(
+    step: int, steps: int, warmup: int, final_share: float, schedule: str = COSINE
+) -> float:
     """The factor on the peak learning rate at `step`, from 0.
 
-    It rises linearly over `warmup` steps, then follows a cosine to `final_share`, which the step
-    after the last would have.
+    It rises linearly over `warmup` steps, then falls to `final_share`, which the step after the
+    last would have.
+
+    Args:
+        schedule: one of SCHEDULES: along a cosine, along a line, or not at all.
     """
     if step < warmup:
         return (step + 1) / warmup  # at a rate of 0 the first step would be lost
-    progress = (step - warmup) / max(1, steps - warmup)
-    return final_share + (1 - final_share) * (1 + math.cos(math.pi * min(1.0, progress))) / 2
+    if schedule == CONSTANT:
+        return 1.0
+    progress = min(1.0, (step - warmup) / max(1, steps - warmup))
+    left = 1 - progress if schedule == LINEAR else (1 + math.cos(math.pi * progress)) / 2
+    return final_share + (1 - final_share) * left
 
 
 def rate_factor(step: int, settings: Train) -> float:
     """The factor on a training's peak learning rates at `step`, by the plan of that step."""
     # The first plan that the step is still within: what was planned later changes nothing before.
     planned = next((steps for steps in settings.plans if step < steps), settings.steps)
-    return warmup_cosine(step, planned, settings.warmup, settings.final_lr_share)
+    share, schedule = settings.final_lr_share, settings.schedule
+    return warmup_then_decay(step, planned, settings.warmup, share, schedule)
 
 
 def rate_left(step: int, settings: Train) -> float:

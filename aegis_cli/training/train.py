@@ -50,6 +50,7 @@ from aegis_cli.training import (
     eight_bit,
     folder,
     inputs,
+    loading,
     longer,
     step,
     track,
@@ -136,7 +137,8 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
-        training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
+        with loading.told("train", on_event):
+            training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         if not (goes_on and _is_finished(out, recipe)):
             training.questions = _asked_before(training, on_event)
         if goes_on:

@@ -85,6 +85,13 @@ def test_a_rate_that_never_falls_is_warned_of(said: Said) -> None:
         assert warned in text and text.count("warning: train.warmup") == bool(warned)
 
 
+def test_a_constant_rate_is_warned_of_where_it_is_never_reached(said: Said) -> None:
+    for warmup, warned in ((4, ""), (8, "end at 50 % of their peaks, where the rise ends. Set")):
+        advice.of_settings(recipe("embedded", steps=4, warmup=warmup, schedule="constant"))
+        text = said()
+        assert warned in text and text.count("warning: train.warmup") == bool(warned)
+
+
 def test_a_threshold_that_another_replaces_is_warned_of(said: Said) -> None:
     both = replace(recipe("embedded"), nullspace=Nullspace(soft=1e-3, energy=0.9))
     advice.of_settings(both, methods=("naive", "nullspace"))

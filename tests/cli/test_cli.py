@@ -8,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
+import itertools
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +24,7 @@ import torch
 import typer
 from samples.command import ROOT, finding, python, refused
 
-from aegis_cli.cli import render, stages
+from aegis_cli.cli import other_trainers, render, stages
 from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -30,7 +32,8 @@ from aegis_cli.common.events import Progress
 from aegis_cli.common.version import __version__
 from aegis_cli.data.selection import Selection
 from aegis_cli.deploy import load_acting
-from aegis_cli.recipes import Anchor
+from aegis_cli.recipes import Anchor, Recipe
+from aegis_cli.recipes.decoding import below
 
 STAGES = {
     "demos": "aegis_cli.data.record",
@@ -710,11 +713,43 @@ def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
         ("--batch-size", "train.batch_size"),
         ("--train.steps=100", "train.steps"),
         ("--camera", "demos.camera"),
+        ("--optimizer.betas", "train.betas"),
+        ("--scheduler.type=cosine", "train.schedule"),
+        ("--lr_scheduler_type", "train.schedule"),
+        ("--lr-scheduler-type", "train.schedule"),
     ],
 )
 def test_a_recipes_key_that_is_given_as_an_option_is_told(option: str, key: str, aegis) -> None:
     code, out, err = aegis("train", "reach", "--out", "x", option, "8")
     assert (code, out) == (2, "") and f"but a key of recipes: --set {key}=..." in err
+
+
+def test_an_option_of_several_keys_is_told_all_of_them(aegis) -> None:
+    code, out, err = aegis("train", "reach", "--out", "x", "--learning_rate=1e-4")
+    told = "keys of recipes: --set train.backbone_lr=... --set train.expert_lr=..."
+    assert (code, out) == (2, "") and told in " ".join(err.split())
+
+
+def test_options_of_other_trainers_are_told_as_the_documentation_has_them() -> None:
+    page = (ROOT / "docs" / "lerobot.md").read_text()
+    (section,) = re.findall(r"^## What its options are called here$(.+?)^## ", page, re.M | re.S)
+    rows = re.findall(r"^\| (.+?) \| (.+?) \|$", section, re.M)
+    documented = {
+        option.partition("=")[0].lstrip("-"): re.findall(r"`(?:--)?([\w.]+)[^`]*`", here)
+        for there, here in rows
+        for option in re.findall("`([^`]+)`", there)
+    }
+    assert other_trainers.KEYS.keys() - documented.keys() == {"lr"}
+    for name in other_trainers.KEYS.keys() & documented.keys():
+        # A method is an option here, too.
+        keys = {"method" if k == "train.method" else k for k in other_trainers.KEYS[name]}
+        assert keys <= set(documented[name]), name
+
+
+def test_every_key_that_is_told_is_one() -> None:
+    for key in set(itertools.chain(*other_trainers.KEYS.values())):
+        section, _, name = key.partition(".")
+        assert key in below(name, Recipe) and section
 
 
 @pytest.mark.parametrize("args", [("train", "reach", "--anchor.steps=1"), ("anchor", "--steps")])

@@ -114,6 +114,11 @@ def test_what_is_finished_at_once_has_no_rate():
         assert lines_of(events)[-1] == f"q: 501/501 questions (100 %){rate}, {took}"
 
 
+def test_a_single_unit_has_no_rate():
+    events = [(7.0 * done, Progress("train (loading)", done, 1, "model")) for done in (0, 1)]
+    assert lines_of(events)[-1] == "train (loading): 1/1 model (100 %), took 7s"
+
+
 def test_a_stage_that_begins_anew_is_shown_anew():
     events = [(0.0, Progress("probe", 5, 5, "batches")), (0.1, Progress("probe", 1, 5, "batches"))]
     assert [line[:11] for line in lines_of(events)] == ["probe: 5/5 ", "probe: 1/5 "]

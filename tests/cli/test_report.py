@@ -375,6 +375,16 @@ def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: P
     assert any(tag == "svg" for tag, _ in page.tags)
 
 
+def test_a_run_without_a_line_of_metrics_has_no_heading_for_them(aegis, job: Path) -> None:
+    """Such as one that was interrupted before its first line."""
+    run, heading = job / "naive", "<h2>Learning</h2>"
+    reported(aegis, run)
+    assert heading in (run / "report.html").read_text(encoding="utf-8")
+    (run / "metrics.jsonl").write_text("")
+    reported(aegis, run)
+    assert heading not in (run / "report.html").read_text(encoding="utf-8")
+
+
 def test_questions_of_one_family_have_one_row(aegis, job: Path) -> None:
     probed = files.load_json(job / "naive" / "probe.json")
     probed["families"] = {"all": next(iter(probed["families"].values()))}

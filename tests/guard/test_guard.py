@@ -141,7 +141,7 @@ def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
     policy, settings = run.policy.train(), run.recipe.train
     (optimizer,) = run.optimizers
     for index, frames in enumerate(frames_of(run)):
-        factor = schedule.warmup_cosine(
+        factor = schedule.warmup_then_decay(
             index, settings.steps, settings.warmup, settings.final_lr_share
         )
         for group in run.rates:

@@ -495,6 +495,78 @@ def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, tmp_path: Pat
     assert "ORG/NAME" in refused(aegis("push", "--dry-run", "--", tmp_path, name))
 
 
+@pytest.fixture(scope="module", params=FORMS)
+def exported(
+    request: pytest.FixtureRequest, run_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str]:
+    """What `aegis export` wrote, under a name that is no repository's, and its format."""
+    out = tmp_path_factory.mktemp("exports") / "the arm.v2"
+    export.run(run_folder, out, request.param)
+    return out, request.param
+
+
+def test_an_export_is_sent_as_its_run_would_be(
+    exported: tuple[Path, str], run_folder: Path, hub: Hub, own_cache: None
+) -> None:
+    folder, form = exported
+    of_run = push.run(run_folder, REPO, form)
+    sent = dict(hub.committed)
+    hub.committed.clear()
+    of_export = push.run(folder, REPO)
+    assert of_export == of_run and hub.committed == sent
+    assert b"ORG/" not in sent[card.NAME] and REPO.encode() in sent[card.NAME]
+
+
+def test_the_card_of_an_export_may_be_edited_and_hidden_files_stay(
+    exported: tuple[Path, str], hub: Hub, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(exported[0], tmp_path / "mine")
+    (folder / ".git").mkdir()
+    (folder / ".git" / "config").write_text("mine")
+    own = "Of our own robot, as in {}. And ORGAN/x, für alle"
+    (folder / card.NAME).write_text(own.format("ORG/the-arm.v2"), encoding="utf-8")
+    push.run(folder, REPO)
+    assert hub.committed[card.NAME].decode() == own.format(REPO)
+    assert (folder / card.NAME).read_text(encoding="utf-8") == own.format("ORG/the-arm.v2")
+    assert not any(".git" in name for name in hub.committed)
+
+
+def test_a_card_that_the_hub_does_not_take_is_one_error(
+    exported: tuple[Path, str], hub: Hub, aegis: Aegis
+) -> None:
+    hub.card_error = '"license" must be a string'
+    said = refused(aegis("push", exported[0], REPO))
+    assert hub.card_error in said and "nothing was committed" in said
+    assert hub.committed == {}
+
+
+def test_an_export_is_sent_in_its_own_layout_and_type(
+    exported: tuple[Path, str], aegis: Aegis
+) -> None:
+    folder, form = exported
+    (other,) = set(FORMS) - {form}
+    for option in (("--format", other), ("--dtype", "float32")):
+        said = refused(aegis("push", folder, REPO, "--dry-run", *option))
+        assert " ".join(option) in said and f"exported with --format {form}" in said
+    code, out, _ = aegis("push", folder, REPO, "--dry-run", "--format", form, "--json")
+    assert code == 0 and json.loads(out)["format"] == form
+
+
+def test_an_export_without_a_card_or_with_a_damaged_policy_is_refused(
+    exported: tuple[Path, str], aegis: Aegis, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(exported[0], tmp_path / "mine")
+    weights = next(path for path in folder.glob("*.safetensors"))
+    whole = weights.read_bytes()
+    weights.write_bytes(whole[:-100])
+    assert weights.name in refused(aegis("push", folder, REPO, "--dry-run"))
+    weights.write_bytes(whole)
+    (folder / card.NAME).write_bytes(b"\xff")
+    assert "UTF-8" in refused(aegis("push", folder, REPO, "--dry-run"))
+    (folder / card.NAME).unlink()
+    assert "hf upload" in refused(aegis("push", folder, REPO, "--dry-run"))
+
+
 def test_what_is_no_run_is_refused(aegis: Aegis, run_folder: Path, tmp_path: Path) -> None:
     assert "no checkpoint" in refused(aegis("push", tmp_path, REPO, "--dry-run"))
     alone = tmp_path / "alone"

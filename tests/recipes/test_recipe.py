@@ -180,6 +180,12 @@ def test_one_camera_or_several(text, value, tmp_path):
     assert load(write(tmp_path, to_yaml(recipe))) == recipe
 
 
+def test_betas_may_be_alike_and_come_back_from_the_file(tmp_path):
+    alike = load(write(tmp_path, "name: x"), ["train.betas=[0, 0]"])
+    assert alike.train.betas == (0.0, 0.0)
+    assert load(write(tmp_path, to_yaml(alike))) == alike
+
+
 def test_an_optional_key_takes_null(tmp_path):
     assert (
         load(
@@ -201,6 +207,12 @@ def test_an_optional_key_takes_null(tmp_path):
         ("train.extended_from=[1000000000001]", "at most 1,000,000,000,000"),
         ("ewc.weight=1e300", "a number, 0 or more, at most 1e+30"),
         ("demos.weights=[1.0, 2e30]", "at most 1e+30"),
+        ("train.betas=[0.9]", "a list of two numbers such as [0.9, 0.95]"),
+        ("train.betas=[0.9, 0.95, 0.99]", "a list of two numbers"),
+        ("train.betas=[0.9, 1]", "each 0 or more and below 1"),
+        ("train.betas=0.9", "a list of two numbers"),
+        ("train.betas=[0.9, many]", "a list of two numbers"),
+        ("train.eps=0", "a number, 1e-30 or more"),
         ("train.steps=true", "a whole number"),
         ("train.steps=many", "a whole number"),
         ("train.steps=", "a whole number"),
@@ -520,6 +532,25 @@ def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     assert setting.replace("=", ": ") in refusal(tmp_path, "name: x", setting, kind=kind).found
 
 
+@pytest.mark.parametrize(
+    ("setting", "found"),
+    [
+        ("train.final_lr_share=0", "train.final_lr_share: 0 with train.schedule: constant"),
+        ("kfac.growth=1", "kfac.growth: 1 with train.schedule: constant"),
+    ],
+)
+def test_a_constant_schedule_takes_nothing_that_belongs_to_a_fall(setting, found, tmp_path):
+    told = refusal(tmp_path, "name: x", "train.schedule=constant", setting)
+    assert told.found.startswith(found) and "delete " + setting.partition("=")[0] in told.fix
+    for falling in ("cosine", "linear"):
+        load(write(tmp_path, "name: x"), [f"train.schedule={falling}", setting])
+
+
+def test_a_constant_schedule_takes_the_share_that_says_the_same(tmp_path):
+    settings = ["train.schedule=constant", "train.final_lr_share=1"]
+    assert load(write(tmp_path, "name: x"), settings).train.schedule == "constant"
+
+
 def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
     found = refusal(tmp_path, "name: x\ntasks: [reach]", "probe.gate=upper", kind=RobotStreamRecipe)
     assert "probe.gate: upper with a stream" in found.found and found.fix == "delete probe.gate"
@@ -556,7 +587,8 @@ def test_a_key_that_came_later_is_no_part_of_a_record_until_it_is_used():
 
 def test_the_training_part_is_what_it_was_before_optimizers_and_refreshing():
     part = training_part(Recipe(name="x", train=Train(method="aegis")))
-    assert not {"optimizer", "momentum"} & part["train"].keys()
+    later = {"optimizer", "momentum", "betas", "eps", "schedule"}
+    assert not later & part["train"].keys()
     assert not {"idle", "refresh"} & part["aegis"].keys()
     sgd = Recipe(name="x", train=Train(method="aegis", optimizer="sgd"), aegis=Aegis(refresh=4))
     assert training_part(sgd)["train"]["optimizer"] == "sgd"

@@ -23,6 +23,7 @@ class Hub:
     Attributes:
         committed: the files by their paths, after all commits.
         created: what a repository was asked for with; None before that.
+        card_error: what is wrong with the head of every card.
         public: whether the repository is there already, and public.
         downloaded: the paths of the files that were sent, in their order.
     """
@@ -30,6 +31,7 @@ class Hub:
     def __init__(self) -> None:
         self.committed: dict[str, bytes] = {}
         self.created: dict[str, Any] | None = None
+        self.card_error = ""
         self.public = False
         self.downloaded: list[str] = []
         self.url = ""
@@ -40,6 +42,8 @@ class Hub:
             self.created = json.loads(body)
             name = f"{self.created['organization']}/{self.created['name']}"
             return (409 if self.public else 200), {"url": f"{self.url}/{name}"}
+        if path == "/api/validate-yaml" and self.card_error:
+            return 400, {"errors": [{"message": self.card_error}], "warnings": []}
         if "/preupload/" in path:
             names = [file["path"] for file in json.loads(body)["files"]]
             modes = [{"path": n, "uploadMode": "regular", "shouldIgnore": False} for n in names]

@@ -119,7 +119,7 @@ def assert_resumes(start: Start, method: str, recipe: Recipe, folder: Path) -> N
 
 def stop_at(done: int, error: BaseException) -> OnEvent:
     def on_event(event: Event) -> None:
-        if isinstance(event, Progress) and event.done == done:
+        if isinstance(event, Progress) and (event.stage, event.done) == ("train", done):
             raise error
 
     return on_event

@@ -47,3 +47,12 @@ def test_bench_reports_the_latency_of_a_run(naive_run: Path, aegis: Any) -> None
 
 def test_options_of_training_have_no_place_beside_it(aegis: Any) -> None:
     assert "--batch-size" in refused(aegis("bench", "--latency", "x", "--batch-size", "4"))
+
+
+@pytest.mark.parametrize("repeats", [0, 10**12])
+@pytest.mark.parametrize("beside", [(), ("--latency", "x"), ("--shape", "smolvlm2-256m")])
+def test_more_rounds_than_anybody_waits_for_are_refused(
+    repeats: int, beside: tuple[str, ...], aegis: Any
+) -> None:
+    said = refused(aegis("bench", *beside, "--repeats", repeats))
+    assert "--repeats" in said and "from 1 to 10,000,000" in said

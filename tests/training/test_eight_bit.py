@@ -20,6 +20,7 @@ from aegis_cli.training import dry_run, eight_bit, optimizer_state, train
 
 __all__ = ["recipe", "start"]  # fixtures
 
+TRAIN = Train(weight_decay=0.1)
 EIGHT_BIT = replace(SETTINGS, states=eight_bit.STATES)
 Saved = dict[str, Tensor]
 installed = pytest.mark.skipif(
@@ -34,8 +35,8 @@ def parameters(seed: int = 0) -> dict[str, nn.Parameter]:
     return {n: nn.Parameter(torch.randn(shape, generator=generator)) for n, shape in shapes.items()}
 
 
-def adamw(named: dict[str, nn.Parameter]) -> torch.optim.Optimizer:
-    return eight_bit.adamw([{"params": list(named.values()), "lr": 1e-2}], 0.1)
+def adamw(named: dict[str, nn.Parameter], settings: Train = TRAIN) -> torch.optim.Optimizer:
+    return eight_bit.adamw([{"params": list(named.values()), "lr": 1e-2}], settings)
 
 
 def steps(named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, which: range) -> None:
@@ -60,6 +61,18 @@ def test_its_steps_are_near_adamws() -> None:
     near, exact = parameters(), parameters()
     steps(near, adamw(near), range(20))
     steps(exact, torch.optim.AdamW(exact.values(), lr=1e-2, weight_decay=0.1), range(20))
+    torch.testing.assert_close(near["small"], exact["small"], rtol=1e-5, atol=1e-6)
+    moved = (exact["large"] - parameters()["large"]).norm()
+    assert 0 < (near["large"] - exact["large"]).norm() < 0.1 * moved
+
+
+@installed
+def test_its_betas_and_eps_are_the_recipes() -> None:
+    other = replace(TRAIN, betas=(0.5, 0.8), eps=1e-2)
+    near, exact = parameters(), parameters()
+    steps(near, adamw(near, other), range(20))
+    as_torch = {"betas": (0.5, 0.8), "eps": 1e-2, "weight_decay": 0.1}
+    steps(exact, torch.optim.AdamW(exact.values(), lr=1e-2, **as_torch), range(20))
     torch.testing.assert_close(near["small"], exact["small"], rtol=1e-5, atol=1e-6)
     moved = (exact["large"] - parameters()["large"]).norm()
     assert 0 < (near["large"] - exact["large"]).norm() < 0.1 * moved

@@ -18,7 +18,6 @@ from aegis_cli.common.events import Event, Warned
 from aegis_cli.models import lerobot_folder
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import checkpoint
-from aegis_cli.training.schedule import rate_factor
 
 LONGER = STEPS + 4
 
@@ -28,13 +27,23 @@ def of(recipe: Recipe, **changes: object) -> Recipe:
     return replace(recipe, train=replace(recipe.train, **changes))
 
 
-@pytest.mark.parametrize("method", ["naive", "aegis", "nullspace", "kfac"])
+@pytest.mark.parametrize(
+    ("method", "schedule"),
+    [
+        ("naive", "cosine"),
+        ("naive", "constant"),
+        ("aegis", "cosine"),
+        ("nullspace", "cosine"),
+        ("kfac", "linear"),
+    ],
+)
 def test_a_longer_run_ends_in_the_bytes_of_one_planned_so(
-    method: str, recipe: Recipe, start: Start, tmp_path: Path
+    method: str, schedule: str, recipe: Recipe, start: Start, tmp_path: Path
 ) -> None:
     """Also where the added steps are interrupted, and where it is made longer twice."""
+    recipe = of(recipe, schedule=schedule)
     twice = of(recipe, steps=LONGER + 3)
-    start(method, tmp_path / "grown")
+    start(method, tmp_path / "grown", recipe=recipe)
     with pytest.raises(KeyboardInterrupt):
         start(
             method,
@@ -51,24 +60,22 @@ def test_a_longer_run_ends_in_the_bytes_of_one_planned_so(
     assert kept.train.extended_from == (STEPS, LONGER) and kept.train.steps == LONGER + 3
 
 
-def test_what_is_said_and_kept(recipe: Recipe, start: Start, tmp_path: Path) -> None:
-    start("naive", tmp_path)
+@pytest.mark.parametrize(
+    ("schedule", "rates"), [("linear", "rise again to"), ("constant", "stay at 100 %")]
+)
+def test_what_is_said_and_kept(
+    schedule: str, rates: str, recipe: Recipe, start: Start, tmp_path: Path
+) -> None:
+    recipe = of(recipe, schedule=schedule)
+    start("naive", tmp_path, recipe=recipe)
     said: list[Event] = []
     longer = of(recipe, steps=LONGER)
     start("naive", tmp_path, recipe=longer, resume=True, on_event=said.append)
     (warned,) = [event.text for event in said if isinstance(event, Warned)]
-    assert f"from step {STEPS} to {LONGER}" in warned
+    assert f"from step {STEPS} to {LONGER}; the learning rates {rates}" in warned
     before = contents(tmp_path)
     start("naive", tmp_path, recipe=longer, resume=True)
     assert contents(tmp_path) == before
-
-
-def test_the_rate_follows_each_plan(recipe: Recipe) -> None:
-    plain, longer = recipe.train, of(recipe, steps=LONGER).train
-    extended = of(recipe, steps=LONGER, extended_from=(STEPS,)).train
-    for step in range(LONGER):
-        followed = plain if step < STEPS else longer
-        assert rate_factor(step, extended) == rate_factor(step, followed)
 
 
 def unfinished(recipe: Recipe, start: Start, out: Path) -> Recipe:

@@ -23,7 +23,7 @@ from aegis_cli.training import assemble, dry_run
 
 __all__ = ["recipe", "start"]  # fixtures
 
-SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05)
+SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05, betas=(0.8, 0.95))
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from torch import nn
 
 from aegis_cli.anchors import anchor_file as anchor_files
 from aegis_cli.common import artifacts, devices, files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations
@@ -169,8 +170,25 @@ def test_the_report(start: Start, tmp_path: Path) -> None:
     assert report.energy_shed_mean == pytest.approx(
         np.mean([line["energy_shed"] for line in lines])
     )
-    assert [event.done for event in events] == list(range(STEPS + 1))
+    told = [f"{event.stage} {event.done}/{event.total}" for event in events]
+    loading = ["train (loading) 0/1", "train (loading) 1/1"]
+    assert told == loading + [f"train {done}/{STEPS}" for done in range(STEPS + 1)]
     assert report.to_json()["step_s"] > 0
+
+
+def test_a_training_says_that_it_loads_before_it_does(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a pipe nothing else would: a large model and many frames take minutes."""
+    events: list[Event] = []
+
+    def load(name: str) -> NoReturn:
+        raise AegisError(f"no model '{name}' after {len(events)} events", "one", "make one")
+
+    monkeypatch.setattr(loading.backbones, "load", load)
+    with pytest.raises(AegisError, match="after 1 events"):
+        start("naive", tmp_path, on_event=events.append)
+    assert events == [Progress("train (loading)", 0, 1, "model")]
 
 
 def test_learning_rates_warm_up_and_fall(naive_run: Path) -> None:
@@ -359,22 +377,29 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
 
 
 Make = Callable[[dict[str, Any]], torch.optim.Optimizer]
+WITHOUT_MOMENTUM = {"momentum": 0.0}
+ADAMW_AS_IN_OPENPI = {"betas": (0.9, 0.95), "eps": 1e-6}
 
 
-def adamw(group: dict[str, Any]) -> torch.optim.Optimizer:
-    return torch.optim.AdamW([group], weight_decay=SETTINGS.weight_decay, fused=True)
+def adamw(group: dict[str, Any], **options: Any) -> torch.optim.Optimizer:
+    decay = SETTINGS.weight_decay
+    return torch.optim.AdamW([group], weight_decay=decay, fused=True, **options)
 
 
-def sgd(group: dict[str, Any], momentum: float) -> torch.optim.Optimizer:
+def sgd(group: dict[str, Any], momentum: float = 0.9) -> torch.optim.Optimizer:
     return torch.optim.SGD([group], momentum=momentum, weight_decay=SETTINGS.weight_decay)
 
 
 @pytest.mark.parametrize(
-    ("name", "momentum", "make"),
+    ("changes", "of_backbone", "of_expert"),
     [
-        ("adamw", 0.9, adamw),
-        ("sgd", 0.9, partial(sgd, momentum=0.9)),
-        ("sgd", 0.0, partial(sgd, momentum=0.0)),
+        ({"schedule": "cosine"}, adamw, adamw),
+        ({"schedule": "linear", "final_lr_share": 0.0}, adamw, adamw),
+        ({"schedule": "constant"}, adamw, adamw),
+        (ADAMW_AS_IN_OPENPI, *[partial(adamw, **ADAMW_AS_IN_OPENPI)] * 2),
+        ({"optimizer": "sgd"}, sgd, adamw),
+        ({"optimizer": "sgd", **WITHOUT_MOMENTUM}, partial(sgd, **WITHOUT_MOMENTUM), adamw),
+        ({"optimizer": "sgd", **ADAMW_AS_IN_OPENPI}, sgd, partial(adamw, **ADAMW_AS_IN_OPENPI)),
     ],
 )
 def test_naive_equals_a_plain_training_loop(
@@ -383,12 +408,12 @@ def test_naive_equals_a_plain_training_loop(
     demos_file: Path,
     tiny_folder: Path,
     tmp_path: Path,
-    name: str,
-    momentum: float,
-    make: Make,
+    changes: dict[str, Any],
+    of_backbone: Make,
+    of_expert: Make,
 ) -> None:
     """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
-    chosen = replace(SETTINGS, optimizer=name, momentum=momentum)
+    chosen = replace(SETTINGS, **changes)
     start("naive", tmp_path, recipe=replace(recipe, train=chosen))
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
     backbone = backbones.load(str(tiny_folder))
@@ -397,11 +422,11 @@ def test_naive_equals_a_plain_training_loop(
     expert = policy.expert
     learning = [*backbone.parameters(), *expert.parameters()]
     optimizers = [
-        make({"params": backbone.parameters(), "lr": SETTINGS.backbone_lr}),
-        adamw({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
+        of_backbone({"params": backbone.parameters(), "lr": SETTINGS.backbone_lr}),
+        of_expert({"params": expert.parameters(), "lr": SETTINGS.expert_lr}),
     ]
     schedulers = [
-        torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.warmup_cosine(i, STEPS, 2, 0.1))
+        torch.optim.lr_scheduler.LambdaLR(o, lambda i: schedule.rate_factor(i, chosen))
         for o in optimizers
     ]
     losses = []

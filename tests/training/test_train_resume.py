@@ -658,7 +658,7 @@ def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def on_event(event: Progress) -> None:
-        if event.done == after:
+        if (event.stage, event.done) == ("train", after):
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
 
     try:

@@ -176,10 +176,3 @@ def test_the_order_by_shares_depends_on_no_batch_before_it() -> None:
     assert np.array_equal(late, whole[68:72])
     other = schedule.BatchOrder(10, 4, 1, [(4, 7), (6, 3)]).rows(17)
     assert not np.array_equal(late, other)
-
-
-def test_no_warm_up_starts_at_the_peak() -> None:
-    assert schedule.warmup_cosine(0, 10, 0, 0.1) == 1
-    assert schedule.warmup_cosine(10, 10, 0, 0.1) == pytest.approx(0.1)
-    factors = [schedule.warmup_cosine(i, 10, 20, 0.1) for i in range(10)]  # all warm-up
-    assert factors == pytest.approx([(i + 1) / 20 for i in range(10)])

@@ -307,7 +307,7 @@ _CURVES = (
 )
 
 
-def curves(runs: Sequence[At]) -> Markup:
+def curves(runs: Sequence[At]) -> Markup | None:
     """What metrics.jsonl logged, a chart for each figure that some run has."""
     drawn = []
     for name, title, log, scale in _CURVES:
@@ -318,6 +318,8 @@ def curves(runs: Sequence[At]) -> Markup:
         if any(s.points for s in series):
             chart = charts.lines(series, "step", title, title, log)
             drawn.append(figure(chart))
+    if not drawn:  # a run that was interrupted before its first line
+        return None
     names = [(str(run["label"]), number) for number, run in enumerate(runs)]
     legend = charts.legend(names) if len(runs) > 1 else None
     return section("Learning", legend, element("div", *drawn, class_="charts"))

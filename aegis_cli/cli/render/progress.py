@@ -76,12 +76,13 @@ class Pace:
     def figures(self, event: Progress) -> str:
         """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`.
 
-        The rate of what is finished is that of the whole stage, if it took long enough for one.
+        The rate of what is finished is that of the whole stage, if it took long enough for one
+        and is more than a single unit.
         """
         parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
         elapsed_s = self.clock() - self.start_s
         if event.done >= event.total:
-            if elapsed_s >= _RATED_S and event.done > self.first:
+            if elapsed_s >= _RATED_S and event.done > self.first and event.total > 1:
                 parts.append(f"{_rate((event.done - self.first) / elapsed_s)} {event.unit}/s")
             parts.append(f"took {_duration(elapsed_s)}")
         elif self.rate:

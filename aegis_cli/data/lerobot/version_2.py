@@ -59,6 +59,9 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
             for feature, figures in row["stats"].items():
                 # Episode by episode: all of them at once would be held in memory.
                 own = {name: np.asarray(value, np.float64) for name, value in figures.items()}
+                if not np.all(own["count"] > 0):  # NaN, which `null` becomes, is not either
+                    where = f"'{feature}' in episode {row.get('episode_index')}"
+                    raise ValueError(f"the count of {where} is {figures['count']}, not above 0")
                 known = [joined[feature], own] if feature in joined else [own]
                 joined[feature] = statistics.merge(known)
     return dict(joined)

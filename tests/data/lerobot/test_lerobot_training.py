@@ -380,7 +380,7 @@ def test_a_run_of_frames_on_demand_has_the_weights_of_one_of_kept_ones(
     start("naive", tmp_path / "asked", demos=film, recipe=asked)
     assert not (frame_cache / "frames").exists()
     with pytest.raises(KeyboardInterrupt):
-        stop = only("train", stop_at(2, KeyboardInterrupt()))
+        stop = stop_at(2, KeyboardInterrupt())
         start("naive", tmp_path / "kept", demos=film, on_event=stop)
     start("naive", tmp_path / "kept", demos=film, recipe=asked, resume=True)
     one, other = weights(tmp_path / "asked"), weights(tmp_path / "kept")
@@ -480,14 +480,10 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(
             "naive",
             tmp_path / "parts",
             demos=reach_folder,
-            on_event=only("train", stop_at(done, KeyboardInterrupt())),
+            on_event=stop_at(done, KeyboardInterrupt()),
         )
     start("naive", tmp_path / "parts", demos=reach_folder, resume=True)
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
-
-
-def only(stage: str, on_event: Any) -> Any:
-    return lambda event: on_event(event) if event.stage == stage else None
 
 
 def test_a_changed_dataset_is_not_trained_on_further(

@@ -158,6 +158,10 @@ def lines(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], 
     return spoil
 
 
+def counted(row: int, count: object) -> Callable[[Path], object]:
+    return lines(lambda rows: rows[row]["stats"]["action"].update(count=count))
+
+
 def pipe(path: Path) -> None:
     path.unlink()
     os.mkfifo(path)
@@ -201,6 +205,11 @@ def test_a_bad_file_is_one_error(
     [
         (cut, "is damaged"),
         (lines(lambda rows: rows[1]["stats"]["action"].pop("mean")), "no 'mean'"),
+        *(
+            (counted(row, count), f"the count of 'action' in episode {row} is {count}, not")
+            for row in (0, 1)
+            for count in ([0], [-3], None)
+        ),
     ],
 )
 def test_statistics_are_read_by_those_who_show_them(

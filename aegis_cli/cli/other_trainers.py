@@ -1,0 +1,59 @@
+"""Options of LeRobot's training and of transformers' Trainer, by the keys of recipes for the same.
+
+docs/lerobot.md has them as a table, and what no key does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+_RATES = ("train.backbone_lr", "train.expert_lr")
+# what an option is called there, without its dashes -> keys here
+KEYS: Mapping[str, tuple[str, ...]] = {
+    # LeRobot's
+    "dataset.repo_id": ("demos.path",),
+    "dataset.root": ("demos.path",),
+    "dataset.episodes": ("demos.only",),
+    "dataset.image_transforms.enable": ("train.augment",),
+    "rename_map": ("demos.rename",),
+    "policy.chunk_size": ("train.chunk",),
+    "policy.n_action_steps": ("rollout.replan",),
+    "policy.freeze_vision_encoder": ("train.freeze",),
+    "policy.train_expert_only": ("train.method",),
+    "policy.use_relative_actions": ("train.relative_actions",),
+    "policy.normalization_mapping": ("train.normalization",),
+    "policy.compile_model": ("train.compile",),
+    "policy.gradient_checkpointing": ("train.gradient_checkpointing",),
+    "log_freq": ("train.log_every",),
+    "save_freq": ("train.checkpoint_every",),
+    "optimizer.type": ("train.optimizer",),
+    "optimizer.lr": _RATES,
+    "optimizer.betas": ("train.betas",),
+    "optimizer.eps": ("train.eps",),
+    "optimizer.weight_decay": ("train.weight_decay",),
+    "optimizer.grad_clip_norm": ("train.clip_norm",),
+    "scheduler.type": ("train.schedule",),
+    "scheduler.num_warmup_steps": ("train.warmup",),
+    "scheduler.decay_lr": ("train.final_lr_share",),
+    "wandb.enable": ("train.track",),
+    # the Trainer's
+    "per_device_train_batch_size": ("train.batch_size",),
+    "gradient_accumulation_steps": ("train.accumulate",),
+    "max_steps": ("train.steps",),
+    "logging_steps": ("train.log_every",),
+    "save_steps": ("train.checkpoint_every",),
+    "save_total_limit": ("train.keep_checkpoints",),
+    "eval_steps": ("train.validate_every",),
+    "learning_rate": _RATES,
+    "adam_beta1": ("train.betas",),
+    "adam_beta2": ("train.betas",),
+    "adam_epsilon": ("train.eps",),
+    "max_grad_norm": ("train.clip_norm",),
+    "lr_scheduler_type": ("train.schedule",),
+    "warmup_steps": ("train.warmup",),
+    "report_to": ("train.track",),
+    "bf16": ("train.precision",),
+    "optim": ("train.optimizer", "train.states"),
+    # anybody's
+    "lr": _RATES,
+}
