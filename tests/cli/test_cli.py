@@ -72,6 +72,7 @@ class Report:
     entropy: float | None = None
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
+    validation_vqa: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
     gate_failed: tuple[str, ...] = ()
 

@@ -20,7 +20,7 @@ from aegis_cli.cli.app import app
 from aegis_cli.common import files, launch, leading, ranks
 from aegis_cli.common.errors import AegisError, Diverged, PeerLost
 from aegis_cli.common.events import Event, OnEvent, Progress, ignore
-from aegis_cli.evaluation import probe, results
+from aegis_cli.evaluation import probe
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
 from aegis_cli.training import dry_run, train
@@ -154,7 +154,7 @@ class Failing:
             contextlib.redirect_stderr(printed),
             pytest.raises(SystemExit) as end,
         ):
-            patch.setattr(results, "within", lambda *_: False)
+            patch.setattr(pipeline, "passes", lambda *_: False)
             app(["run", str(self.recipe), "--out", str(self.root)], prog_name="aegis")
         files.make_folder(self.said)
         told = {"code": end.value.code, "printed": printed.getvalue()}
