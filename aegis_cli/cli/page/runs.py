@@ -300,7 +300,7 @@ def _wrong(example: At) -> Markup:
 _CURVES = (
     ("loss", "Training loss", True, 1.0),
     ("validation_loss", "Validation loss", False, 1.0),
-    ("vqa_drop_points", "VQA drop on validation questions (points)", False, 1.0),
+    ("vqa_drop_points", "VQA drop, validation (points)", False, 1.0),
     ("energy_shed", "Energy shed (%)", True, 100.0),
     ("lr_backbone", "Learning rate of the backbone", False, 1.0),
     ("step_s", "Time of a step (s)", False, 1.0),
