@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from aegis_cli.common.limits import MOST_MADE
+from aegis_cli.data.vqa.gate import MEAN
 from aegis_cli.recipes.keys import changed
 from aegis_cli.recipes.policy import CONSTANT, MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
@@ -80,7 +81,7 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     if recipe.train.schedule == CONSTANT and recipe.kfac.growth > 0:
         found = f"kfac.growth: {recipe.kfac.growth:g} with train.schedule: {CONSTANT}"
         yield Problem(found, "learning rates that fall, as it grows", "delete kfac.growth")
-    if recipe.probe.gate != "mean" and recipe.probe.max_drop is None:
+    if recipe.probe.gate != MEAN and recipe.probe.max_drop is None:
         found = f"probe.gate: {recipe.probe.gate} without probe.max_drop"
         yield Problem(found, "a limit that the drop is held to", "set probe.max_drop")
     if not recipe.task.startswith(SUITE) and recipe.demos.drop_below is not None:
@@ -152,7 +153,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(
             found, "no gate: a stream has a figure after each task", "delete probe.max_drop"
         )
-    if recipe.probe.gate != "mean":
+    if recipe.probe.gate != MEAN:
         found = f"probe.gate: {recipe.probe.gate} with a stream"
         yield Problem(found, "no gate: a stream has a figure after each task", "delete probe.gate")
     if recipe.probe.while_training is not None:

@@ -7,6 +7,7 @@ import re
 
 from aegis_cli.data import renaming
 from aegis_cli.data.selection import Selection
+from aegis_cli.data.vqa.gate import MEAN, UPPER
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     BELOW_ONE_EACH,
@@ -762,8 +763,8 @@ class Probe:
         "`aegis probe` of the run.",
     )
     gate: str = key(
-        choice("mean", "upper"),
-        default="mean",
+        choice(MEAN, UPPER),
+        default=MEAN,
         later=True,
         doc="What of the drop `max_drop` limits: mean, the drop as measured, or upper, the upper "
         "end of its 95 % interval, so that too few questions cannot pass.",

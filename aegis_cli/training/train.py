@@ -139,12 +139,13 @@ def run(
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         with loading.told("train", on_event):
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
-        if not (goes_on and _is_finished(out, recipe)):
+        is_finished = goes_on and checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
+        if not is_finished:
             training.questions = _asked_before(training, on_event)
         if goes_on:
             restored = _restore(training, places)
             # Where all steps are behind it, `_train` takes none and reports what there is.
-            if restored[0] >= recipe.train.steps:
+            if is_finished:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
                 _warn_of_another_precision(training, on_event)
@@ -162,11 +163,6 @@ def run(
             files.save_json(out / machine.NAME, _machine(training))
             _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
-
-
-def _is_finished(out: Path, recipe: Recipe) -> bool:
-    """Whether all steps of a run with a checkpoint are behind it."""
-    return checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
 
 
 def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | None:

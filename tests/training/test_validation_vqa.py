@@ -20,10 +20,12 @@ from samples.training_runs import (
 from samples.vqa_files import write_jsonl
 
 from aegis_cli import recipes
+from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import drop_interval, score
+from aegis_cli.evaluation import kept_figures
 from aegis_cli.inspection import folders
 from aegis_cli.models import backbones
 from aegis_cli.models.asking import ask
@@ -176,6 +178,10 @@ def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: 
     line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
     told = early.facts["validation_vqa"]["scenes"]
     assert told["cross_entropy"] == line["vqa_cross_entropy"]
+    # `aegis run` keeps the report, and reads it again for its page.
+    files.save_json(tmp_path / "train.json", report.to_json())
+    kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
+    assert kept["validation_vqa"] == report.validation_vqa
     drawn = gather.run_document(tmp_path / "run").metrics
     assert [at["step"] for at in drawn if "vqa_drop_points" in at] == [3, STEPS]
 
