@@ -7,7 +7,16 @@ from collections.abc import Iterator, Sequence
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.data.vqa.gate import MEAN
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import CONSTANT, MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
+from aegis_cli.recipes.policy import (
+    CONSTANT,
+    MERGE_NEEDS,
+    MERGE_UNREAD,
+    NEEDS,
+    SUITE,
+    TASKS,
+    Recipe,
+    Train,
+)
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -207,6 +216,10 @@ def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             found = f"merge.{name}: {getattr(merge, name)} without merge.method"
             yield Problem(found, "a method that merges", f"set merge.method, or delete {name}")
         return
+    for name in MERGE_UNREAD.get(merge.method, ()):
+        if name in changed(merge):
+            found = f"merge.{name}: {getattr(merge, name)} with merge.method: {merge.method}"
+            yield Problem(found, "a method that reads it", f"delete merge.{name}")
     if merge.method == "linear" and merge.strength > 1:
         found = f"merge.strength: {merge.strength:g} with merge.method: linear"
         yield Problem(found, "the share of the way back, from 0 to 1", "set merge.strength: 0.4")
