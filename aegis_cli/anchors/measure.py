@@ -91,6 +91,7 @@ def run(
         AegisError: inputs that cannot be read, or parts that frames do not tell.
     """
     with joined() as ranks:
+        _warn_of_unread(settings, on_event)
         if settings.source == "demos":
             shown = replace(selection, state=(), action=())
             measured = _on_frames(backbone, settings, Path(out), demos, shown, on_event, ranks)
@@ -107,6 +108,29 @@ def run(
             )
         _warn_of_few(measured.samples, settings, on_event)
         return ranks.by_first(lambda: _written(measured, settings, Path(out)))
+
+
+# The parts each of which reads a setting that others do not.
+_READ_BY = {
+    "energy": ("inputs", "curvature"),
+    "exact_width": ("inputs", "curvature"),
+    "memory": ("inputs", "curvature"),
+    "tokens": ("inputs",),
+    "temperature": ("curvature",),
+    "fisher_samples": ("fisher",),
+}
+
+
+def _warn_of_unread(settings: Settings, on_event: OnEvent) -> None:
+    """Warn of settings of parts that are not measured."""
+    for name, parts in _READ_BY.items():
+        value = getattr(settings, name)
+        if value != getattr(Settings(), name) and not set(parts) & set(settings.parts):
+            text = (
+                f"anchor.{name}: {value:g} changes nothing without {' or '.join(parts)} among the "
+                f"parts that are measured: {', '.join(settings.parts)}"
+            )
+            on_event(Warned("anchor", text))
 
 
 def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:

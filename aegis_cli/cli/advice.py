@@ -10,6 +10,7 @@ from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import (
     AnyStudy,
+    Insulate,
     Nullspace,
     Recipe,
     RobotStreamRecipe,
@@ -24,6 +25,9 @@ from aegis_cli.recipes.study_cells import cell
 from aegis_cli.recipes.variants import SECTIONS
 
 _SCENES = "scenes"
+# Keys of a training that are about the backbone's learning alone.
+_OF_BACKBONE = ("train.backbone_lr", "train.backbone_until", "train.optimizer", "train.momentum")
+_OF_QUESTIONS = ("vqa", "skip_bad", "ask", "questions", "batch_size")
 
 
 def of_questions(model: str, *names: str | None) -> None:
@@ -91,6 +95,8 @@ def of_settings(
     texts = [*_of_schedule(recipe), *_of_unread(overrides, methods)]
     if isinstance(recipe, Recipe) and "nullspace" in methods:
         texts += _of_thresholds(recipe.nullspace)
+    if isinstance(recipe, Recipe) and "insulate" in methods:
+        texts += _of_unasked(recipe.insulate)
     for text in texts:
         render.note(f"warning: {text}")
 
@@ -108,15 +114,20 @@ def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[
 
 
 def _of_unread(overrides: Sequence[str], methods: Sequence[str]) -> Iterator[str]:
-    """Options of methods that are not trained, and the rate of a backbone that does not learn."""
+    """Options of methods that are not trained, of a backbone that does not learn, and of others.
+
+    What shares a training among processes has no effect in one.
+    """
     own = {method.replace("-", "_") for method in methods}  # the sections that they read
     named = " and ".join(methods)
     for override in overrides:
-        dotted = override.partition("=")[0].strip()
+        dotted, _, value = map(str.strip, override.partition("="))
         section = dotted.partition(".")[0]
-        frozen = dotted == "train.backbone_lr" and set(methods) == {"stop-gradient"}
+        frozen = dotted in _OF_BACKBONE and set(methods) == {"stop-gradient"}
         if frozen or (section in SECTIONS and section not in own):
             yield f"--set {dotted} changes nothing: {named} does not read it"
+        if (dotted, value) == ("train.parallel", "fsdp") and launch.world_size() == 1:
+            yield f"--set {dotted} changes nothing in one process: start several with torchrun"
 
 
 def _of_thresholds(chosen: Nullspace) -> Iterator[str]:
@@ -124,6 +135,17 @@ def _of_thresholds(chosen: Nullspace) -> Iterator[str]:
         yield (
             f"nullspace.soft: {chosen.soft:g} changes nothing beside nullspace.energy: "
             f"{chosen.energy:g}, which is instead of it. Delete one of them"
+        )
+
+
+def _of_unasked(chosen: Insulate) -> Iterator[str]:
+    """What says which questions are trained on, where none are."""
+    own = [name for name in _OF_QUESTIONS if getattr(chosen, name) != getattr(Insulate(), name)]
+    if chosen.vqa_weight == 0 and own:
+        yield (
+            f"insulate.{own[0]}: {getattr(chosen, own[0])} changes nothing beside "
+            "insulate.vqa_weight: 0, which trains on no questions. Set it above 0, or delete "
+            f"{' and '.join(own)}"
         )
 
 

@@ -26,6 +26,8 @@ _REPEATED = 100  # bytes of a name that are repeated in a temporary's; file syst
 _NUMBER = r"\.\d+\.tmp"  # how such a name ends
 _LEFT = re.compile(r"\.(.+)" + _NUMBER)  # with the name of what it was to become
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
+# Where `str.splitlines` ends a line and JSON does not; as escapes they end none.
+_LINE_ENDS = str.maketrans({end: f"\\u{ord(end):04x}" for end in "\x85\u2028\u2029"})
 _ATTEMPTS = 100  # at a folder above which others come and go
 _AT_ONCE = 2**26  # bytes after which the disk begins to write them
 
@@ -55,6 +57,15 @@ def save_json(path: str | Path, obj: Any) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file: all of it, or nothing."""
     write_atomically(Path(path), lambda file: file.write(text.encode()))
+
+
+def save_json_lines(path: str | Path, objects: Iterable[Any]) -> None:
+    """Write JSON Lines in plain UTF-8: all of it, or nothing."""
+    lines = [json.dumps(obj, ensure_ascii=False) for obj in objects]
+    text = "".join(line.translate(_LINE_ENDS) + "\n" for line in lines)
+    # Half of a surrogate pair has no UTF-8. Its backslash escape is also that of JSON.
+    data = text.encode("utf-8", "backslashreplace")
+    write_atomically(Path(path), lambda file: file.write(data))
 
 
 def load_json(path: str | Path) -> Any:

@@ -40,6 +40,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.numerics import ratio
 from aegis_cli.core.pairs import Pair, from_matrix, matrix
 from aegis_cli.core.spectrum import Spectrum
@@ -90,11 +91,21 @@ class TwoSided:
 
 
 def basis(task: Tensor, questions: Tensor) -> Basis:
-    """The generalised eigenbasis of two positive definite matrices [n, n], in float64."""
+    """The generalised eigenbasis of two positive definite matrices [n, n], in float64.
+
+    Raises:
+        AegisError: they are damped by less than rounding, and so are not positive definite.
+    """
     task, questions = task.double(), questions.double()
     # With A + B = L L^T, the eigenvalues of L^-1 A L^-T are the shares of A, from 0 to 1. Those of
     # B^-1 A have no bound, and lose digits where B is nearly singular.
-    root = torch.linalg.cholesky(task + questions)
+    root, failed = torch.linalg.cholesky_ex(task + questions)
+    if failed:
+        raise AegisError(
+            f"second moments of {len(task)} directions with less damping than rounding",
+            "enough for a Cholesky factor of both together",
+            "merge with --damping 1e-6, or merge.damping: 1e-6 of a recipe, or more",
+        )
     half = torch.linalg.solve_triangular(root, task, upper=False)  # L^-1 A
     whitened = torch.linalg.solve_triangular(root, half.T, upper=False)  # L^-1 A L^-T
     # eigh reads one triangle only; the mean of both has less of the solver's rounding.

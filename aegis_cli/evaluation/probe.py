@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 from collections.abc import Sequence
@@ -160,8 +159,9 @@ def run(
     warn_of_little_knowledge(report, known, ask, "probe", on_event)
     warn_of_few_questions(report.questions, report.drop_interval, max_drop, "probe", on_event)
     if predictions is not None and ranks.first:
-        lines = [json.dumps(prediction(graded, i)) + "\n" for i, graded in enumerate(after)]
-        files.write_text(predictions, "".join(lines))
+        files.save_json_lines(
+            predictions, (prediction(graded, i) for i, graded in enumerate(after))
+        )
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
         name = f"probe-{source.name}"

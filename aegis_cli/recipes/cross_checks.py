@@ -7,7 +7,16 @@ from collections.abc import Iterator, Sequence
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.data.vqa.gate import MEAN
 from aegis_cli.recipes.keys import changed
-from aegis_cli.recipes.policy import CONSTANT, MERGE_NEEDS, NEEDS, SUITE, TASKS, Recipe, Train
+from aegis_cli.recipes.policy import (
+    CONSTANT,
+    MERGE_NEEDS,
+    MERGE_UNREAD,
+    NEEDS,
+    SUITE,
+    TASKS,
+    Recipe,
+    Train,
+)
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
@@ -75,12 +84,7 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     yield from _train_checks(recipe.train)
     yield from _extension_checks(recipe)
     yield from _source_checks(recipe)
-    if recipe.kfac.step == "gradient" and recipe.kfac.growth > 0:
-        found = f"kfac.growth: {recipe.kfac.growth:g} with kfac.step: gradient"
-        yield Problem(found, "kfac.step: proximal, whose weight can grow", "delete kfac.growth")
-    if recipe.train.schedule == CONSTANT and recipe.kfac.growth > 0:
-        found = f"kfac.growth: {recipe.kfac.growth:g} with train.schedule: {CONSTANT}"
-        yield Problem(found, "learning rates that fall, as it grows", "delete kfac.growth")
+    yield from _method_checks(recipe)
     if recipe.probe.gate != MEAN and recipe.probe.max_drop is None:
         found = f"probe.gate: {recipe.probe.gate} without probe.max_drop"
         yield Problem(found, "a limit that the drop is held to", "set probe.max_drop")
@@ -91,6 +95,22 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
             "a suite task, whose episodes have a return",
             "delete demos.drop_below: failures are dropped",
         )
+
+
+def _method_checks(recipe: Recipe) -> Iterator[Problem]:
+    """Whether a method's options have what they belong to."""
+    kfac, train = recipe.kfac, recipe.train
+    for name in ("growth", "every"):
+        if kfac.step == "gradient" and name in changed(kfac):
+            found = f"kfac.{name}: {getattr(kfac, name):g} with kfac.step: gradient"
+            yield Problem(found, "kfac.step: proximal, which it belongs to", f"delete kfac.{name}")
+    fix = "delete kfac.growth"
+    if train.schedule == CONSTANT and kfac.growth > 0:
+        found = f"kfac.growth: {kfac.growth:g} with train.schedule: {CONSTANT}"
+        yield Problem(found, "learning rates that fall, as it grows", fix)
+    elif train.final_lr_share == 1 and kfac.growth > 0:
+        found = f"kfac.growth: {kfac.growth:g} with train.final_lr_share: 1"
+        yield Problem(found, "learning rates that fall, as it grows", fix)
 
 
 def _train_checks(train: Train) -> Iterator[Problem]:
@@ -196,6 +216,10 @@ def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             found = f"merge.{name}: {getattr(merge, name)} without merge.method"
             yield Problem(found, "a method that merges", f"set merge.method, or delete {name}")
         return
+    for name in MERGE_UNREAD.get(merge.method, ()):
+        if name in changed(merge):
+            found = f"merge.{name}: {getattr(merge, name)} with merge.method: {merge.method}"
+            yield Problem(found, "a method that reads it", f"delete merge.{name}")
     if merge.method == "linear" and merge.strength > 1:
         found = f"merge.strength: {merge.strength:g} with merge.method: linear"
         yield Problem(found, "the share of the way back, from 0 to 1", "set merge.strength: 0.4")

@@ -79,6 +79,8 @@ NEEDS = {
 }
 # merge -> the part of an anchor that it reads
 MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
+# what a merge leaves unread
+MERGE_UNREAD = {"linear": ("damping", "frames"), "kfac-shrink": ("frames",)}
 # what the names of dm_control's suite tasks and of MetaWorld's begin with; which there are, the
 # stages know
 SUITE, METAWORLD = "suite/", "metaworld/"

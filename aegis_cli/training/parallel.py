@@ -25,9 +25,9 @@ from aegis_cli.common.ranks import is_sharded as is_cut
 from aegis_cli.methods.backward import Groups
 from aegis_cli.methods.base import Method
 from aegis_cli.methods.lora import LowRankLinear
+from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
-from aegis_cli.models.structure import outermost_lists
 from aegis_cli.recipes import Recipe, Train
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def _blocks(backbone: Backbone) -> list[nn.Module]:
     With what lies outside the blocks it is gathered by what `encode` returns.
     """
     last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
-    blocks = [block for blocks in outermost_lists(backbone) for block in blocks]
+    blocks = [block for blocks in structure.outermost_lists(backbone) for block in blocks]
     return [block for block in blocks if not any(id(p) in last for p in block.parameters())]
 
 
@@ -195,6 +195,24 @@ def is_sharded(policy: Policy) -> bool:
     # The class cannot occur where nobody has imported its module, which takes long.
     fsdp = sys.modules.get("torch.distributed.fsdp")
     return fsdp is not None and isinstance(policy.backbone, fsdp.FSDPModule)
+
+
+@torch.no_grad()
+def share_averages(backbone: Backbone, ranks: Ranks) -> None:
+    """Make what modules such as BatchNorm average of frames the mean over the processes.
+
+    Each process's modules read its own frames alone. Training passes do not read the averages, and
+    they are linear in what was read. So it is enough to do this before somebody does read them, and
+    to do it more often leads to the same.
+    """
+    averaging = structure.averaging(backbone).values()
+    # What is frozen is the same everywhere, and stays so to the last bit.
+    following = [module for module in averaging if module.training]
+    buffers = [b for module in following for b in module.buffers(recurse=False)]
+    averages = [b for b in buffers if b.is_floating_point()]  # not the number of batches
+    ranks.add_up(averages)
+    for average in averages:
+        average /= ranks.count
 
 
 @torch.no_grad()

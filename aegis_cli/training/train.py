@@ -52,6 +52,7 @@ from aegis_cli.training import (
     inputs,
     loading,
     longer,
+    parallel,
     step,
     track,
     validation_vqa,
@@ -476,6 +477,8 @@ def _take_step(
     with _good_steps_saved(run):
         # Neither a checkpoint nor a validation may see an update that is still to be constrained.
         update(run, index, batch, window, settle=due.checkpoint or due.validation)
+        if due.validation:
+            parallel.share_averages(run.policy.backbone, run.ranks)
         if due.line:
             read_figures(run, window)
     window.data_s += fetched - started
@@ -612,6 +615,7 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
             f"{kept}; {LOWER}, or another value of the method's options",
             good,
         )
+    parallel.share_averages(run.policy.backbone, run.ranks)
     run.save_checkpoint(finished, going_on)
 
 

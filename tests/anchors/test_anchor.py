@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -178,6 +179,29 @@ def test_a_part_alone(tiny_folder: Path, tmp_path: Path, part: str) -> None:
     assert all(n is not None and n > 0 for n in of_moments) == (part == "moments")
     assert part == "moments" or of_moments == (None, None, None)
     assert (report.entropy is None) == (part != "curvature")
+
+
+@pytest.mark.parametrize(
+    ("own", "parts", "warned"),
+    [
+        ({"temperature": 4.0}, ("moments", "inputs"), True),
+        ({"temperature": 4.0}, ("curvature",), False),
+        ({"tokens": 0.5}, ("curvature",), True),
+        ({"energy": 0.9}, ("moments",), True),
+        ({"energy": 0.9}, ("curvature",), False),
+        ({"memory": 9}, ("inputs",), False),
+        ({"fisher_samples": 9}, ("inputs",), True),
+    ],
+)
+def test_a_setting_of_a_part_that_is_not_measured_is_warned_of(
+    own: dict[str, Any], parts: tuple[str, ...], warned: bool
+) -> None:
+    seen: list[Event] = []
+    measure._warn_of_unread(Settings(parts=parts, **own), seen.append)
+    (name,) = own
+    said = [event.text for event in seen if isinstance(event, Warned)]
+    assert len(said) == warned
+    assert all(f"anchor.{name}: {own[name]:g} changes nothing without" in text for text in said)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from samples.vqa_files import write_jsonl
 from aegis_cli.cli import advice
 from aegis_cli.common import artifacts
 from aegis_cli.core import moment_sums
-from aegis_cli.recipes import Anchor, Cotrain, Nullspace, Probe, StudyRecipe, shipped
+from aegis_cli.recipes import Anchor, Cotrain, Insulate, Nullspace, Probe, StudyRecipe, shipped
 from aegis_cli.recipes.studies import PolicyVariant
 from aegis_cli.recipes.study_cells import load
 
@@ -107,6 +107,9 @@ def test_a_threshold_that_another_replaces_is_warned_of(said: Said) -> None:
         ("train.backbone_lr=1e-3", ("stop-gradient",), True),
         ("train.backbone_lr=1e-3", ("stop-gradient", "naive"), False),
         ("train.expert_lr=1e-3", ("stop-gradient",), False),
+        ("train.backbone_until=0.5", ("stop-gradient",), True),
+        ("train.optimizer=sgd", ("stop-gradient",), True),
+        ("train.optimizer=sgd", ("naive",), False),
         ("kfac.weight=1", ("naive", "nullspace"), True),
         ("kfac.weight=1", ("naive", "kfac"), False),
         ("moe_adapters.rank=2", ("moe-adapters",), False),
@@ -119,6 +122,26 @@ def test_a_key_that_no_method_reads_is_warned_of_where_it_is_given(
     text = said()
     assert ("changes nothing: " + " and ".join(methods) in text) == warned
     assert bool(text) == warned
+
+
+def test_what_shares_a_training_among_processes_is_warned_of_in_one(
+    said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for processes, warned in ((1, True), (2, False)):
+        monkeypatch.setenv("WORLD_SIZE", str(processes))
+        advice.of_settings(recipe("embedded"), ["train.parallel=fsdp"])
+        assert ("train.parallel changes nothing in one process" in said()) == warned
+
+
+def test_questions_that_nothing_is_trained_on_are_warned_of(said: Said) -> None:
+    unread = replace(recipe("embedded"), insulate=Insulate(questions=9, batch_size=2))
+    advice.of_settings(unread, methods=("insulate",))
+    text = said()
+    assert "insulate.questions: 9 changes nothing" in text and "questions and batch_size" in text
+    advice.of_settings(unread, methods=("naive",))
+    weighed = replace(unread.insulate, vqa_weight=0.1)
+    advice.of_settings(replace(unread, insulate=weighed), methods=("insulate",))
+    assert said() == ""
 
 
 def test_a_training_tells_of_settings_and_goes_on(

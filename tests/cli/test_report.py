@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,11 @@ from samples.command import refused
 from samples.reports import HOSTILE, METHODS, open_loop, probe, rollout, write_job
 from samples.studies import found
 
+from aegis_cli.cli.page import pages
+from aegis_cli.cli.page.cursor import At
 from aegis_cli.common import files
 from aegis_cli.evaluation import results
+from aegis_cli.recipes import Train
 from aegis_cli.studies.comparison import POLICY_BAR
 from aegis_cli.studies.metrics import bar
 from aegis_cli.studies.tuning import PolicyPoint
@@ -103,6 +106,25 @@ def test_the_page_tells_what_an_automatic_precision_was(aegis, job: Path) -> Non
     assert "Precisionauto" in reported(aegis, job / "naive")[0].said  # an earlier Aegis did not say
     files.save_json(path, files.load_json(path) | {"precision": "float32"})
     assert "Precisionfloat32 (auto)" in reported(aegis, job / "naive")[0].said
+
+
+@pytest.mark.parametrize(
+    ("settings", "shown"),
+    [
+        ({}, "0.0003 and 0.001 of the expert, up over 100 steps, down to 10 % along a cosine"),
+        (
+            {"warmup": 0, "schedule": "linear", "final_lr_share": 0.0},
+            "0.0003 and 0.001 of the expert, down to 0 % along a line",
+        ),
+        (
+            {"schedule": "constant"},
+            "0.0003 and 0.001 of the expert, up over 100 steps, then constant",
+        ),
+    ],
+)
+def test_the_page_tells_how_learning_rates_go_on(settings: dict[str, Any], shown: str) -> None:
+    train = Train(backbone_lr=3e-4, expert_lr=1e-3, **settings)
+    assert pages._rates(At(asdict(train))) == shown
 
 
 def test_open_loop_errors_are_on_the_page_with_what_they_are_of(aegis, job: Path) -> None:

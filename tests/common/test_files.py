@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import json
 import os
 import shlex
 import signal
@@ -25,6 +26,15 @@ def test_json_round_trip_is_canonical(tmp_path: Path) -> None:
     files.save_json(tmp_path / "b.json", {"a": {"x": "é", "y": 0.1}, "b": (1, None)})
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert files.load_json(tmp_path / "a.json") == {"a": {"x": "é", "y": 0.1}, "b": [1, None]}
+
+
+def test_json_lines_are_plain_text_and_each_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "said.jsonl"
+    odd = "\x85 \u2028 \u2029 \x1c \n \ud83d end"  # ends of lines, and half of a pair
+    files.save_json_lines(path, [{"said": "größer: 苹果 😀"}, {"said": odd}])
+    text = path.read_text(encoding="utf-8")
+    assert "größer: 苹果 😀" in text
+    assert [json.loads(line)["said"] for line in text.splitlines()] == ["größer: 苹果 😀", odd]
 
 
 def test_nan_never_reaches_a_file(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.merging import TwoSided, basis, damped
 from aegis_cli.core.pairs import from_matrix, matrix
 from aegis_cli.core.spectrum import decompose
@@ -61,6 +62,16 @@ def test_both_matrices_are_diagonal_in_the_basis(seed: int) -> None:
     torch.testing.assert_close(t.T @ questions @ t, torch.diag(1 - found.share), rtol=0, atol=1e-9)
     torch.testing.assert_close(t @ found.inverse, one, rtol=0, atol=1e-8)
     assert (found.share >= 0).all() and (found.share <= 1).all()
+
+
+def test_moments_that_are_damped_by_less_than_rounding_are_refused() -> None:
+    few = draw(1, 3, 60)  # rows of 60 directions; most are read by none
+    spectrum = decompose(few.T @ few)
+    for damping in (1e-2, 1e-9):
+        assert basis(damped(spectrum, damping), damped(spectrum, damping)).share.isfinite().all()
+    with pytest.raises(AegisError, match="less damping than rounding") as caught:
+        basis(damped(spectrum, 1e-18), damped(spectrum, 1e-18))
+    assert "--damping 1e-6" in caught.value.fix
 
 
 # --- the minimum ----------------------------------------------------------------------------------

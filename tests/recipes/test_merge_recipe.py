@@ -39,6 +39,8 @@ def test_each_method_is_accepted_with_the_anchors_part_that_it_reads(method: str
         ({"strength": 3.0}, "without merge.method"),
         ({"damping": 0.5}, "without merge.method"),
         ({"method": "linear", "strength": 2.0}, "from 0 to 1"),
+        ({"method": "linear", "strength": 0.5, "damping": 0.5}, "a method that reads it"),
+        ({"method": "kfac-shrink", "frames": 9}, "a method that reads it"),
         ({"method": "factors", "methods": ("naive", "stop-gradient")}, "stop-gradient"),
     ],
 )

@@ -551,6 +551,27 @@ def test_a_constant_schedule_takes_the_share_that_says_the_same(tmp_path):
     assert load(write(tmp_path, "name: x"), settings).train.schedule == "constant"
 
 
+@pytest.mark.parametrize(
+    ("without", "settings", "found"),
+    [
+        (
+            ["train.final_lr_share=0.5", "kfac.growth=1"],
+            ["train.final_lr_share=1"],
+            "kfac.growth: 1 with train.final_lr_share: 1",
+        ),
+        (["kfac.every=2"], ["kfac.step=gradient"], "kfac.every: 2 with kfac.step: gradient"),
+        (["kfac.growth=1"], ["kfac.step=gradient"], "kfac.growth: 1 with kfac.step: gradient"),
+    ],
+)
+def test_an_option_of_a_method_that_another_takes_all_effect_from_is_refused(
+    without, settings, found, tmp_path
+):
+    load(write(tmp_path, "name: x"), without)
+    told = refusal(tmp_path, "name: x", *without, *settings)
+    assert told.found.startswith(found), told.found
+    load(write(tmp_path, "name: x"), settings)  # alone each of them is fine
+
+
 def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
     found = refusal(tmp_path, "name: x\ntasks: [reach]", "probe.gate=upper", kind=RobotStreamRecipe)
     assert "probe.gate: upper with a stream" in found.found and found.fix == "delete probe.gate"

@@ -14,6 +14,7 @@ from typing import Protocol
 
 import pytest
 import torch
+from torch import nn
 
 from aegis_cli.anchors import measure
 from aegis_cli.cli.app import app
@@ -21,9 +22,10 @@ from aegis_cli.common import files, launch, leading, ranks
 from aegis_cli.common.errors import AegisError, Diverged, PeerLost
 from aegis_cli.common.events import Event, OnEvent, Progress, ignore
 from aegis_cli.evaluation import probe
+from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor, Recipe
 from aegis_cli.studies import pipeline
-from aegis_cli.training import dry_run, train
+from aegis_cli.training import dry_run, loading, train
 from samples import processes
 
 
@@ -69,6 +71,25 @@ class Job:
             resume=self.resume,
             on_event=die,
         )
+
+
+@dataclass(frozen=True)
+class Averaging(Job):
+    """A training of a backbone that averages the pixels which it reads."""
+
+    def run(self) -> None:
+        """Train here, alone or with the processes that the environment speaks of."""
+        load = loading.backbones.load
+
+        def averaging(name: str) -> Backbone:
+            backbone = load(name)
+            backbone.stem.norm = nn.BatchNorm2d(3)
+            backbone.stem.register_forward_pre_hook(lambda stem, given: stem.norm(*given))
+            return backbone
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(loading.backbones, "load", averaging)
+            super().run()
 
 
 @dataclass(frozen=True)

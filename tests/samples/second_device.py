@@ -27,6 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils import backend_registration as registration
+from torch.utils._device import _device_constructors
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 NAME = "stand_in"
@@ -279,6 +280,9 @@ def in_reach(hugging_face: bool = False) -> Iterator[None]:
     torch.__future__.set_swap_module_params_on_conversion(True)  # so that a parameter stays itself
     # Without a view of its own, a tensor of inference mode cannot be of a class of one's own.
     torch.inference_mode = torch.no_grad  # type: ignore[misc,assignment]
+    # PyTorch lists once what makes tensors, for blocks of `torch.device`. With the replacements in
+    # that list, transformers would not see that it lays out a model on the device `meta`.
+    _device_constructors()
     makers = torch.tensor, torch.as_tensor
     torch.tensor, torch.as_tensor = map(_moved_after, makers)
     _let_threads_reach()

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from concurrent import futures
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from aegis_cli import RealTime, load_policy
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core.continuation import Continued
 from aegis_cli.deploy import DeployedPolicy, Seen
+from aegis_cli.serving import real_time
 
 TEXT, OTHER = "go to the red target", "go to the blue target"
 CHUNK = 4
@@ -113,6 +115,24 @@ def test_the_longest_of_the_last_delays_is_expected(planned: Planned) -> None:
             running.select_action(picture, TEXT, at(step))
         assert running.delay == 1 and [c and c.delay for _, c in planned.asked] == [None, 1, 1]
         running.select_action(picture, TEXT, at(6))  # two steps have passed since step 4
+        planned.may_end.release(10)
+
+
+def test_a_slow_first_prediction_is_expected_once_and_shifts_no_action(
+    planned: Planned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a GPU's, which prepares in it. The robot stands still meanwhile, so nothing is skipped."""
+    picture, times = images(1)[0].numpy(), iter([0.0, 0.65])
+    monkeypatch.setattr(real_time, "time", SimpleNamespace(perf_counter=times.__next__))
+    planned.fps = 10
+    with RealTime(planned, guided=True) as running:
+        for step in range(4):
+            if step == 3:
+                finished(running)
+            assert running.select_action(picture, TEXT, at(step)).tolist() == [step, step]
+            assert running.delay == (7 if step < 3 else 1)  # 6.5 steps, and then what it took
+        # Held to all that is left of the chunk, and to no more.
+        assert [c and (c.delay, c.actions.shape[1]) for _, c in planned.asked] == [None, (2, 2)]
         planned.may_end.release(10)
 
 

@@ -70,8 +70,7 @@ def recipe(backbone: Path) -> Recipe:
 def commands(backbone: Path, demos: Path, methods: Sequence[str]) -> dict[str, list[str]]:
     """From the anchor to what is measured of a policy and of a merged one."""
     given = ["--demos", str(demos), "--anchor", ANCHOR]
-    asked = ["--samples", "6", "--batch-size", "3", "--parts", PARTS]
-    found = {"anchor": ["anchor", "--backbone", str(backbone), *asked, "--out", ANCHOR]}
+    found = {"anchor": measuring(backbone, PARTS, ANCHOR)}
     for method in methods:
         found[method] = ["train", RECIPE, "--method", method, *given, "--out", method]
     asked = ["--baseline", str(backbone), "--questions", "14"]
@@ -80,6 +79,11 @@ def commands(backbone: Path, demos: Path, methods: Sequence[str]) -> dict[str, l
     found["merge"] = ["merge", "naive", *given, "--strength", "1", "--frames", "16"]
     found["merge"] += ["--out", "merged"]
     return {name: [*arguments, "--json"] for name, arguments in found.items()}
+
+
+def measuring(backbone: Path, parts: str, out: str) -> list[str]:
+    asked = ["--samples", "6", "--batch-size", "3", "--parts", parts, "--out", out]
+    return ["anchor", "--backbone", str(backbone), *asked]
 
 
 def run(folder: Path, jobs: dict[str, list[str]], device: str, kind: str) -> Run:
@@ -125,11 +129,18 @@ def both(
     @cache
     def on(device: str, kind: str) -> Run:
         backbone, methods = tiny_folder, sorted(METHODS)
+        earlier: dict[str, list[str]] = {}
         if kind == "hugging_face":
             backbone, methods = hf_folder("smolvlm"), list(OF_HF)
+            # Another backbone, which was there before, leaves no trace.
+            earlier["earlier"] = [
+                *measuring(tiny_folder, "moments", "earlier.safetensors"),
+                "--json",
+            ]
         folder = tmp_path_factory.mktemp(device)
         (folder / RECIPE).write_text(to_yaml(recipe(backbone)))
-        return run(folder, commands(backbone, demos_file, methods), device, kind)
+        jobs = {**earlier, **commands(backbone, demos_file, methods)}
+        return run(folder, jobs, device, kind)
 
     return lambda device, kind: Both(on("cpu", kind), on(device, kind))
 

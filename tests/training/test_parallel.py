@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from samples import processes
-from samples.parallel_runs import Job, Measuring, free_ports, lose_one, run_together
+from samples.parallel_runs import Averaging, Job, Measuring, free_ports, lose_one, run_together
 from samples.training_runs import TIMES, metrics
 from torch import multiprocessing
 
@@ -122,6 +122,9 @@ def shared_runs(
     two["fsdp", "hf", "bf16"] = replace(
         hugging_face, recipe=replace(hugging_face.recipe, train=changed), out=out / "hf-bf16"
     )
+    for way in ("ddp", "fsdp"):
+        job = make("naive", out / f"averaging-{way}", parallel=way)
+        two[way, "averaging"] = Averaging(**vars(replace(job, anchor=None)))
     # The others notice it, and may be the first that are noticed.
     gone = (multiprocessing.ProcessExitedException, multiprocessing.ProcessRaisedException)
     with pytest.raises(gone):
@@ -225,6 +228,20 @@ def test_the_average_of_sharded_weights_is_written_whole(
     alone.run()
     assert_same_training(job.out, alone.out)
     assert_same_policy(job.out, alone.out)
+
+
+@pytest.mark.parametrize("way", ["ddp", "fsdp"])
+def test_batch_normalisations_average_the_frames_of_all_processes(
+    shared_runs: dict[object, Any], tmp_path: Path, way: str
+) -> None:
+    job = shared_runs[2, way, "averaging"]
+    alone = replace(job, out=tmp_path / "alone")
+    alone.run()
+    # Half of a batch each, so that the mean of both averages is that of one process, up to how
+    # PyTorch rounds a sum over so many pixels. What one of the two has averaged is a fifth off.
+    both, one = (artifacts.load(checkpoint.last(j.out) / checkpoint.STATE) for j in (job, alone))
+    mean = "buffer.backbone.stem.norm.running_mean"
+    torch.testing.assert_close(both.tensors[mean], one.tensors[mean], rtol=1e-3, atol=0)
 
 
 def test_two_processes_measure_what_one_measures(

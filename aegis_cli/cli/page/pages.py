@@ -20,6 +20,7 @@ from aegis_cli.cli.render.output import document
 from aegis_cli.common import files
 from aegis_cli.common.version import __version__
 from aegis_cli.inspection import steps_taken
+from aegis_cli.recipes.policy import CONSTANT, COSINE
 
 # The page itself forbids what it never does, to load anything from elsewhere or to run a script: a
 # browser keeps to it whatever a file's metadata may have brought in.
@@ -115,13 +116,27 @@ def _trained(run: At, anchor: str | None) -> Markup:
         *_weights(recipe),
         *([("Anchor", anchor)] if anchor else []),
         ("Steps", f"{_steps(run)}, of {train['batch_size']} frames each"),
-        ("Learning rates", f"{train['backbone_lr']} and {train['expert_lr']} of the expert"),
+        ("Learning rates", _rates(train)),
         ("Precision", _precision(run)),
         ("Seed", str(run["facts"]["seed"])),
     ]
     if "merge" in run["facts"].value:
         shown.append(("Merged afterwards", _merge(run["facts"]["merge"])))
     return pairs(shown)
+
+
+def _rates(train: At) -> str:
+    """The peak learning rates, how they rise to them, and how they go on."""
+    shown = [f"{train['backbone_lr']} and {train['expert_lr']} of the expert"]
+    if train["warmup"].value:
+        shown.append(f"up over {train['warmup']} steps")
+    schedule = train["schedule"].value
+    if schedule == CONSTANT:
+        shown.append("then constant")
+    else:
+        left = f"{100 * train['final_lr_share'].value:g} %"
+        shown.append(f"down to {left} along a {'cosine' if schedule == COSINE else 'line'}")
+    return ", ".join(shown)
 
 
 def _precision(run: At) -> str:
