@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, TypeVar
 
 import pytest
 from torch.multiprocessing import start_processes
@@ -21,6 +22,20 @@ IMPORTED = (
     "aegis_cli.cli.app",
     "aegis_cli.studies.pipeline",
 )
+
+Found = TypeVar("Found")
+
+
+def alone(function: Callable[..., Found], *args: Any) -> Found:
+    """What a function returns in a process of its own, which may do to torch what it likes.
+
+    Raises:
+        Exception: what the function raises.
+    """
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(1, context) as process:
+        return process.submit(function, *args).result()
 
 
 def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
