@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 
 import pytest
@@ -35,7 +37,7 @@ def alone(function: Callable[..., Found], *args: Any) -> Found:
     multiprocessing.set_forkserver_preload(list(IMPORTED))
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(1, context) as process:
-        return process.submit(function, *args).result()
+        return process.submit(_begun, function, *args).result()
 
 
 def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
@@ -46,7 +48,13 @@ def start(function: Callable[..., object], args: tuple[Any, ...], count: int) ->
             ended.
     """
     multiprocessing.set_forkserver_preload(list(IMPORTED))
-    start_processes(function, args, nprocs=count, start_method="forkserver")
+    start_processes(partial(_begun, function), args, nprocs=count, start_method="forkserver")
+
+
+def _begun(function: Callable[..., Found], *args: Any) -> Found:
+    """Call the function; no collection of garbage looks through what was there before it."""
+    gc.freeze()
+    return function(*args)
 
 
 @pytest.fixture
