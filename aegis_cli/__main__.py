@@ -3,13 +3,14 @@
 What starts modules (torchrun, debuggers) uses the latter too.
 """
 
-from aegis_cli.common import interrupts
+from aegis_cli.common import garbage, interrupts
 
 
 def main() -> None:
     """Listen to Ctrl-C, then load the commands, which takes a moment, and run one."""
     interrupts.leave_at_ctrl_c()
-    from aegis_cli.cli import app
+    with garbage.left_out():
+        from aegis_cli.cli import app
 
     app.main()
 

@@ -24,19 +24,20 @@ os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
-import typer
 from hypothesis import settings
 from samples import fast
+from samples.command import command
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
-from aegis_cli.cli.app import app
 from aegis_cli.data import record
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 TESTS = Path(__file__).parent
+# How many modules were there when garbage was last collected, and how many more are worth another.
+MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 
 # An example may take longer on a machine that does something else, too.
 settings.register_profile("unhurried", deadline=None)
@@ -85,13 +86,27 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_finish() -> None:
-    """Leave what the modules and the tests consist of out of each later collection of garbage.
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """What the modules and the tests consist of stays to the end."""
+    keep_what_is_there(session)
 
-    They are millions of objects. A dry run, which looks at all that are alive, took seconds.
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """So is what a file leaves, and what has just been imported for the first time."""
+    of_another_file = nextitem is None or nextitem.path != item.path
+    if of_another_file or len(sys.modules) > item.session.stash[MODULES] + MANY_MODULES:
+        keep_what_is_there(item.session)
+
+
+def keep_what_is_there(session: pytest.Session) -> None:
+    """Leave the objects that are alive out of each later collection of garbage.
+
+    They are millions. A dry run, which looks at all that are alive, took seconds.
     """
     gc.collect()
     gc.freeze()
+    session.stash[MODULES] = len(sys.modules)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -171,12 +186,6 @@ def anchor_file(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> 
         path,
     )
     return path
-
-
-@cache
-def command() -> Callable[..., None]:
-    """What `app` makes of its commands whenever it is called, which takes a moment; made once."""
-    return typer.main.get_command(app)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ OpenGL.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 from rich.console import RenderableType
 
 from aegis_cli.cli import render
-from aegis_cli.common import launch
+from aegis_cli.common import garbage, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.recipes import (
@@ -43,7 +44,11 @@ class Stage(NamedTuple):
     @property
     def module(self) -> Any:
         """The stage itself; it is imported here."""
-        return importlib.import_module(f"aegis_cli.{self.name}")
+        name = f"aegis_cli.{self.name}"
+        if name in sys.modules:
+            return sys.modules[name]
+        with garbage.left_out():
+            return importlib.import_module(name)
 
     def run(
         self,

@@ -6,6 +6,7 @@ What takes longest is imported here: torch does so itself where the first optimi
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import shutil
 from pathlib import Path
@@ -40,6 +41,9 @@ def up(root: Path) -> None:
         for args in commands:
             _run(command, args)
         shutil.rmtree("warm")
+    # No collection of garbage in a child looks through all this, and copies its memory.
+    gc.collect()
+    gc.freeze()
 
 
 def _run(command: object, args: tuple[str, ...]) -> None:

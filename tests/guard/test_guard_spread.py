@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from samples.command import ROOT, finding
+from samples import processes, spread_model
 from samples.guard import LAYERS, make, measured
 from samples.second_device import POSSIBLE
 from samples.spread_model import DONE, PLACES
@@ -26,14 +23,7 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]
     if not POSSIBLE:
         pytest.skip("this torch takes no device of others' making")
     folder = tmp_path_factory.mktemp("spread")
-    done = subprocess.run(
-        [sys.executable, "-m", "samples.spread_model", str(folder)],
-        env={**finding(ROOT, ROOT / "tests"), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout)
+    return processes.alone(spread_model.apart, folder)
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -5,9 +5,22 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
+
+import typer
+
+from aegis_cli.cli.app import app
 
 ROOT = Path(__file__).parent.parent.parent
+
+
+@cache
+def command() -> Callable[..., Any]:
+    """What `app` makes of its commands whenever it is called, which takes a moment; made once."""
+    return typer.main.get_command(app)
 
 
 def finding(*folders: Path) -> dict[str, str]:

@@ -15,8 +15,12 @@ _SOURCE = Path(aegis_cli.__file__).parent
 
 
 def copied(folder: Path) -> Path:
-    """The package in `folder`, without the checkpoints that ship."""
-    ignored = shutil.ignore_patterns("__pycache__", "*.safetensors")
+    """The package in `folder`, without the checkpoints that ship.
+
+    What is compiled of it holds for the copy, too, whose files are as old; one that another process
+    is only now writing may be gone before it is copied.
+    """
+    ignored = shutil.ignore_patterns("*.safetensors", "*.pyc.*")
     return shutil.copytree(_SOURCE, folder / "aegis_cli", ignore=ignored)
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
 
 import pytest
 from torch.multiprocessing import start_processes
@@ -22,6 +25,20 @@ IMPORTED = (
     "aegis_cli.studies.pipeline",
 )
 
+Found = TypeVar("Found")
+
+
+def alone(function: Callable[..., Found], *args: Any) -> Found:
+    """What a function returns in a process of its own, which may do to torch what it likes.
+
+    Raises:
+        Exception: what the function raises.
+    """
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(1, context) as process:
+        return process.submit(_begun, function, *args).result()
+
 
 def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
     """Let `count` processes call a function with their number and `args`; wait for their end.
@@ -31,7 +48,13 @@ def start(function: Callable[..., object], args: tuple[Any, ...], count: int) ->
             ended.
     """
     multiprocessing.set_forkserver_preload(list(IMPORTED))
-    start_processes(function, args, nprocs=count, start_method="forkserver")
+    start_processes(partial(_begun, function), args, nprocs=count, start_method="forkserver")
+
+
+def _begun(function: Callable[..., Found], *args: Any) -> Found:
+    """Call the function; no collection of garbage looks through what was there before it."""
+    gc.freeze()
+    return function(*args)
 
 
 @pytest.fixture

@@ -2,13 +2,7 @@
 
 PyTorch offers one name for devices of others' making. Tensors of that device are wrappers here, and
 what they hold is computed by the CPU. As with a GPU, no operation takes tensors of both, and a
-number of it is read by waiting. A process that has such a device keeps it:
-
-    python -m samples.second_device COMMANDS.json stand_in embedded
-
-runs the commands of the file, each a list of `aegis`'s arguments, and prints as JSON what each said
-and how often each place in Aegis waited for the device within a step of training. With `cuda` there
-is no such device. Models of transformers need `hugging_face` in the place of `embedded`.
+number of it is read by waiting. A process that has such a device keeps it.
 """
 
 from __future__ import annotations
@@ -16,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import sys
 import threading
 import traceback
@@ -29,6 +24,9 @@ from torch import Tensor
 from torch.utils import backend_registration as registration
 from torch.utils._device import _device_constructors
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+from aegis_cli.common import devices
+from samples.command import command
 
 NAME = "stand_in"
 POSSIBLE = hasattr(registration, "_setup_privateuseone_for_python_backend")
@@ -274,12 +272,10 @@ def in_reach(hugging_face: bool = False) -> Iterator[None]:
     Args:
         hugging_face: whether models of transformers are loaded, which takes long to import.
     """
-    from aegis_cli.common import devices
-
     registration._setup_privateuseone_for_python_backend(NAME, _Module())
     torch.__future__.set_swap_module_params_on_conversion(True)  # so that a parameter stays itself
     # Without a view of its own, a tensor of inference mode cannot be of a class of one's own.
-    torch.inference_mode = torch.no_grad  # type: ignore[misc,assignment]
+    torch._C._InferenceMode = _without_gradients  # type: ignore[misc,assignment]
     # PyTorch lists once what makes tensors, for blocks of `torch.device`. With the replacements in
     # that list, transformers would not see that it lays out a model on the device `meta`.
     _device_constructors()
@@ -295,6 +291,11 @@ def in_reach(hugging_face: bool = False) -> Iterator[None]:
             module.send = sent  # type: ignore[attr-defined]
     with InReach():
         yield
+
+
+def _without_gradients(mode: bool) -> contextlib.AbstractContextManager[None]:
+    """What stands for inference mode, or for its end within it."""
+    return torch.set_grad_enabled(not mode)
 
 
 def _moved_after(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -351,27 +352,33 @@ def _load_outside(makers: Sequence[Callable[..., Tensor]]) -> None:
 
 
 def said(commands: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
-    """What each of the commands, run one after the other, said, and where its steps waited."""
-    from aegis_cli.cli.app import app
+    """What each of the commands, run one after the other, said, and where its steps waited.
 
+    Args:
+        commands: each a list of `aegis`'s arguments.
+    """
     found = []
     for arguments in commands:
         waits.clear()
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
-            code = app(list(arguments), standalone_mode=False)
-        if code:  # what went wrong is said on stderr
-            sys.exit(code)
+            code = command()(list(arguments), standalone_mode=False)
+        assert not code, arguments
         found.append({"said": json.loads(printed.getvalue()), "waits": dict(waits)})
     return found
 
 
-def main(commands: Path, device: str, kind: str) -> None:
-    """Run the commands of a file on a device, and print as JSON what `said` returns."""
+def said_there(
+    folder: Path, commands: Sequence[Sequence[str]], device: str, kind: str
+) -> list[dict[str, Any]]:
+    """What `said` finds on a device, by commands in a folder.
+
+    Args:
+        device: the stand-in, which this process then keeps, or `cuda`.
+        kind: `hugging_face` where models of transformers are loaded.
+    """
+    os.environ[devices.VARIABLE] = "cuda" if device == "cuda" else "cpu"
+    torch.set_num_threads(1)
+    os.chdir(folder)
     with in_reach(kind == "hugging_face") if device == NAME else contextlib.nullcontext():
-        found = said(json.loads(commands.read_text(encoding="utf-8")))
-    print(json.dumps(found))
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:])
+        return said(commands)

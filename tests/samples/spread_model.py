@@ -1,15 +1,7 @@
-"""A model whose layers lie on two devices, as `device_map="auto"` lays them; one is a stand-in.
-
-    python -m samples.spread_model FOLDER
-
-prints as JSON, by what was done, how far the weights, or the anchor, are from those of the same
-model on the CPU alone; or what went wrong.
-"""
+"""A model whose layers lie on two devices, as `device_map="auto"` lays them; one is a stand-in."""
 
 from __future__ import annotations
 
-import json
-import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -110,8 +102,13 @@ def _apart(made: Callable[[str | None], Tensor], whole: Tensor, place: str) -> f
         return traceback.format_exc()[-2000:]
 
 
-def main(folder: Path) -> None:
-    """Do everything, with each layer in turn on the other device."""
+def apart(folder: Path) -> dict[str, dict[str, float | str]]:
+    """How far the weights, or the anchor, are from those of the same model on the CPU alone.
+
+    They are by the layer that lies on the other device, which this process then keeps, and by what
+    was done. A text in the place of a number says what went wrong.
+    """
+    torch.set_num_threads(1)
     found: dict[str, dict[str, float | str]] = {}
     with second_device.in_reach():
         anchors = anchors_by_method(folder)
@@ -124,8 +121,4 @@ def main(folder: Path) -> None:
         for place in PLACES:
             found[place] = {name: _apart(do, on_one[name], place) for name, do in made.items()}
         found["moved"] = {"said": moved(anchors)}
-    print(json.dumps(found))
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    return found

@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,17 +16,15 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file
-from samples.command import ROOT, finding
-from samples.second_device import NAME, POSSIBLE, said
+from samples import processes
+from samples.second_device import NAME, POSSIBLE, said, said_there
 from samples.training_runs import SETTINGS, TIMES, metrics
 
-from aegis_cli.common import devices
 from aegis_cli.methods import METHODS
 from aegis_cli.recipes import Cotrain, Expert, Recipe, to_yaml
 
 OTHERS = [NAME] * POSSIBLE + ["cuda"] * torch.cuda.is_available()
 pytestmark = pytest.mark.skipif(not OTHERS, reason="this torch takes no device of others' making")
-TESTS = Path(__file__).parent.parent
 ANCHOR, RECIPE = "anchor.safetensors", "recipe.yaml"
 STEPS = 2
 PARTS = "moments,inputs,curvature,fisher"
@@ -90,31 +85,11 @@ def run(folder: Path, jobs: dict[str, list[str]], device: str, kind: str) -> Run
     if device == "cpu":
         with contextlib.chdir(folder):
             found = said(list(jobs.values()))
-    else:
-        found = said_by_process(folder, list(jobs.values()), device, kind)
+    else:  # in a process of its own, since one that has the stand-in keeps it
+        found = processes.alone(said_there, folder, list(jobs.values()), device, kind)
     each = dict(zip(jobs, found, strict=True))
     told = {name: one["said"] for name, one in each.items()}
     return Run(folder, told, {name: one["waits"] for name, one in each.items()})
-
-
-def said_by_process(
-    folder: Path, jobs: list[list[str]], device: str, kind: str
-) -> list[dict[str, Any]]:
-    """What `said` finds in a process of its own, since one that has the stand-in keeps it."""
-    (folder / "jobs.json").write_text(json.dumps(jobs))
-    done = subprocess.run(
-        [sys.executable, "-m", "samples.second_device", "jobs.json", device, kind],
-        cwd=folder,
-        env={
-            **finding(ROOT, TESTS),
-            "OMP_NUM_THREADS": "1",
-            devices.VARIABLE: "cuda" if device == "cuda" else "cpu",
-        },
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
