@@ -482,7 +482,7 @@ def _load_folder(
 def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, tuple[str, ...]]:
     """Features side by side [N, D] float32, and the names of their D numbers.
 
-    The names are empty where one of the features has none.
+    The names are empty where none of the features has any.
     """
     chosen = listed(features)
     read = [rows.read_vectors(source, name) for name in chosen]

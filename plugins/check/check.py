@@ -1,7 +1,7 @@
 """Checks of both plugins against the LeRobot that is installed; exit 1 if one fails.
 
     python -m venv .venv-lerobot && . .venv-lerobot/bin/activate
-    pip install 'lerobot[smolvla,training,evaluation]==0.6.1' 'mujoco>=3.8,<3.9'
+    pip install 'lerobot[smolvla,training,evaluation]==0.6.1'
     pip install -e . -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
     python plugins/check/check.py
 
@@ -59,10 +59,20 @@ TRAIN = (
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--keep", type=Path, help="folder to work in, which is kept")
+    options.add_argument(
+        "--keep", type=Path, help="folder to work in, which is kept; each check makes its part anew"
+    )
     keep = options.parse_args().keep
-    folder = keep or Path(tempfile.mkdtemp(prefix="aegis-lerobot-"))
-    folder.mkdir(parents=True, exist_ok=True)
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        sys.exit(1 if failures(keep.resolve()) else 0)
+    with tempfile.TemporaryDirectory(prefix="aegis-lerobot-", ignore_cleanup_errors=True) as name:
+        failed = failures(Path(name))
+    sys.exit(1 if failed else 0)
+
+
+def failures(folder: Path) -> int:
+    """Run all checks in the folder, and say of each how it went; how many have failed."""
     os.environ["HF_HOME"] = str(folder / "hf")
     register_third_party_plugins()
     checks: tuple[Callable[[Path], str], ...] = (
@@ -85,12 +95,10 @@ def main() -> None:
         name = check.__name__.replace("_", " ")
         try:
             print(f"ok      {name}: {check(folder)}", flush=True)
-        except (AssertionError, AegisError, subprocess.CalledProcessError) as error:
+        except Exception as error:  # a check that cannot run keeps none of the others from running
             failed += 1
-            print(f"FAILED  {name}: {error}", flush=True)
-    if keep is None:
-        shutil.rmtree(folder, ignore_errors=True)
-    sys.exit(1 if failed else 0)
+            print(f"FAILED  {name}: {type(error).__name__}: {error}", flush=True)
+    return failed
 
 
 # --- the policy -----------------------------------------------------------------------------------
@@ -112,17 +120,18 @@ def discovery(_: Path) -> str:
 def a_run_and_its_export(folder: Path) -> str:
     """A run of 20 steps, its demonstrations as a LeRobot dataset, its export, an anchor."""
     recipe = Path(__file__).parents[2] / "recipes" / "reach.yaml"
-    if not (folder / "anchor.safetensors").exists():
-        record = ("demos", "reach", "--episodes", "8")
-        command("aegis", *record, "--out", folder / "reach.safetensors")
-        command("aegis", *record, "--format", "lerobot", "--out", folder / "dataset")
-        short = ("steps=20", "batch_size=8", "flow_samples=2")
-        settings = [part for value in short for part in ("--set", f"train.{value}")]
-        demos = ("--demos", folder / "reach.safetensors")
-        command("aegis", "train", recipe, *demos, "--out", folder / "run", *settings)
-        command("aegis", "export", folder / "run", "--out", folder / "policy")
-        parts = ("--parts", "inputs,curvature", "--samples", "60")
-        command("aegis", "anchor", *parts, "--out", folder / "anchor.safetensors")
+    for name in ("reach.safetensors", "dataset", "run", "policy", "anchor.safetensors"):
+        remove(folder / name)
+    record = ("demos", "reach", "--episodes", "8")
+    command("aegis", *record, "--out", folder / "reach.safetensors")
+    command("aegis", *record, "--format", "lerobot", "--out", folder / "dataset")
+    short = ("steps=20", "batch_size=8", "flow_samples=2")
+    settings = [part for value in short for part in ("--set", f"train.{value}")]
+    demos = ("--demos", folder / "reach.safetensors")
+    command("aegis", "train", recipe, *demos, "--out", folder / "run", *settings)
+    command("aegis", "export", folder / "run", "--out", folder / "policy")
+    parts = ("--parts", "inputs,curvature", "--samples", "60")
+    command("aegis", "anchor", *parts, "--out", folder / "anchor.safetensors")
     return ", ".join(sorted(path.name for path in (folder / "policy").iterdir()))
 
 
@@ -162,8 +171,7 @@ def actions_of_the_evaluation(folder: Path) -> str:
 
 def the_evaluation_itself(folder: Path) -> str:
     """`lerobot-eval` with two environments at a time, in processes of their own."""
-    out = folder / "eval"
-    shutil.rmtree(out, ignore_errors=True)
+    out = remove(folder / "eval")
     command(
         "lerobot-eval",
         f"--policy.path={folder / 'policy'}",
@@ -195,8 +203,7 @@ def answers(folder: Path) -> str:
 
 def a_missing_tensor(folder: Path) -> str:
     """A file without one tensor is refused, and so is one that another program wrote."""
-    broken = folder / "broken"
-    shutil.rmtree(broken, ignore_errors=True)
+    broken = remove(folder / "broken")
     shutil.copytree(folder / "policy", broken)
     from aegis_cli.common import artifacts
 
@@ -230,10 +237,8 @@ def a_protected_training_and_its_resumption(folder: Path) -> str:
 
 def a_hugging_face_backbone(folder: Path) -> str:
     """A new policy on a small SmolVLM2: trained, saved with its processor, asked and rolled out."""
-    vlm, out = folder / "vlm", folder / "hugging-face"
-    if not vlm.exists():
-        save_vlm(vlm)
-    shutil.rmtree(out, ignore_errors=True)
+    vlm, out = remove(folder / "vlm"), remove(folder / "hugging-face")
+    save_vlm(vlm)
     train(
         folder,
         out,
@@ -254,9 +259,7 @@ def a_hugging_face_backbone(folder: Path) -> str:
 
 
 def resumed(folder: Path, name: str, policy: tuple[str, ...]) -> str:
-    whole, again = folder / name, folder / f"{name}-resumed"
-    for path in (whole, again):
-        shutil.rmtree(path, ignore_errors=True)
+    whole, again = remove(folder / name), remove(folder / f"{name}-resumed")
     half = STEPS // 2
     train(folder, whole, *policy, f"--steps={STEPS}", f"--save_freq={half}")
     shutil.copytree(whole, again, symlinks=True)
@@ -345,17 +348,16 @@ def smolvla_at_strength_0_is_adamw(folder: Path) -> str:
 def smolvla(folder: Path) -> tuple[Path, Path]:
     """A small SmolVLA with the weights of a small SmolVLM2, and that VLM's anchor."""
     start, anchor = folder / "smolvla", folder / "vlm-anchor.safetensors"
-    if not anchor.exists():
-        save_vlm(folder / "vlm")
-        save_smolvla(start, folder / "vlm", folder / "dataset")
-        parts = ("--parts", "inputs,curvature", "--samples", "40", "--energy", "1")
-        command("aegis", "anchor", "--backbone", folder / "vlm", *parts, "--out", anchor)
+    vlm = remove(folder / "vlm")
+    save_vlm(vlm)
+    save_smolvla(remove(start), vlm, folder / "dataset")
+    parts = ("--parts", "inputs,curvature", "--samples", "40", "--energy", "1")
+    command("aegis", "anchor", "--backbone", vlm, *parts, "--out", remove(anchor))
     return start, anchor
 
 
 def train_smolvla(folder: Path, start: Path, name: str, optimizer: tuple[str, ...]) -> Path:
-    out = folder / name
-    shutil.rmtree(out, ignore_errors=True)
+    out = remove(folder / name)
     train(
         folder,
         out,
@@ -416,6 +418,14 @@ def command(program: str, *arguments: str | Path) -> None:
     if done.returncode:
         print(done.stderr[-4000:], file=sys.stderr)
         done.check_returncode()
+
+
+def remove(path: Path) -> Path:
+    """The path itself, where nothing is any more of what an earlier call has left there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    return path
 
 
 def loaded(folder: Path) -> torch.nn.Module:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe, Train
 from aegis_cli.training import checkpoint
+from aegis_cli.training.schedule import rate_factor
 
 SOURCE = Path(__file__).parents[2] / "plugins" / "lerobot_policy_aegis" / "src"
 IMAGE, WRIST = "observation.image", "observation.images.wrist"
@@ -48,6 +50,15 @@ class Registered:
     @classmethod
     def register_subclass(cls, _: str) -> Callable[[type], type]:
         return lambda registered: registered
+
+
+@dataclass
+class Preset:
+    """LeRobot's AdamW, of what the plugin sets."""
+
+    lr: float
+    weight_decay: float
+    grad_clip_norm: float
 
 
 @dataclass
@@ -91,8 +102,8 @@ STAND_IN: dict[str, dict[str, Any]] = {
         "PreTrainedConfig": PreTrainedConfig,
     },
     "lerobot.optim": {
-        "AdamWConfig": Registered,
-        "CosineDecayWithWarmupSchedulerConfig": Registered,
+        "AdamWConfig": Preset,
+        "LRSchedulerConfig": Registered,
         "OptimizerConfig": Registered,
     },
     "lerobot.policies": {"PreTrainedPolicy": PreTrainedPolicy},
@@ -222,6 +233,7 @@ def seen(text: str = TEXT, state: torch.Tensor | None = None, shade: float = 0.0
     return {IMAGE: picture, "observation.state": positions, "task": [text]}
 
 
+NAMED = {"task": None, "normalization": "mean_std", "proprio_names": ["x", "y", "z"]}
 BAD_STATES = [
     (torch.tensor([[0.0, math.nan, 0.0]]), "not finite"),
     (torch.tensor([[0.0, math.inf, 0.0]]), "not finite"),
@@ -243,6 +255,14 @@ def test_a_broken_sensor_is_refused_at_every_call(
             with pytest.raises(AegisError, match=says):
                 act(seen(state=state))
     assert torch.isfinite(begun.select_action(seen())).all()
+
+
+def test_positions_that_are_too_few_are_named(plugin: Any) -> None:
+    model = make_policy()
+    policy = plugin.AegisPolicy(config(plugin, model, IMAGE), model=model, meta=NAMED)
+    with pytest.raises(AegisError) as caught:
+        policy.select_action(seen(state=torch.zeros(1, 2)))
+    assert caught.value.expected == "(1, 3): x, y, z"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -347,6 +367,112 @@ def test_an_ensemble_is_that_of_load_policy(plugin: Any, tmp_path: Path) -> None
     policy.config.temporal_ensemble_coeff = None
     policy._save_pretrained(tmp_path)
     assert "ensemble" not in checkpoint.load_policy(tmp_path)[1]
+
+
+def test_lerobot_trains_by_the_settings_of_aegis_train(plugin: Any) -> None:
+    own, recipe = plugin.AegisConfig(), Recipe(name="reach")
+    train, expert = recipe.train, recipe.expert
+    chunk = (own.chunk_size, own.n_action_steps, own.flow_samples, own.normalization)
+    assert chunk == (train.chunk, recipe.rollout.replan, train.flow_samples, train.normalization)
+    assert (own.expert_width, own.expert_mlp_ratio) == (expert.width, expert.mlp_ratio)
+    assert (own.backbone_lr, own.method) == (train.backbone_lr, train.method)
+    adamw = own.get_optimizer_preset()
+    assert (adamw.lr, adamw.weight_decay) == (train.expert_lr, train.weight_decay)
+    assert adamw.grad_clip_norm == train.clip_norm
+
+
+@pytest.mark.parametrize("steps", [300, 40_000])
+def test_lerobots_learning_rates_are_those_of_aegis_train(steps: int, plugin: Any) -> None:
+    """The rise is as long in a short training as in a long one, and the end is its own."""
+    peaks = [1e-4, 1e-3]
+    groups = [{"params": [nn.Parameter(torch.zeros(1))], "lr": peak} for peak in peaks]
+    optimizer = torch.optim.SGD(groups)
+    schedule = plugin.AegisConfig().get_scheduler_preset().build(optimizer, steps)
+    wanted = Train(steps=steps)
+    for step in range(steps):
+        rates = [group["lr"] for group in optimizer.param_groups]
+        assert rates == pytest.approx([peak * rate_factor(step, wanted) for peak in peaks])
+        optimizer.step()
+        schedule.step()
+
+
+def test_a_training_that_is_shorter_than_the_rise_is_warned_of(
+    plugin: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    scheduler = plugin.AegisConfig(warmup_steps=20).get_scheduler_preset()
+    optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
+    scheduler.build(optimizer, 21)
+    assert not caplog.records
+    scheduler.build(optimizer, 20)
+    assert "rise over 20 steps, and the training has 20" in caplog.text
+
+
+def test_real_time_chunking_of_a_policy_that_averages_is_refused(plugin: Any) -> None:
+    policy = acting(plugin)
+    policy.config.temporal_ensemble_coeff = 0.01
+    with pytest.raises(AegisError, match="0.01 with real-time chunking") as caught:
+        policy.supports_rtc()
+    assert "--policy.temporal_ensemble_coeff=null" in caught.value.fix
+
+
+@pytest.mark.parametrize("method", ["kfac", "nullspace"])
+def test_a_method_that_protects_asks_for_the_policys_anchor(method: str, plugin: Any) -> None:
+    with pytest.raises(AegisError, match=f"{method} without --policy.anchor") as caught:
+        plugin.AegisConfig(method=method).get_optimizer_preset()
+    assert "--policy.anchor=anchor.safetensors" in caught.value.fix
+
+
+def test_a_blank_task_is_warned_of_once(plugin: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """LeRobot gives an empty text where `lerobot-rollout` has no --task."""
+    policy = acting(plugin)
+    for _ in range(5):
+        policy.select_action(seen(""))
+    assert [record.message for record in caplog.records] == [
+        "The task is an empty text, which tells a policy nothing: give --task=TEXT"
+    ]
+    caplog.clear()
+    policy.reset()
+    policy.select_action(seen())
+    assert not caplog.records
+
+
+def dataset(actions: list[str] | None, fps: int = 30, robot: str | None = None) -> Any:
+    """LeRobot's metadata of a dataset, as far as a policy is told of it."""
+    state = {"dtype": "float32", "shape": (3,), "names": {"motors": ["x", "y", "z"]}}
+    action = {"dtype": "float32", "shape": (2,), "names": actions}
+    features = {"observation.state": state, "action": action}
+    return SimpleNamespace(fps=fps, robot_type=robot, features=features)
+
+
+def test_a_new_policy_keeps_what_the_dataset_says_of_the_robot(
+    plugin: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """So that a robot's observation can be told, as with a policy of `aegis train`."""
+    monkeypatch.setattr(plugin, "_new", lambda *_: make_policy())
+    made = config(plugin, make_policy(), IMAGE)
+    told = dataset(["x", "y"], robot="aegis/reach")
+    plugin.AegisPolicy(made, {}, dataset_meta=told)._save_pretrained(tmp_path)
+    meta = checkpoint.load_policy(tmp_path)[1]
+    names = (meta["proprio_names"], meta["action_names"])
+    assert names == (["x", "y", "z"], ["x", "y"])
+    assert (meta["fps"], meta["task"]) == (30.0, "reach")
+    nameless = plugin.AegisPolicy(made, {}, dataset_meta=dataset(None))
+    assert "action_names" not in nameless._meta and nameless._meta["task"] is None
+
+
+def test_a_policy_goes_on_with_its_own_joints_alone(
+    plugin: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    known = {"action_names": ["x", "y"], "fps": 30.0}
+    for same in (["x", "y"], None):
+        plugin._check_recorded(known, plugin._recorded(dataset(same)))
+    assert not caplog.records
+    with pytest.raises(AegisError, match="'x' in another place.*actions y, x"):
+        plugin._check_recorded(known, plugin._recorded(dataset(["y", "x"])))
+    plugin._check_recorded(known, plugin._recorded(dataset(["pan", "tilt"], fps=10)))
+    said = [record.message for record in caplog.records]
+    assert "the actions pan, tilt, and the policy x, y" in said[0]
+    assert "30 frames a second, and the dataset has 10" in said[1]
 
 
 def test_an_ensemble_predicts_at_every_step(plugin: Any) -> None:

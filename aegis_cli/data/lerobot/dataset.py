@@ -121,17 +121,19 @@ class Dataset:
         return found.shape[0]
 
     def names(self, features: Sequence[str]) -> tuple[str, ...]:
-        """What the numbers of features side by side are called; empty where one has no names.
+        """What the numbers of features side by side are called; empty where none has names.
 
+        A feature without names, beside one that has some, gets its own and a number: `joints.0`.
         Where two features use one name, as those of two arms do, all but LeRobot's own features of
         state and action put theirs before it: `left_arm.gripper`.
 
         Raises:
             AegisError: a renaming would give two of them one name.
         """
-        named = [self.info.features[self.own(feature)].components for feature in features]
-        if not all(map(any, named)):  # a feature none of whose numbers has a name
+        told = [self.info.features[self.own(feature)].components for feature in features]
+        if not any(map(any, told)):
             return ()
+        named = [_named(feature, each) for feature, each in zip(features, told, strict=True)]
         where = f"'{self.folder}'"
         own = [renaming.joints(self.rename, components, where) for components in named]
         alone = tuple(itertools.chain(*own))
@@ -139,9 +141,12 @@ class Dataset:
             # Each feature was checked by itself; two of them may have been given one name.
             renaming.check_apart(self.rename, tuple(itertools.chain(*named)), alone, where)
             return alone
-        within = [_within(*pair) for pair in zip(features, own, strict=True)]
+        within = list[str]()
+        for feature, said, components in zip(features, told, own, strict=True):
+            # Numbered ones have their feature's name already.
+            within += _within(feature, components) if any(said) else components
         # A second time: a renaming may speak of `left_arm.gripper`, or of `gripper`.
-        return renaming.joints(self.rename, tuple(itertools.chain(*within)), where)
+        return renaming.joints(self.rename, within, where)
 
     @property
     def all_names(self) -> set[str]:
@@ -151,16 +156,28 @@ class Dataset:
         for name, feature in features.items():
             if name in self.info.cameras:  # whose components are red, green and blue
                 continue
-            found.update(feature.components, _within(name, feature.components))
+            found.update(_named(name, feature.components), _within(name, feature.components))
         return found
+
+
+def _named(feature: str, components: Sequence[str]) -> Sequence[str]:
+    """The names of a feature's numbers; those of one without any are its own name and a number."""
+    if any(components):
+        return components
+    short = _short(feature)
+    return [f"{short}.{number}" for number in range(len(components))]
 
 
 def _within(feature: str, components: Sequence[str]) -> tuple[str, ...]:
     """The names of a feature's numbers with the feature's before them, except of LeRobot's own."""
     if feature in (layout.STATE, layout.ACTION):
         return tuple(components)
-    short = feature.removeprefix("observation.").removeprefix("action.")
+    short = _short(feature)
     return tuple(f"{short}.{name}" if name else name for name in components)
+
+
+def _short(feature: str) -> str:
+    return feature.removeprefix("observation.").removeprefix("action.")
 
 
 def _list(cameras: tuple[str, ...]) -> str:

@@ -143,8 +143,7 @@ class Info:
     @property
     def task(self) -> str | None:
         """The simulated task that `aegis demos` recorded; None for any other dataset."""
-        kind = self.robot_type or ""
-        return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
+        return simulated_task(self.robot_type)
 
 
 @dataclass(frozen=True)
@@ -172,6 +171,12 @@ class EpisodeIndex:
     length: int
     data: Path
     clips: Mapping[str, Clip]
+
+
+def simulated_task(robot_type: str | None) -> str | None:
+    """The simulated task that a dataset's robot type names; None for any other."""
+    kind = robot_type or ""
+    return kind.removeprefix(ROBOT) if kind.startswith(ROBOT) else None
 
 
 def short(camera: str) -> str:

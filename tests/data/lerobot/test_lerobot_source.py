@@ -20,6 +20,7 @@ from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import dataset, source, write
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot.write import Limits, NewEpisode
+from aegis_cli.data.mixture import check_rename
 from aegis_cli.data.selection import Selection
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -349,14 +350,32 @@ def nameless(folder: Path, feature: str) -> None:
 
 
 def test_names_and_rate_are_kept_as_far_as_the_data_says_them(folder: Path) -> None:
-    """Of a feature without names, and so of what it is joined with, there are none."""
+    """Of a feature without names there are none."""
     found = loaded(folder)
     names = {"action_names": ["dx", "dy"], "proprio_names": ["x", "y", "z"]}
     assert found.recorded == names | {"fps": 10.0}
     nameless(folder, "observation.state")
-    found = loaded(folder, selection=Selection(state=("action", "observation.state")))
+    found = loaded(folder)
     assert found.proprio_names == () and found.action_names == ("dx", "dy")
     assert found.recorded == {"action_names": ["dx", "dy"], "fps": 10.0}
+
+
+def test_a_nameless_feature_beside_one_with_names_is_numbered(folder: Path) -> None:
+    """The others keep their names, so that actions can be relative to positions by them."""
+    nameless(folder, "observation.state")
+    state = ("action", "observation.state")
+    found = loaded(folder, selection=Selection(state=state))
+    assert found.proprio_names == ("dx", "dy", "state.0", "state.1", "state.2")
+    assert found.relative_places(()) == (0, 1)
+    renamed = loaded(folder, selection=Selection(state=state, rename=(("state.1", "elbow"),)))
+    assert renamed.proprio_names == ("dx", "dy", "state.0", "elbow", "state.2")
+    check_rename([folder], (("state.1", "elbow"),))
+    arms(folder, {"action": "action.left"})
+    arms(folder, {"action": "action.right", "observation.state": "joints"})
+    state = ("action.left", "action.right", "joints")
+    found = loaded(folder, selection=Selection(state=state, action="action.left"))
+    arm_names = ("left.dx", "left.dy", "right.dx", "right.dy")
+    assert found.proprio_names == (*arm_names, "joints.0", "joints.1", "joints.2")
 
 
 def test_nameless_actions_are_relative_to_positions_by_their_order(folder: Path) -> None:

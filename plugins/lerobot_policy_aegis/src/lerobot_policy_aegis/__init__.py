@@ -6,5 +6,6 @@ and its processors when it makes one.
 
 from lerobot_policy_aegis.configuration_aegis import AegisConfig
 from lerobot_policy_aegis.optimizers_aegis import AegisKfacConfig, AegisNullspaceConfig
+from lerobot_policy_aegis.schedulers_aegis import AegisSchedulerConfig
 
-__all__ = ["AegisConfig", "AegisKfacConfig", "AegisNullspaceConfig"]
+__all__ = ["AegisConfig", "AegisKfacConfig", "AegisNullspaceConfig", "AegisSchedulerConfig"]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig, OptimizerConfig
+from lerobot.optim import AdamWConfig, OptimizerConfig
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import ensemble
 from lerobot_policy_aegis.optimizers_aegis import AegisKfacConfig, AegisNullspaceConfig
+from lerobot_policy_aegis.schedulers_aegis import AegisSchedulerConfig
 
 METHODS = ("naive", "stop-gradient", "kfac", "nullspace")
 
@@ -36,6 +37,7 @@ class AegisConfig(PreTrainedConfig):
         noise_seed: seeds the noise that the flow begins with, at every reset.
         flow_samples: flow times that are drawn per frame in training.
         method: how `lerobot-train` fine-tunes the backbone; kfac and nullspace need `anchor`.
+        decay_steps: after so many steps the learning rates have fallen; None: at the end.
     """
 
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_unscaled)
@@ -57,7 +59,7 @@ class AegisConfig(PreTrainedConfig):
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     warmup_steps: int = 100
-    decay_steps: int = 30_000
+    decay_steps: int | None = None
     final_lr_share: float = 0.1
 
     def __post_init__(self) -> None:
@@ -113,7 +115,11 @@ class AegisConfig(PreTrainedConfig):
             )
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """AdamW; or for kfac and nullspace the optimizer that protects."""
+        """AdamW; or for kfac and nullspace the optimizer that protects.
+
+        Raises:
+            AegisError: a method that protects, without an anchor.
+        """
         common = {
             "lr": self.expert_lr,
             "weight_decay": self.weight_decay,
@@ -122,17 +128,14 @@ class AegisConfig(PreTrainedConfig):
         protecting = {"kfac": AegisKfacConfig, "nullspace": AegisNullspaceConfig}
         if self.method in protecting:
             kind = protecting[self.method]
-            return kind(**common, anchor=self.anchor or "", base=self.backbone)
+            chosen = kind(**common, anchor=self.anchor or "", base=self.backbone)
+            chosen.check_anchor("--policy")
+            return chosen
         return AdamWConfig(**common)
 
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        """A rise, then a cosine down to a share of the peak."""
-        return CosineDecayWithWarmupSchedulerConfig(
-            num_warmup_steps=self.warmup_steps,
-            num_decay_steps=self.decay_steps,
-            peak_lr=self.expert_lr,
-            decay_lr=self.final_lr_share * self.expert_lr,
-        )
+    def get_scheduler_preset(self) -> AegisSchedulerConfig:
+        """The learning rates of `aegis train`."""
+        return AegisSchedulerConfig(self.warmup_steps, self.decay_steps, self.final_lr_share)
 
     @property
     def observation_delta_indices(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
+from aegis_cli.data import joints
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, least_spread
+from aegis_cli.data.lerobot import layout
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy, check_actions
@@ -30,6 +33,7 @@ from lerobot_policy_aegis.configuration_aegis import AegisConfig
 TASK, IS_PAD, INDEX = "task", "action_is_pad", "index"
 OBSERVED = "observation."  # what whole names of LeRobot's begin with
 Statistics = Mapping[str, Mapping[str, Any]]
+_LOG = logging.getLogger(__name__)
 
 
 class AegisPolicy(PreTrainedPolicy):
@@ -48,6 +52,7 @@ class AegisPolicy(PreTrainedPolicy):
         dataset_stats: Statistics | None = None,
         model: Policy | None = None,
         meta: Mapping[str, Any] | None = None,
+        dataset_meta: Any = None,
         **_: Any,
     ) -> None:
         """Wrap a policy, or make a new one.
@@ -57,6 +62,8 @@ class AegisPolicy(PreTrainedPolicy):
             dataset_stats: what a new policy is scaled by.
             model: a loaded policy; None for a new one, with the backbone that the config names.
             meta: what a loaded policy's user has to know.
+            dataset_meta: LeRobot's metadata of the dataset; a new policy has the joints' names and
+                the control rate from it.
 
         Raises:
             AegisError: features that the policy does not have, or a new policy without statistics.
@@ -65,7 +72,8 @@ class AegisPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config: AegisConfig = config
         self.model = model or _new(config, dataset_stats)
-        self._meta = dict(meta or {"task": None, "normalization": config.normalization})
+        known = {"task": None, "normalization": config.normalization, **_recorded(dataset_meta)}
+        self._meta = dict(meta or known)
         if model is None and (spread := _spread(dataset_stats, ACTION)) is not None:
             self._meta["action_std"] = spread.tolist()
         self._cameras = self._in_order()
@@ -88,6 +96,7 @@ class AegisPolicy(PreTrainedPolicy):
         self._ahead: deque[Tensor] = deque()
         decay = self.config.temporal_ensemble_coeff
         self._averaged = None if decay is None else TemporalEnsemble(decay)
+        self._is_told = False  # whether this episode has been warned of an empty text
         self._follow: list[str] = []  # the texts that the actions ahead are of
         self._generator.manual_seed(self.config.noise_seed)
 
@@ -124,7 +133,18 @@ class AegisPolicy(PreTrainedPolicy):
         return self._ahead.popleft()
 
     def supports_rtc(self) -> bool:
-        """LeRobot's real-time chunking (`--inference.type=rtc`) asks for chunks that continue."""
+        """LeRobot's real-time chunking (`--inference.type=rtc`) asks for chunks that continue.
+
+        Raises:
+            AegisError: the policy averages chunks, which it could not do with these.
+        """
+        decay = self.config.temporal_ensemble_coeff
+        if decay is not None:
+            raise AegisError(
+                f"temporal_ensemble_coeff {decay:g} with real-time chunking",
+                "one of the two: chunks that continue each other are not averaged",
+                "--policy.temporal_ensemble_coeff=null, or --inference.type=sync",
+            )
         return True
 
     @torch.no_grad()
@@ -153,9 +173,17 @@ class AegisPolicy(PreTrainedPolicy):
             raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
         self.eval()
         images, texts = self._images(batch), _texts(batch)
+        self._warn_of_no_task(texts)
         state = self._state(batch, len(texts))
         continued = self._continued(prev_chunk_left_over, inference_delay or 0, len(texts))
         return check_actions(self.model.act(images, texts, state, self._generator, continued))
+
+    def _warn_of_no_task(self, texts: Sequence[str]) -> None:
+        """Say once an episode that a text is blank, as LeRobot's is where `--task` is left out."""
+        if self._is_told or all(text.strip() for text in texts):
+            return
+        self._is_told = True
+        _LOG.warning("The task is an empty text, which tells a policy nothing: give --task=TEXT")
 
     def _continued(self, left: Tensor | None, delay: int, rows: int) -> Continued | None:
         """What chunks are to continue, as LeRobot gives it; None where nothing is left.
@@ -287,10 +315,12 @@ class AegisPolicy(PreTrainedPolicy):
 
         Args:
             strict: there is no other way; LeRobot's own default is ignored.
-            kwargs: what LeRobot gives besides; statistics of a dataset change no trained scale.
+            kwargs: what LeRobot gives besides; statistics of a dataset change no trained scale, and
+                its joints have to be the policy's.
 
         Raises:
-            AegisError: a file or tensor that is missing, damaged or left over.
+            AegisError: a file or tensor that is missing, damaged or left over, or a dataset whose
+                joints have another order than the policy's.
         """
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
@@ -313,6 +343,7 @@ class AegisPolicy(PreTrainedPolicy):
                 "aegis export RUN --format lerobot --out FOLDER",
             )
         model, meta = checkpoint.load_policy(folder)
+        _check_recorded(meta, _recorded(kwargs.get("dataset_meta")))
         policy = cls(config, model=model, meta=meta)
         policy.to(config.device)
         return policy.eval()
@@ -341,9 +372,10 @@ class AegisPolicy(PreTrainedPolicy):
         wanted, found = (rows, len(self.model.proprio_scale.mean)), batch.get(OBS_STATE)
         if found is None or tuple(found.shape) != wanted:
             said = "none" if found is None else f"of shape {tuple(found.shape)}"
+            names = ", ".join(self._meta.get("proprio_names") or ())
             raise AegisError(
                 f"{OBS_STATE} {said} in a batch of {rows}",
-                f"{wanted}",
+                f"{wanted}: {names}" if names else f"{wanted}",
                 "give what the demonstrations hold, a row per text",
             )
         if not found.isfinite().all():
@@ -441,6 +473,51 @@ def _new(config: AegisConfig, statistics: Statistics | None) -> Policy:
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )
     return Policy(backbone, ActionExpert(shape), *scales)
+
+
+def _recorded(dataset_meta: Any) -> dict[str, Any]:
+    """What a LeRobot dataset says of its robot, as checkpoints of `aegis train` have it."""
+    if dataset_meta is None:
+        return {}
+    found: dict[str, Any] = {"fps": float(dataset_meta.fps)}
+    if (task := layout.simulated_task(dataset_meta.robot_type)) is not None:
+        found["task"] = task
+    for kind, feature in (("proprio_names", OBS_STATE), ("action_names", ACTION)):
+        said = dataset_meta.features[feature]
+        names = layout.Feature(said["dtype"], tuple(said["shape"]), said["names"], False).components
+        if all(names):
+            found[kind] = list(names)
+    return found
+
+
+def _check_recorded(known: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    """Warn of a dataset that calls joints otherwise than a policy, or is of another control rate.
+
+    Raises:
+        AegisError: a joint has another place.
+    """
+    for other in joints.differences(known, found):
+        if other.moved is not None:
+            raise AegisError(
+                f"'{other.moved}' in another place than the policy has it, in a dataset with the "
+                f"{other.what} {', '.join(other.found)}",
+                f"{', '.join(other.known)}, in this order, as it was trained on",
+                "give a dataset in that order, or train a new policy: --policy.type=aegis",
+            )
+        _LOG.warning(
+            "The dataset calls the %s %s, and the policy %s: see that they are the same.",
+            other.what,
+            ", ".join(other.found),
+            ", ".join(other.known),
+        )
+    before, now = known.get("fps"), found.get("fps")
+    if before is not None and now is not None and before != now:
+        _LOG.warning(
+            "The policy was trained on %g frames a second, and the dataset has %g: the policy's "
+            "actions are meant for steps of another length.",
+            before,
+            now,
+        )
 
 
 def _scale(statistics: Statistics, name: str, normalization: str) -> Normalizer:

@@ -40,20 +40,29 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
     def options(self) -> dict[str, Any]:
         """The method's own options."""
 
+    def check_anchor(self, option: str) -> None:
+        """Raise AegisError where no anchor is named.
+
+        Args:
+            option: what `.anchor` names it of, on the command line.
+        """
+        if self.anchor:
+            return
+        part = "curvature" if self.method == "kfac" else "inputs"
+        raise AegisError(
+            f"the method {self.method} without {option}.anchor",
+            "what was measured of the VLM on questions",
+            f"aegis anchor --backbone {self.base} --parts {part} --out anchor.safetensors; "
+            f"then {option}.anchor=anchor.safetensors",
+        )
+
     def build(self, params: Any) -> ProtectedAdamW:
         """The optimizer of these parameters.
 
         Raises:
             AegisError: no anchor, or what `ProtectedAdamW` refuses.
         """
-        if not self.anchor:
-            part = "curvature" if self.method == "kfac" else "inputs"
-            raise AegisError(
-                f"--optimizer.type=aegis_{self.method} without an anchor",
-                "what was measured of the VLM on questions",
-                f"aegis anchor --backbone {self.base} --parts {part} --out anchor.safetensors; "
-                "then --optimizer.anchor=anchor.safetensors",
-            )
+        self.check_anchor("--optimizer")
         return ProtectedAdamW(
             params,
             self.method,
