@@ -36,9 +36,9 @@ from aegis_cli.evaluation.open_loop import (
     StepError,
 )
 from aegis_cli.evaluation.results import Result
-from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy, SiteSpectrum
 from aegis_cli.merging.merge import MergePoint, MergeReport
+from aegis_cli.models.acting import PartSuccess, RolloutReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 from aegis_cli.studies.comparison import POLICY_BAR
 from aegis_cli.studies.metrics import Column as Declared

@@ -25,7 +25,7 @@ from aegis_cli.common.palette import SEEN
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import rollout
-from aegis_cli.models import lerobot_folder
+from aegis_cli.models import acting, lerobot_folder
 from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos
 from aegis_cli.sim.contract import EVALUATION, episode_rng
@@ -103,7 +103,7 @@ def test_a_policy_of_two_cameras_is_rolled_out_by_both(
         return act(policy, images, *rest)
 
     monkeypatch.setattr(rollout.Policy, "act", noting)
-    report = rollout.run(run, None, 1, rollout.DEFAULT)
+    report = rollout.run(run, None, 1, acting.DEFAULT)
     assert report.episodes == 1 and all(len(row) == 2 for images in seen for row in images)
     export.run(run, tmp_path / "exported")
     config = json.loads((tmp_path / "exported" / lerobot_folder.CONFIG).read_text())
@@ -159,9 +159,9 @@ def test_lerobots_environment_shows_the_camera_that_was_asked_for(camera: str) -
     assert found is not None and found.loader is not None
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
-    seen, _ = module.AegisTask(TASK, rollout.DEFAULT, camera).reset(seed=0)
+    seen, _ = module.AegisTask(TASK, acting.DEFAULT, camera).reset(seed=0)
     own = sim.make(TASK, seen_by=(camera,) if camera in BOTH else ())
-    wanted = own.reset(episode_rng(rollout.EVALUATION_SEED, EVALUATION, 0), SEEN)
+    wanted = own.reset(episode_rng(acting.EVALUATION_SEED, EVALUATION, 0), SEEN)
     assert np.array_equal(seen["pixels"][camera], wanted.image)
 
 
