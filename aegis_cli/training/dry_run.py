@@ -300,7 +300,8 @@ def _needs(
         # Before the steps, which move the weights; what it takes is part of the training's peak.
         if training.episodes is not None:
             rollout_s = _seconds(partial(_acted, training, on_event), ranks)
-        step_s = _seconds(partial(_timed, training, on_event), ranks)
+        if training.episodes is None or rollout_s is not None:
+            step_s = _seconds(partial(_timed, training, on_event), ranks)
         fits = False  # unless the steps show that it does
     if step_s is not None:
         # Steps were taken, but no checkpoint was written: its share is still the estimate's.

@@ -327,6 +327,18 @@ def test_a_dry_run_tells_how_long_they_take(
     assert plain.rollout_s is None and plain.hours == pytest.approx(STEPS * plain.step_s / 3600)
 
 
+def test_memory_that_does_not_suffice_to_act_is_told(
+    playing: Recipe, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(validation_rollout, "longest_s", full)
+    plan = dry_run.run(playing, "naive", demos_file, None, tmp_path / "run")
+    assert plan.memory_fits is False and plan.memory_measured_mb is None
+    assert (plan.rollout_s, plan.step_s, plan.hours) == (None, None, None)
+
+
 # --- what is refused ------------------------------------------------------------------------------
 
 
