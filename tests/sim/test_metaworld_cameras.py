@@ -28,8 +28,8 @@ from aegis_cli.evaluation import rollout
 from aegis_cli.models import acting, lerobot_folder
 from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos
-from aegis_cli.sim.contract import EVALUATION, episode_rng
-from aegis_cli.training import checkpoint, train
+from aegis_cli.sim.contract import EVALUATION, VALIDATION, episode_rng
+from aegis_cli.training import checkpoint, train, validation_rollout
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -46,9 +46,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def trained(backbone: Path, dataset: Path, out: Path, camera: Any, **demos: Any) -> Path:
+def trained(
+    backbone: Path, dataset: Path, out: Path, camera: Any, played: int | None = None, **demos: Any
+) -> Path:
     made = recipe(backbone, steps=1, validation_share=0.5)
     made = replace(made, task=TASK, demos=Demos(camera=camera, **demos))
+    made = replace(made, rollout=replace(made.rollout, while_training=played))
     train.run(made, "naive", dataset, None, out)
     return out
 
@@ -109,6 +112,26 @@ def test_a_policy_of_two_cameras_is_rolled_out_by_both(
     config = json.loads((tmp_path / "exported" / lerobot_folder.CONFIG).read_text())
     assert {name for name in config["input_features"] if "images" in name} == {*FULL}
     assert rollout.load_run(tmp_path / "exported", None).cameras == BOTH
+
+
+def test_a_policy_of_two_cameras_acts_by_both_while_it_trains(
+    dataset: Path,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = []
+    play = validation_rollout.play
+
+    def noting(*given: Any, **named: Any) -> acting.RolloutReport:
+        found.append(play(*given, **named))
+        return found[-1]
+
+    monkeypatch.setattr(validation_rollout, "play", noting)
+    run = trained(hf_folder("smolvlm"), dataset, tmp_path / "run", BOTH, played=1)
+    again = rollout.run(run, None, 1, acting.DEFAULT, stream=VALIDATION)
+    assert len(found) == 1 and found[0].outcomes == again.outcomes
+    assert found[0].action_change == pytest.approx(again.action_change, rel=1e-4)
 
 
 def test_another_single_camera_than_the_usual_is_remembered(
