@@ -35,7 +35,8 @@ from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
 from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.data.selection import listed
-from aegis_cli.evaluation.rollout import Acting, load_run
+from aegis_cli.evaluation.rollout import load_run
+from aegis_cli.models.acting import Acting
 from aegis_cli.models.policy import Policy, check_actions
 from aegis_cli.recipes import is_robot_stream_run
 from aegis_cli.training import checkpoint

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 _RATES = ("train.backbone_lr", "train.expert_lr")
+_WATCHED = ("rollout.while_training", "train.validate_every")
 # what an option is called there, without its dashes -> keys here
 KEYS: Mapping[str, tuple[str, ...]] = {
     # LeRobot's
@@ -38,6 +39,9 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "scheduler.num_warmup_steps": ("train.warmup",),
     "scheduler.decay_lr": ("train.final_lr_share",),
     "wandb.enable": ("train.track",),
+    "env_eval_freq": _WATCHED,
+    "eval_freq": _WATCHED,
+    "eval.n_episodes": ("rollout.while_training",),
     # the Trainer's
     "per_device_train_batch_size": ("train.batch_size",),
     "gradient_accumulation_steps": ("train.accumulate",),

@@ -35,9 +35,8 @@ from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
-from aegis_cli.evaluation import rollout
-from aegis_cli.evaluation.rollout import Acting
 from aegis_cli.models import backbones, policy_meta
+from aegis_cli.models.acting import Acting, play
 from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -680,17 +679,13 @@ class RobotEvaluator:
         """Share of successes of the task of that number, or of the highest return."""
         acting, settings = self._run.acting(task), self._run.recipe.rollout
         split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
-        found = rollout.play(
-            acting.policy,
-            acting.task,
+        found = play(
+            acting,
             settings.episodes,
             settings.colors,
-            acting.replan,
             split,
             on_event=self._named(acting.task),
             seed=settings.seed,
-            cameras=acting.cameras,
-            sizes=acting.sizes,
         )
         # A task of dm_control's suite has no success, but a return.
         share = found.return_share if found.success is None else found.success

@@ -12,7 +12,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from aegis_cli.evaluation.estimates import LEVEL
+from aegis_cli.common.estimates import LEVEL
 
 if TYPE_CHECKING:  # tables of finished studies are shown without it
     import numpy as np

@@ -167,6 +167,7 @@ class TrainFigures:
     cameras: list[str] | None = None
     out: str | None = None
     validation_vqa: dict[str, dict[str, Number | list[Number]]] | None = None
+    validation_rollout: dict[str, Number | Interval] | None = None
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands, devices, hub
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.estimates import t_quantile
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
@@ -28,7 +29,6 @@ from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
-from aegis_cli.evaluation.estimates import t_quantile
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import backbones, download, lerobot_folder
 from aegis_cli.models.policy import Policy

@@ -3,154 +3,20 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
-import torch
 
 from aegis_cli import sim
 from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.limits import MOST_MADE
-from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
-from aegis_cli.common.pictures import fit
 from aegis_cli.core import ensemble as temporal
-from aegis_cli.core.continuation import Continued
-from aegis_cli.core.ensemble import TemporalEnsemble
-from aegis_cli.data.batch import Images
-from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import results
-from aegis_cli.evaluation.estimates import estimate
+from aegis_cli.models.acting import DEFAULT, EVALUATION_SEED, Acting, RolloutReport, play
 from aegis_cli.models.policy import Policy
-from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
+from aegis_cli.sim.contract import EVALUATION
 from aegis_cli.training import checkpoint
-
-EVALUATION_SEED = 0
-TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
-DEFAULT = "seen"  # the default, and the only choice for a task without colours
-_LOCKSTEP = 64  # episodes that share a forward pass
-
-
-@dataclass(frozen=True)
-class PartSuccess:
-    """What a policy did in some of the episodes."""
-
-    success: float
-    interval: tuple[float, float]
-    episodes: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class RolloutReport:
-    """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
-
-    The distance is the mean at the episodes' ends; only a task with coloured targets has one.
-    `tasks` has the success in each task of a set. Where the episodes differ in them,
-    `target_colors` has that by the target's colour, and `instructions` that by the instruction, in
-    which `{color}` stands for the colour.
-
-    `outcomes` has one character per episode, 1 for a success and 0 otherwise.
-
-    A task measured by its return has none of these. It has the mean return, its 95 % interval
-    (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
-
-    `action_change` is the root mean square of the difference between one executed action and the
-    next, as a share of a full action: how much the robot jerks. Episodes of one step have none.
-    """
-
-    task: str
-    colors: str | None = None
-    success: float | None = None
-    interval: tuple[float, float] | None = None
-    outcomes: str | None = None
-    wrong_target: float | None = None
-    final_distance_m: float | None = None
-    tasks: dict[str, PartSuccess] | None = None
-    target_colors: dict[str, PartSuccess] | None = None
-    instructions: dict[str, PartSuccess] | None = None
-    mean_return: float | None = None
-    return_interval: tuple[float, float] | None = None
-    return_share: float | None = None
-    action_change: float | None = None
-    episodes: int
-    episodes_per_s: float
-    video: str | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON-ready values."""
-        return asdict(self)
-
-
-@dataclass
-class _PlayedEpisode:
-    """One environment with what has become of it so far.
-
-    An episode that is filmed keeps as many `moments` per second as a video shows,
-    `media.FRAMES_PER_S`. Of others, `moments` is None.
-    """
-
-    env: TaskEnv
-    observation: Observation
-    moments: list[media.Moment] | None
-    ensemble: TemporalEnsemble | None = None
-    left: np.ndarray | None = None  # what is left of its last chunk [n, A]
-    executed: np.ndarray | None = None  # the last action [A]
-    changes: list[float] = field(default_factory=list)  # mean squares over the dimensions
-    last: Step | None = None
-    total_reward: float = 0.0
-    steps: int = 0
-
-    @property
-    def done(self) -> bool:
-        return self.last is not None and self.last.done
-
-    @property
-    def end(self) -> Step:
-        """The last step of an episode that has been played."""
-        assert self.last is not None
-        return self.last
-
-
-@dataclass(frozen=True)
-class _Pace:
-    """How many actions of each chunk are executed, and which.
-
-    Attributes:
-        replan: actions between two predictions.
-        delay: actions that a prediction takes, in which the chunk before is executed; None: the
-            robot stands still meanwhile.
-        guided: whether a delayed chunk continues the one before (see `core.continuation`).
-    """
-
-    replan: int
-    delay: int | None = None
-    guided: bool = False
-
-
-# (height, width) of the pictures that each camera showed in training; empty where nobody knows.
-Sizes = tuple[tuple[int, int], ...]
-
-
-class Acting(NamedTuple):
-    """A policy ready to act in a task; `replan` actions of each predicted chunk are executed.
-
-    `ensemble` is the decay of its temporal ensemble, which predicts at every step. `rate` is known
-    of a policy that was trained in no task: the actions per second that it means.
-    """
-
-    policy: Policy
-    task: str
-    replan: int
-    cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
-    ensemble: float | None = None
-    sizes: Sizes = ()
-    rate: float | None = None
-
 
 Load = Callable[[Path, str | None], Acting]
 
@@ -211,39 +77,28 @@ def run(
     if video_out is not None:
         media.check_video(video_out)
     gl.check()
-    asked = task
-    policy, task, planned, cameras, own, sizes, rate = (load or load_run)(Path(run_path), asked)
-    if rate is not None:
-        _check_rate(rate, task, on_event)
+    acting = (load or load_run)(Path(run_path), task)
+    if acting.rate is not None:
+        _check_rate(acting.rate, acting.task, on_event)
     # Whoever asks for another number of executed actions does without the policy's own ensemble,
     # which executes one.
-    decay = own if ensemble is None and replan is None else ensemble
-    if not sim.has_colors(task) and colors != DEFAULT:
+    decay = acting.ensemble if ensemble is None and replan is None else ensemble
+    if not sim.has_colors(acting.task) and colors != DEFAULT:
         raise AegisError(
-            f"{colors} colours for '{task}'", "a task with coloured targets", "leave out --colors"
+            f"{colors} colours for '{acting.task}'",
+            "a task with coloured targets",
+            "leave out --colors",
         )
+    executed = replan or acting.replan
     if delay is not None:
-        _check_delay(delay, replan or planned, policy.expert.shape.chunk, decay)
-    report = play(
-        policy.to(devices.pick()),
-        task,
-        episodes,
-        colors,
-        replan or planned,
-        stream=stream,
-        video_out=video_out,
-        on_event=on_event,
-        seed=seed,
-        cameras=cameras,
-        ensemble=decay,
-        delay=delay,
-        guided=guided,
-        sizes=sizes,
-    )
+        _check_delay(delay, executed, acting.policy.expert.shape.chunk, decay)
+    policy = acting.policy.to(devices.pick())
+    acting = acting._replace(policy=policy, replan=executed, ensemble=decay)
+    report = play(acting, episodes, colors, stream, video_out, on_event, seed, delay, guided)
     if keep:
-        name = "-".join(["rollout", *([] if asked is None else [asked]), colors])
-        settings = {"task": task, "episodes": episodes, "colors": colors, "seed": seed}
-        settings |= {"replan": replan or planned}
+        name = "-".join(["rollout", *([] if task is None else [task]), colors])
+        settings = {"task": acting.task, "episodes": episodes, "colors": colors, "seed": seed}
+        settings |= {"replan": executed}
         settings |= {} if decay is None else {"ensemble": decay}
         settings |= {} if delay is None else {"delay": delay, "guided": guided}
         results.keep_if_possible(Path(run_path), name, report.to_json(), settings, on_event)
@@ -265,124 +120,6 @@ def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) ->
             f"0 to {longest}: as many are left of a chunk, and no more are executed of the next",
             f"use --delay {longest}, or a policy of longer chunks (train.chunk)",
         )
-
-
-def play(
-    policy: Policy,
-    task: str,
-    episodes: int,
-    colors: str,
-    replan: int,
-    stream: int = EVALUATION,
-    video_out: Path | None = None,
-    on_event: OnEvent = ignore,
-    seed: int = EVALUATION_SEED,
-    cameras: tuple[str, ...] = (),
-    ensemble: float | None = None,
-    delay: int | None = None,
-    guided: bool = False,
-    sizes: Sizes = (),
-) -> RolloutReport:
-    """Let a loaded policy act, as `run` does.
-
-    With the decay of a temporal `ensemble` it predicts at every step, whatever `replan` is.
-
-    Args:
-        sizes: which the task's pictures are fitted to, wherever training showed others.
-    """
-    pace = _Pace(replan, delay, guided)
-    started = time.perf_counter()
-    finished: list[_PlayedEpisode] = []
-    stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
-    clips = 0 if video_out is None else media.CLIPS
-    for first in range(0, episodes, _LOCKSTEP):
-        numbers = range(first, min(episodes, first + _LOCKSTEP))
-        colored = TARGET_COLORS[colors]
-        group = []
-        for i in numbers:  # the first episodes are filmed
-            group.append(_begin(task, seed, stream, i, colored, i < clips, cameras, ensemble))
-        for _ in _play(policy, group, pace, first, seed, sizes):
-            longest = group[0].env.spec.max_steps
-            # An episode that ended early counts in full, so that the progress reaches its end.
-            in_group = sum(longest if e.done else e.steps for e in group)
-            done = first * longest + in_group
-            on_event(Progress(stage, done, episodes * longest, "steps"))
-        finished += group
-    seconds = time.perf_counter() - started
-    if video_out is not None:
-        media.save_video([_clip(e) for e in finished[:clips]], video_out)
-    return RolloutReport(
-        task=task,
-        episodes=episodes,
-        episodes_per_s=episodes / seconds,
-        video=None if video_out is None else str(video_out),
-        action_change=_action_change(finished),
-        **_measured(task, colors, finished),
-    )
-
-
-def _action_change(finished: Sequence[_PlayedEpisode]) -> float | None:
-    """The root mean square over the steps of all episodes; None where all had one."""
-    changes = [change for episode in finished for change in episode.changes]
-    return math.sqrt(sum(changes) / len(changes)) if changes else None
-
-
-def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
-    """The report's figures that a task of this kind has."""
-    if sim.is_suite(task):
-        return _returns(finished)
-    found: dict[str, Any] = {**vars(_success(finished))}
-    del found["episodes"]  # which every report has, also one of returns
-    found["outcomes"] = "".join(str(int(bool(e.end.success))) for e in finished)
-    if sim.has_colors(task):
-        wrong = sum(bool(e.end.wrong_target) for e in finished) / len(finished)
-        distance = float(np.mean([_distance(e) for e in finished]))
-        found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
-    tasks = sim.members(task)
-    if tasks != (task,):
-        # The tasks take turns: episode i is of task i mod n. With few episodes, not every one has
-        # its turn.
-        turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
-        found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
-    found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
-    found["instructions"] = _apart(finished, _instruction)
-    return found
-
-
-def _distance(episode: _PlayedEpisode) -> float:
-    """Metres from the effector to the target, in a task with coloured ones."""
-    distance = episode.env.distance()
-    assert distance is not None
-    return distance
-
-
-def _apart(
-    finished: Sequence[_PlayedEpisode], part_of: Callable[[_PlayedEpisode], str | None]
-) -> dict[str, PartSuccess] | None:
-    """The success in each part of the episodes; None where they are all of one."""
-    parts: dict[str, list[_PlayedEpisode]] = {}
-    for episode in finished:
-        if (name := part_of(episode)) is not None:
-            parts.setdefault(name, []).append(episode)
-    return {name: _success(parts[name]) for name in sorted(parts)} if len(parts) > 1 else None
-
-
-def _instruction(episode: _PlayedEpisode) -> str:
-    """The instruction of an episode, without the colour of its target."""
-    color, said = episode.env.target_color, episode.observation.instruction
-    return said if color is None else said.replace(color, "{color}")
-
-
-def _success(finished: Sequence[_PlayedEpisode]) -> PartSuccess:
-    successes = sum(bool(e.end.success) for e in finished)
-    interval = wilson_interval(successes, len(finished))
-    return PartSuccess(successes / len(finished), interval, len(finished))
-
-
-def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
-    found = estimate([e.total_reward for e in finished])
-    share = found.mean / finished[0].env.spec.max_steps
-    return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
@@ -418,132 +155,3 @@ def _check_rate(rate: float, task: str, on_event: OnEvent) -> None:
             "actions are meant for steps of another length"
         )
         on_event(Warned("rollout", text))
-
-
-def _begin(
-    task: str,
-    seed: int,
-    stream: int,
-    number: int,
-    colors: Sequence[str],
-    filmed: bool,
-    cameras: tuple[str, ...],
-    ensemble: float | None,
-) -> _PlayedEpisode:
-    env = sim.make(task, number=number, seen_by=cameras)
-    observation = env.reset(episode_rng(seed, stream, number), colors)
-    moments = [media.Moment(observation.image, "start")] if filmed else None
-    averaged = None if ensemble is None else TemporalEnsemble(ensemble)
-    return _PlayedEpisode(env, observation, moments, averaged)
-
-
-def _play(
-    policy: Policy, group: list[_PlayedEpisode], pace: _Pace, first: int, seed: int, sizes: Sizes
-) -> Iterator[None]:
-    """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
-    # Seeded by the group, so that the noise does not depend on how the groups before it ended.
-    generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
-    while active := [e for e in group if not e.done]:
-        continued = _continued(active, pace)
-        seen = [e.observation for e in active]
-        chunks = _decide(policy, seen, generator, continued, sizes)  # [B, H, A]
-        for episode, chunk in zip(active, chunks, strict=True):
-            _execute(episode, _to_execute(episode, chunk, pace))
-        yield
-
-
-def _continued(active: Sequence[_PlayedEpisode], pace: _Pace) -> Continued | None:
-    """What the next chunks continue; None where they need not, as the first ones of episodes."""
-    left = [e.left for e in active if e.left is not None and len(e.left)]
-    if pace.delay is None or not pace.guided or not left:
-        return None
-    # In lockstep all have as many actions left, so that they stack to [B, n, A].
-    return Continued(torch.from_numpy(np.stack(left)), pace.delay)
-
-
-def _to_execute(episode: _PlayedEpisode, chunk: np.ndarray, pace: _Pace) -> np.ndarray:
-    """The actions [*, A] until the next prediction: of a chunk [H, A], or of the ensemble's."""
-    if episode.ensemble is not None:
-        return episode.ensemble.next(torch.from_numpy(chunk))[None].numpy()  # one action, [1, A]
-    if pace.delay and episode.left is not None:
-        # While the policy predicted, the robot went on with the old chunk for so many steps.
-        chunk = np.concatenate([episode.left[: pace.delay], chunk[pace.delay :]])
-    episode.left = chunk[pace.replan :]
-    return chunk[: pace.replan]
-
-
-def _decide(
-    policy: Policy,
-    observations: list[Observation],
-    generator: torch.Generator,
-    continued: Continued | None,
-    sizes: Sizes,
-) -> np.ndarray:
-    """Action chunks [B, H, A] in the task's units."""
-    images = _images(observations, sizes)
-    proprio = torch.from_numpy(np.stack([o.proprio for o in observations]))  # [B, P]
-    instructions = [o.instruction for o in observations]
-    return policy.act(images, instructions, proprio, generator, continued).cpu().numpy()
-
-
-def _images(observations: list[Observation], sizes: Sizes) -> Images:
-    """[B, H, W, 3], or of several cameras B tuples of [H, W, 3]."""
-    rows = [_fitted((o.image, *o.more), sizes) for o in observations]
-    if not observations[0].more:
-        return torch.from_numpy(np.stack([image for (image,) in rows]))
-    return [tuple(map(torch.from_numpy, row)) for row in rows]
-
-
-def _fitted(pictures: Sequence[np.ndarray], sizes: Sizes) -> Sequence[np.ndarray]:
-    """One picture of each camera, in the sizes of the training where these are known."""
-    if not sizes:
-        return pictures
-    return [fit(picture, *size) for picture, size in zip(pictures, sizes, strict=True)]
-
-
-def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
-    """Execute a chunk of actions.
-
-    The policy looks after the last of them; whoever films, after each.
-    """
-    every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
-    for number, action in enumerate(actions, 1):
-        look = number == len(actions) or episode.moments is not None
-        # Actions are defined in [-1, 1]; a flow may end a little outside.
-        given = np.clip(action, -1, 1)
-        if episode.executed is not None:
-            episode.changes.append(float(np.square(given - episode.executed).mean()))
-        episode.executed = given
-        # To look is to render; without it a step has no observation.
-        episode.last = step = episode.env.step(given, look)
-        episode.steps += 1
-        episode.observation = step.observation or episode.observation
-        episode.total_reward += step.reward or 0.0
-        if episode.moments is not None and (episode.steps % every == 0 or step.done):
-            episode.moments.append(_moment(episode, step))
-        if step.done:
-            return
-
-
-def _moment(episode: _PlayedEpisode, step: Step) -> media.Moment:
-    """What a video shows of a step; the outcome is open until the episode is over."""
-    note = f"step {episode.steps}"
-    if step.success is None:
-        note += f"   return {episode.total_reward:.1f}"
-    elif step.done:
-        note += ": " + _ended(step)
-    outcome = step.success if step.done else None
-    assert step.observation is not None
-    return media.Moment(step.observation.image, note, outcome)
-
-
-def _ended(step: Step) -> str:
-    if step.success:
-        return "success"
-    return "wrong target" if step.wrong_target else "out of time"
-
-
-def _clip(episode: _PlayedEpisode) -> media.Clip:
-    caption = episode.observation.instruction
-    assert episode.moments is not None
-    return media.Clip(caption, episode.moments, episode.env.target_circle())

@@ -831,6 +831,14 @@ class Rollout:
         "weighted by exp(-ensemble * i), i = 0 for the oldest; ACT has 0.01. A chunk is predicted "
         "at every step, so `replan` has to be 1. Null: chunks are executed as they are.",
     )
+    while_training: int | None = key(
+        MADE,
+        default=None,
+        later=True,
+        doc="Validation episodes that `aegis train` plays with every validation loss, on seen "
+        "colours, so that success shows while it grows: in its log and in trackers. Neither "
+        "demonstrations nor evaluations are of these episodes. Null: none.",
+    )
 
 
 @section

@@ -15,9 +15,9 @@ from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from typing import Any, get_type_hints
 
+from aegis_cli.common.estimates import Estimate, estimate
 from aegis_cli.common.limits import ROUNDING
 from aegis_cli.evaluation.bootstrap import Units, crossed_interval
-from aegis_cli.evaluation.estimates import Estimate, estimate
 
 Mean = Estimate | None  # over seeds; None where no cell has a value
 Setting = tuple[str, int]  # the task or stream of a cell, and its seed

@@ -36,7 +36,7 @@ from aegis_cli.evaluation import (
 from aegis_cli.evaluation.probe import ProbeReport
 from aegis_cli.merging import merge
 from aegis_cli.merging.settings import MergeSettings
-from aegis_cli.models import backbones
+from aegis_cli.models import acting, backbones
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import (
     Anchor,
@@ -738,7 +738,7 @@ class PolicyRunner:
         }
         if settings.ensemble is not None:
             key["ensemble"] = settings.ensemble
-        if settings.seed != rollout.EVALUATION_SEED:  # what older records do not have
+        if settings.seed != acting.EVALUATION_SEED:  # what older records do not have
             key["seed"] = settings.seed
 
         def make(on_event: OnEvent) -> None:
@@ -865,4 +865,4 @@ def playable_colors(recipe: Recipe) -> tuple[str, ...]:
 
 
 def _colors(task: str, recipe: Recipe) -> tuple[str, ...]:
-    return recipe.rollout.colors if sim.has_colors(task) else (rollout.DEFAULT,)
+    return recipe.rollout.colors if sim.has_colors(task) else (acting.DEFAULT,)

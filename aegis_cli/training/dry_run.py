@@ -7,8 +7,9 @@ import gc
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from aegis_cli.training import (
     retention,
     track,
     train,
+    validation_rollout,
     validation_vqa,
 )
 from aegis_cli.training.assemble import TrainingRun
@@ -72,7 +74,10 @@ class DryRunReport:
         memory_free_mb: where training would run, None if that is not known.
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
             gradient serves; None where memory does not suffice to take them.
-        hours: of the steps still to be taken, without validation losses and checkpoints.
+        rollout_s: of the episodes of one validation, if none ends early; None where the recipe has
+            no `rollout.while_training`, or where memory does not suffice.
+        hours: of the steps still to be taken and such episodes, without validation losses and
+            checkpoints.
         checkpoints, disk_mb: those still to be written, as many as lie there at one time;
             disk_free_mb: where they would be.
     """
@@ -98,6 +103,7 @@ class DryRunReport:
     memory_free_mb: float | None
     memory_fits: bool | None
     step_s: float | None
+    rollout_s: float | None
     hours: float | None
     checkpoints: int
     disk_mb: float
@@ -167,6 +173,7 @@ def _planned(
         training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     # They are not asked here: that they can be is all that a plan needs to know.
     validation_vqa.chosen(recipe, training.policy.backbone, told)
+    training.episodes = validation_rollout.chosen(recipe, training.policy, training.meta, ranks)
     held = _held(training, there)
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)
@@ -176,18 +183,18 @@ def _planned(
     # Last of all: the steps fill what the optimizer keeps, and move the weights.
     needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
-    return _report(training, tokens, needs, free, disk, recipe.train.steps - _done(written))
+    return _report(training, tokens, needs, free, disk, _done(written))
 
 
 def _report(
-    training: TrainingRun, tokens: int, needs: _Needs, free: int | None, disk: _Disk, left: int
+    training: TrainingRun, tokens: int, needs: _Needs, free: int | None, disk: _Disk, done: int
 ) -> DryRunReport:
     """What was found, in megabytes and hours.
 
     Args:
         tokens: of one frame.
         free: bytes of memory before anything was built.
-        left: steps that are still to be taken.
+        done: steps that are behind it.
     """
     recipe, policy, frames = training.recipe, training.policy, len(training.demos.train)
     groups = policy.backbone.parameter_groups()
@@ -213,13 +220,23 @@ def _report(
         memory_free_mb=_in_mb(free),
         memory_fits=needs.fits,
         step_s=needs.step_s,
-        hours=None if needs.step_s is None else needs.step_s * left / 3600,
+        rollout_s=needs.rollout_s,
+        hours=_hours(recipe.train, needs, done),
         checkpoints=disk.checkpoints,
         disk_mb=disk.needed / _MB,
         disk_free_mb=disk.free / _MB,
         disk_fits=disk.needed <= disk.free,
         out=str(training.out),
     )
+
+
+def _hours(settings: Train, needs: _Needs, done: int) -> float | None:
+    """Hours of the steps after the first `done` ones, and of the episodes between them."""
+    if needs.step_s is None:
+        return None
+    seconds = needs.step_s * (settings.steps - done)
+    seconds += (needs.rollout_s or 0.0) * _left(settings, settings.validate_every, done)
+    return seconds / 3600
 
 
 def _in_mb(size: int | None) -> float | None:
@@ -251,6 +268,7 @@ class _Needs(NamedTuple):
         together: of the processes that share a machine's memory; None where none do.
         fits: whether every process has what it needs; None where it is not known what is free.
         step_s: seconds per step; None where none was taken.
+        rollout_s: seconds of the episodes of one validation; None where none was played.
     """
 
     parts: dict[str, int]
@@ -258,6 +276,7 @@ class _Needs(NamedTuple):
     together: int | None
     fits: bool | None
     step_s: float | None
+    rollout_s: float | None
 
 
 def _needs(
@@ -276,9 +295,13 @@ def _needs(
     """
     device, needed = training.policy.backbone.device, sum(parts.values())
     fits = _fits(needed, free, device, ranks)
-    step_s, measured = None, None
+    step_s, rollout_s, measured = None, None, None
     if fits is not False:
-        step_s = _step_s(training, ranks, on_event)
+        # Before the steps, which move the weights; what it takes is part of the training's peak.
+        if training.episodes is not None:
+            rollout_s = _seconds(partial(_acted, training, on_event), ranks)
+        if training.episodes is None or rollout_s is not None:
+            step_s = _seconds(partial(_timed, training, on_event), ranks)
         fits = False  # unless the steps show that it does
     if step_s is not None:
         # Steps were taken, but no checkpoint was written: its share is still the estimate's.
@@ -286,7 +309,8 @@ def _needs(
         measured = max(ranks.gathered(needed))
         fits = _fits(needed, free, device, ranks)
     largest = max(ranks.gathered(parts), key=lambda found: sum(found.values()))
-    return _Needs(largest, measured, _together(needed, device, ranks), fits, step_s)
+    together = _together(needed, device, ranks)
+    return _Needs(largest, measured, together, fits, step_s, rollout_s)
 
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
@@ -490,24 +514,36 @@ def _while_saving(training: TrainingRun) -> int:
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _step_s(training: TrainingRun, ranks: Ranks, on_event: OnEvent) -> float | None:
-    """Seconds per step, as the training takes its first ones; nothing is written.
+def _seconds(found: Callable[[], float], ranks: Ranks) -> float | None:
+    """The seconds that were found; None where a GPU has no memory left for what takes them.
 
-    None where a GPU has no memory left for them. With several processes that is an error, for the
-    others wait in the same step.
-
-    Raises:
-        Diverged: a step that the training would end at, too.
+    With several processes that is an error, for the others wait in the same step.
     """
     try:
-        return _timed(training, on_event)
+        return found()
     except torch.OutOfMemoryError:
         if ranks.several:
             raise
         return None
 
 
+def _acted(training: TrainingRun, on_event: OnEvent) -> float:
+    """Seconds of the episodes of one validation, if none ends early."""
+    assert training.episodes is not None
+    training.policy.eval()
+    on_event(Progress("dry run (rollout)", 0, 2, "chunks"))
+    with training.masters.as_written():
+        found = training.episodes.longest_s(training.ranks)
+    on_event(Progress("dry run (rollout)", 2, 2, "chunks"))
+    return found
+
+
 def _timed(training: TrainingRun, on_event: OnEvent) -> float:
+    """Seconds per step, as the training takes its first ones; nothing is written.
+
+    Raises:
+        Diverged: a step that the training would end at, too.
+    """
     settings, parts = training.recipe.train, training.parts
     # The first step pays for what is done once, and batches are fetched meanwhile: those that a
     # GPU finds ready say nothing of how long they took, and as many may come together.
@@ -560,12 +596,15 @@ def _disk(training: TrainingRun, written: Sequence[Path]) -> _Disk:
 
 def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
     """Checkpoints that are still to be written."""
-    steps, every = recipe.train.steps, recipe.train.checkpoint_every
-    done = _done(written)
-    if done >= steps:
+    return _left(recipe.train, recipe.train.checkpoint_every, _done(written))
+
+
+def _left(settings: Train, every: int, done: int) -> int:
+    """How often something still comes that does every so many steps, and after the last one."""
+    if done >= settings.steps:
         return 0
     # Rounded up: the last step has one too, whether or not its turn has come.
-    return -(-steps // every) - done // every
+    return -(-settings.steps // every) - done // every
 
 
 def _done(written: Sequence[Path]) -> int:

@@ -45,8 +45,11 @@ class Masters:
     Without parameters nothing is rounded, and nothing costs anything.
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter] = ()) -> None:
-        self._parameters = list(parameters)
+    def __init__(
+        self, parameters: Iterable[nn.Parameter] = (), still: Iterable[nn.Parameter] = ()
+    ) -> None:
+        """Hold on to what learns, and beside it to what is rounded for good."""
+        self._parameters, self._still = list(parameters), list(still)
 
     @classmethod
     def of(cls, own: Iterable[nn.Parameter]) -> Masters:
@@ -54,13 +57,14 @@ class Masters:
 
         What does not learn needs no master: it is rounded here, once and for good.
         """
-        learning = []
+        learning, still = [], []
         for parameter in own:
             if parameter.requires_grad:
                 learning.append(parameter)
             else:
                 parameter.data = parameter.data.to(BF16)
-        return cls(learning)
+                still.append(parameter)
+        return cls(learning, still)
 
     @property
     def rounded_bytes(self) -> int:
@@ -86,6 +90,16 @@ class Masters:
         wide = iter(structure.of_one_type(present, torch.float32))
         for parameter, known, new in zip(self._parameters, before, found, strict=True):
             parameter.grad = _sum(known, None if new is None else next(wide))
+
+    @contextlib.contextmanager
+    def as_written(self) -> Generator[None]:
+        """Let passes inside the block see all weights in float32, as a checkpoint has them.
+
+        Outside `rounded` a model has two types, which no pass of its own takes. Where nothing
+        learns, all are in bfloat16 and stay so.
+        """
+        with structure.of_type(self._still if self._parameters else [], torch.float32):
+            yield
 
     def wide(self, gradients: Mapping[int, Tensor | None]) -> Mapping[int, Tensor | None]:
         """Gradients of the block that do not lie in `.grad`, in float32 too."""

@@ -57,13 +57,7 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
             )
     if shards(settings, ranks):
         _check_sharding(settings, method)
-        if recipe.probe.while_training is not None:
-            raise AegisError(
-                f"probe.while_training: {recipe.probe.while_training} with train.parallel: fsdp",
-                "a model that each process has whole, to write its answers",
-                "delete probe.while_training, and aegis probe the checkpoints; or --set "
-                "train.parallel=ddp",
-            )
+        _check_nothing_is_watched(recipe)
     if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
             f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",
@@ -87,6 +81,22 @@ def _check_sharding(settings: Train, method: Method) -> None:
         )
     if settings.compile:
         raise AegisError("train.parallel: fsdp with train.compile", "one of the two", fix)
+
+
+def _check_nothing_is_watched(recipe: Recipe) -> None:
+    """Refuse to measure, while it trains, what no process has whole."""
+    watched = {
+        "probe": (recipe.probe.while_training, "write its answers"),
+        "rollout": (recipe.rollout.while_training, "act"),
+    }
+    for section, (count, does) in watched.items():
+        if count is not None:
+            raise AegisError(
+                f"{section}.while_training: {count} with train.parallel: fsdp",
+                f"a model that each process has whole, to {does}",
+                f"delete {section}.while_training, and aegis {section} the checkpoints; or --set "
+                "train.parallel=ddp",
+            )
 
 
 def shard(policy: Policy, precision: str, device: torch.device) -> None:

@@ -55,6 +55,7 @@ from aegis_cli.training import (
     parallel,
     step,
     track,
+    validation_rollout,
     validation_vqa,
 )
 from aegis_cli.training.assemble import TrainingRun
@@ -65,11 +66,18 @@ LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
 # A validation has progress of its own if steps with as many batches would take longer than this;
-# so have questions whose answers took longer before training.
+# so have questions whose answers took longer before training, and episodes that did the last time.
 _LONG_S = 20.0
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 # What the progress shows of such a line, and under which name.
-_SHOWN = {"loss": "loss", "vqa_drop_points": "VQA drop"}
+_SHOWN = {
+    "loss": "loss",
+    "vqa_drop_points": "VQA drop",
+    "rollout_success": "success",
+    "rollout_mean_return": "return",
+    "rollout_low": "at least",
+    "rollout_high": "at most",
+}
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
 
@@ -82,6 +90,8 @@ class TrainReport:
     projects the update or fewer groups; None for a method that reads no anchor gradient. `cameras`
     are those of a LeRobot folder, in their order. `validation_vqa` is what the last step's weights
     answer, by the set's name, as `validation_vqa.of_line` has it; empty where nothing was asked.
+    `validation_rollout` is how they act, as `validation_rollout.of_line` has it; empty where
+    nothing was played.
     """
 
     method: str
@@ -93,6 +103,7 @@ class TrainReport:
     cameras: list[str]
     out: str
     validation_vqa: dict[str, ToldOfSet] = field(default_factory=dict)
+    validation_rollout: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -142,6 +153,9 @@ def run(
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         is_finished = goes_on and checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
         if not is_finished:
+            training.episodes = validation_rollout.chosen(
+                recipe, training.policy, training.meta, ranks
+            )
             training.questions = _asked_before(training, on_event)
         if goes_on:
             restored = _restore(training, places)
@@ -175,7 +189,7 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
     questions = validation_vqa.chosen(run.recipe, backbone, on_event)
     if questions is None:
         return None
-    with _evaluating(run.policy):
+    with run.masters.as_written(), _evaluating(run.policy):
         return questions.asked_before(backbone, run.ranks, on_event)
 
 
@@ -781,24 +795,27 @@ def _log(
             loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
         check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
         line["validation_loss"] = loss
-        line |= _vqa_figures(run, finished, on_event)
+        line |= _watched(run, finished, on_event)
         _warn_of_drop(run, line, on_event)
     if run.ranks.first:
         folder.append_metrics(run.out, line)
     return line
 
 
-def _vqa_figures(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, float]:
-    """What the backbone of a checkpoint written now answers; empty where it is not asked.
+def _watched(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, float]:
+    """What a checkpoint written now answers, and how it acts; empty where neither is asked for.
 
     Raises:
-        Diverged: an answer's likelihood is not finite.
+        Diverged: a figure that is not finite, as an answer's likelihood can be.
     """
-    if run.questions is None:
-        return {}
-    heard = on_event if run.questions.seconds > _LONG_S else ignore
-    with run.average.in_place(), _evaluating(run.policy):
-        found = run.questions.figures(run.policy.backbone, run.ranks, heard)
+    found: dict[str, float] = {}
+    with run.average.in_place(), run.masters.as_written(), _evaluating(run.policy):
+        if run.questions is not None:
+            heard = on_event if run.questions.seconds > _LONG_S else ignore
+            found |= run.questions.figures(run.policy.backbone, run.ranks, heard)
+        if run.episodes is not None:
+            heard = on_event if run.episodes.seconds > _LONG_S else ignore
+            found |= run.episodes.figures(run.ranks, heard)
     check_finite(found, f"after step {finished}", LOWER, finished)
     return found
 
@@ -924,4 +941,5 @@ def _report(run: TrainingRun) -> TrainReport:
         cameras=list(run.demos.cameras),
         out=str(run.out),
         validation_vqa=validation_vqa.of_line(run.recipe, lines[-1]),
+        validation_rollout=validation_rollout.of_line(lines[-1]),
     )

@@ -73,6 +73,7 @@ class Report:
     out: Path = Path("x")
     families: dict[str, Any] = field(default_factory=dict)
     validation_vqa: dict[str, Any] = field(default_factory=dict)
+    validation_rollout: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
     gate_failed: tuple[str, ...] = ()
 

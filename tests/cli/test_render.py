@@ -26,7 +26,7 @@ from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live, _warning
 from aegis_cli.cli.render.studies import shown_as, study
-from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe
+from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe, validation_rollout
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.evaluation.open_loop import (
@@ -36,9 +36,9 @@ from aegis_cli.evaluation.open_loop import (
     StepError,
 )
 from aegis_cli.evaluation.results import Result
-from aegis_cli.evaluation.rollout import PartSuccess, RolloutReport
 from aegis_cli.inspection.report import Bin, InspectReport, LayerEnergy, SiteSpectrum
 from aegis_cli.merging.merge import MergePoint, MergeReport
+from aegis_cli.models.acting import PartSuccess, RolloutReport
 from aegis_cli.pretraining.vlm import PretrainReport, Scores
 from aegis_cli.studies.comparison import POLICY_BAR
 from aegis_cli.studies.metrics import Column as Declared
@@ -374,6 +374,20 @@ def test_the_probe_table_lists_families_and_layers():
     compared = SimpleNamespace(layer=0, w2=1.5, baseline_w2=0.5)
     said = text_of(probe(dataclasses.replace(report, layers=(compared,))))
     assert ["0", "1.5", "0.5"] in [line.split() for line in said.splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("acted", "row"),
+    [
+        ({"success": 0.2, "interval": [0.036, 0.624]}, "success % 20.0 3.6 to 62.4"),
+        ({"mean_return": 83.25, "return_interval": [70.0, 96.5]}, "mean return 83.25 70 to 96.5"),
+        ({"mean_return": 83.25, "return_interval": None}, "mean return 83.25 -"),
+    ],
+)
+def test_validation_episodes_are_a_table_with_their_interval(acted: Any, row: str) -> None:
+    (table,) = validation_rollout(acted)
+    assert row in [" ".join(line.split()) for line in text_of(table).splitlines()]
+    assert not list(validation_rollout({}))
 
 
 def test_the_pretraining_table_lists_families():

@@ -34,6 +34,7 @@ from aegis_cli.data.vqa.dataset import load_scenes
 from aegis_cli.deploy import load_acting, load_policy
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import backbones
+from aegis_cli.models.acting import Acting
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import (
     ROBOT_LEARNERS,
@@ -385,14 +386,15 @@ def test_success_is_what_closed_loops_say(
     played = []
 
     def play(
-        policy: Policy, task: str, episodes: int, colors: str, replan: int, split: int, **_: object
+        acting: Acting, episodes: int, colors: str, split: int, **_: object
     ) -> rollout.RolloutReport:
-        played.append((task, len(policy.proprio_scale.mean), episodes, colors, replan, split))
+        task, positions = acting.task, len(acting.policy.proprio_scale.mean)
+        played.append((task, positions, episodes, colors, acting.replan, split))
         return rollout.RolloutReport(
             task=task, success=len(played) / 10, episodes=episodes, episodes_per_s=1.0
         )
 
-    monkeypatch.setattr(rollout, "play", play)
+    monkeypatch.setattr(robots, "play", play)
     settings = RobotRollout(episodes=3, colors="held-out", replan=2, split="validation")
     report = train.run(make("isolated-lora", steps=1, rollout=settings), tmp_path / "run")
     assert played == [

@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from aegis_cli.common.estimates import estimate
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import bootstrap
 from aegis_cli.evaluation.bootstrap import FEW, Units, crossed_interval
-from aegis_cli.evaluation.estimates import estimate
 
 
 def drawn(

@@ -28,6 +28,7 @@ from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import rollout
+from aegis_cli.models import acting
 from aegis_cli.sim.contract import Observation, Step
 from aegis_cli.training import checkpoint, train
 
@@ -364,7 +365,7 @@ def test_a_delay_is_not_for_a_temporal_ensemble(run_folder: Path) -> None:
 def test_progress_and_more_episodes_than_one_group(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rollout, "_LOCKSTEP", 2)
+    monkeypatch.setattr(acting, "_LOCKSTEP", 2)
     puppet(expert)
     events: list = []
     report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)
@@ -453,9 +454,11 @@ def test_a_checkpoint_is_rolled_out_by_its_own_folder(
 ) -> None:
     train.run(recipe(tiny_folder, steps=4), "naive", demos_file, None, tmp_path / "run")
     loaded: list[torch.Tensor] = []
-    monkeypatch.setattr(
-        rollout, "play", lambda policy, *_, **__: loaded.append(next(policy.expert.parameters()))
-    )
+
+    def play(played: acting.Acting, *_: object) -> None:
+        loaded.append(next(played.policy.expert.parameters()))
+
+    monkeypatch.setattr(rollout, "play", play)
     checkpoints = tmp_path / "run" / "checkpoints"
     for folder in (
         tmp_path / "run",
@@ -486,13 +489,13 @@ def test_another_seed_plays_other_episodes(aegis, run_folder: Path) -> None:
         assert code == 0 and json.loads(kept.read_text())["settings"]["seed"] == seed, err
     with pytest.MonkeyPatch.context() as patch:
         begun: list[tuple[int, int]] = []
-        begin = rollout._begin
+        begin = acting._begin
 
-        def noted(task: str, seed: int, stream: int, number: int, *rest: Any) -> Any:
+        def noted(played: acting.Acting, seed: int, stream: int, number: int, *rest: Any) -> Any:
             begun.append((seed, number))
-            return begin(task, seed, stream, number, *rest)
+            return begin(played, seed, stream, number, *rest)
 
-        patch.setattr(rollout, "_begin", noted)
+        patch.setattr(acting, "_begin", noted)
         assert aegis("rollout", run_folder, "--episodes", 2, "--seed", 7)[0] == 0
     assert begun == [(7, 0), (7, 1)]
 
@@ -587,10 +590,8 @@ def test_a_video_says_the_step_the_end_and_the_instruction(
 def test_a_task_measured_by_its_return_shows_that_and_never_ends_well_or_badly() -> None:
     observation = Observation(np.zeros((64, 64, 3), np.uint8), np.zeros(2, np.float32), "run")
     step = Step(observation, None, None, True, reward=0.5)
-    episode = rollout._PlayedEpisode(
-        None, observation, [], last=step, total_reward=83.44, steps=120
-    )
-    moment = rollout._moment(episode, step)
+    episode = acting._PlayedEpisode(None, observation, [], last=step, total_reward=83.44, steps=120)
+    moment = acting._moment(episode, step)
     assert (moment.note, moment.outcome) == ("step 120   return 83.4", None)
 
 

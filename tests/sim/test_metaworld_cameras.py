@@ -25,11 +25,11 @@ from aegis_cli.common.palette import SEEN
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import rollout
-from aegis_cli.models import lerobot_folder
+from aegis_cli.models import acting, lerobot_folder
 from aegis_cli.publishing import export
 from aegis_cli.recipes import Demos
-from aegis_cli.sim.contract import EVALUATION, episode_rng
-from aegis_cli.training import checkpoint, train
+from aegis_cli.sim.contract import EVALUATION, VALIDATION, episode_rng
+from aegis_cli.training import checkpoint, train, validation_rollout
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -46,9 +46,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def trained(backbone: Path, dataset: Path, out: Path, camera: Any, **demos: Any) -> Path:
+def trained(
+    backbone: Path, dataset: Path, out: Path, camera: Any, played: int | None = None, **demos: Any
+) -> Path:
     made = recipe(backbone, steps=1, validation_share=0.5)
     made = replace(made, task=TASK, demos=Demos(camera=camera, **demos))
+    made = replace(made, rollout=replace(made.rollout, while_training=played))
     train.run(made, "naive", dataset, None, out)
     return out
 
@@ -103,12 +106,32 @@ def test_a_policy_of_two_cameras_is_rolled_out_by_both(
         return act(policy, images, *rest)
 
     monkeypatch.setattr(rollout.Policy, "act", noting)
-    report = rollout.run(run, None, 1, rollout.DEFAULT)
+    report = rollout.run(run, None, 1, acting.DEFAULT)
     assert report.episodes == 1 and all(len(row) == 2 for images in seen for row in images)
     export.run(run, tmp_path / "exported")
     config = json.loads((tmp_path / "exported" / lerobot_folder.CONFIG).read_text())
     assert {name for name in config["input_features"] if "images" in name} == {*FULL}
     assert rollout.load_run(tmp_path / "exported", None).cameras == BOTH
+
+
+def test_a_policy_of_two_cameras_acts_by_both_while_it_trains(
+    dataset: Path,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = []
+    play = validation_rollout.play
+
+    def noting(*given: Any, **named: Any) -> acting.RolloutReport:
+        found.append(play(*given, **named))
+        return found[-1]
+
+    monkeypatch.setattr(validation_rollout, "play", noting)
+    run = trained(hf_folder("smolvlm"), dataset, tmp_path / "run", BOTH, played=1)
+    again = rollout.run(run, None, 1, acting.DEFAULT, stream=VALIDATION)
+    assert len(found) == 1 and found[0].outcomes == again.outcomes
+    assert found[0].action_change == pytest.approx(again.action_change, rel=1e-4)
 
 
 def test_another_single_camera_than_the_usual_is_remembered(
@@ -159,9 +182,9 @@ def test_lerobots_environment_shows_the_camera_that_was_asked_for(camera: str) -
     assert found is not None and found.loader is not None
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
-    seen, _ = module.AegisTask(TASK, rollout.DEFAULT, camera).reset(seed=0)
+    seen, _ = module.AegisTask(TASK, acting.DEFAULT, camera).reset(seed=0)
     own = sim.make(TASK, seen_by=(camera,) if camera in BOTH else ())
-    wanted = own.reset(episode_rng(rollout.EVALUATION_SEED, EVALUATION, 0), SEEN)
+    wanted = own.reset(episode_rng(acting.EVALUATION_SEED, EVALUATION, 0), SEEN)
     assert np.array_equal(seen["pixels"][camera], wanted.image)
 
 

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import pytest
 from samples.studies import row
 
-from aegis_cli.evaluation.estimates import Estimate, estimate, t_quantile
+from aegis_cli.common.estimates import Estimate, estimate, t_quantile
 from aegis_cli.recipes import PolicyVariant, Recipe, Train
 from aegis_cli.studies.comparison import (
     POLICY_BAR,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from samples.stream_studies import row
 
-from aegis_cli.evaluation.estimates import Estimate
+from aegis_cli.common.estimates import Estimate
 from aegis_cli.recipes import Pairs, StreamVariant
 from aegis_cli.studies.comparison import StreamResult, stream_results
 from aegis_cli.studies.figures import Divergence

@@ -99,7 +99,9 @@ def shared_runs(
     changes = {"accumulate": 2, "ema_decay": 0.6}
     watched = three["ddp", "distill"]  # three processes ask 2, 2 and 3 of the questions
     probe = replace(watched.recipe.probe, while_training=7)
-    three["ddp", "distill"] = replace(watched, recipe=replace(watched.recipe, probe=probe))
+    played = replace(watched.recipe.rollout, while_training=2)  # the first one alone acts
+    recipe = replace(watched.recipe, probe=probe, rollout=played)
+    three["ddp", "distill"] = replace(watched, recipe=recipe)
     begun = make("aegis", out / "begun", parallel="fsdp", **changes)
     ended = make("aegis", out / "begun", parallel="ddp", **changes)
     # Its expert reads the last layer's keys and values past that layer's output.

@@ -189,7 +189,12 @@ def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: 
 @pytest.mark.parametrize("family", ["smolvlm", "qwen2_5_vl"])
 @pytest.mark.parametrize(
     "changes",
-    [{"weights": "bf16-master"}, {"gradient_checkpointing": True}, {"weights": "bf16"}],
+    [
+        {"weights": "bf16-master"},
+        {"weights": "bf16-master", "freeze": "vision"},
+        {"gradient_checkpointing": True},
+        {"weights": "bf16"},
+    ],
     ids=str,
 )
 def test_models_of_the_hub_are_asked_too(

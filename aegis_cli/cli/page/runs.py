@@ -301,6 +301,8 @@ _CURVES = (
     ("loss", "Training loss", True, 1.0),
     ("validation_loss", "Validation loss", False, 1.0),
     ("vqa_drop_points", "VQA drop, validation (points)", False, 1.0),
+    ("rollout_success", "Success, validation (%)", False, 100.0),
+    ("rollout_mean_return", "Mean return, validation", False, 1.0),
     ("energy_shed", "Energy shed (%)", True, 100.0),
     ("lr_backbone", "Learning rate of the backbone", False, 1.0),
     ("step_s", "Time of a step (s)", False, 1.0),

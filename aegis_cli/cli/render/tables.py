@@ -52,10 +52,10 @@ def facts(report: Any) -> Table:
 
 
 def trained(report: Any) -> RenderableType:
-    """How a training ended, and what its weights answered where it asked."""
+    """How a training ended, what its weights answered where it asked, and how they acted."""
     values = dataclasses.asdict(report)
-    asked = values.pop("validation_vqa")
-    return Group(pairs(values), *validation_vqa(asked))
+    asked, acted = values.pop("validation_vqa"), values.pop("validation_rollout")
+    return Group(pairs(values), *validation_vqa(asked), *validation_rollout(acted))
 
 
 def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
@@ -67,6 +67,20 @@ def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
     if rows:
         head = ("Validation questions", "VQA %", "Drop (points)", "95 % interval")
         yield plain_table(head, rows)
+
+
+def validation_rollout(found: Mapping[str, Any]) -> Iterator[Table]:
+    """A table of how the policy acted in validation episodes; none where it did not act."""
+    shown = {
+        "success": ("success %", "interval", percent),
+        "mean_return": ("mean return", "return_interval", number),
+    }
+    for measure, (name, interval, show) in shown.items():
+        if measure in found:
+            ends = found[interval]
+            between = "-" if ends is None else " to ".join(map(show, ends))
+            head = ("Validation episodes", "Mean", "95 % interval")
+            yield plain_table(head, [(name, show(found[measure]), between)])
 
 
 def serving(report: Any) -> RenderableType:

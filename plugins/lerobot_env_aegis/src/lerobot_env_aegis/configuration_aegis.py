@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
-from aegis_cli.evaluation.rollout import DEFAULT, TARGET_COLORS
+from aegis_cli.models.acting import DEFAULT, TARGET_COLORS
 from lerobot_env_aegis.task_env import SIZE, AegisTask
 
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from aegis_cli import sim
-from aegis_cli.evaluation.rollout import EVALUATION_SEED, TARGET_COLORS
+from aegis_cli.models.acting import EVALUATION_SEED, TARGET_COLORS
 from aegis_cli.sim.contract import EVALUATION, Observation, episode_rng
 
 SIZE = 64  # pixels of a picture's side

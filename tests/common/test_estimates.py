@@ -8,7 +8,7 @@ import statistics
 
 import pytest
 
-from aegis_cli.evaluation.estimates import Estimate, estimate, t_quantile
+from aegis_cli.common.estimates import Estimate, estimate, t_quantile
 
 
 @pytest.mark.parametrize(

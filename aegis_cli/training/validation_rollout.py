@@ -1,0 +1,148 @@
+"""How well the policy acts while it trains: validation episodes beside the validation loss.
+
+They choose checkpoints and learning rates, so no demonstration is of these episodes and no
+evaluation plays them, and what they show is no result. Nothing learns from them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from aegis_cli import sim
+from aegis_cli.common import gl
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, OnEvent
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.models.acting import DEFAULT, Acting, RolloutReport, longest_s, play
+from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
+from aegis_cli.recipes import Recipe
+from aegis_cli.sim.contract import VALIDATION
+from aegis_cli.training import checkpoint
+
+_STAGE = "rollout"
+_PREFIX = "rollout_"  # of its figures in a line of metrics
+# What a task can be measured by, and where a report has its interval.
+_INTERVALS = {"success": "interval", "mean_return": "return_interval"}
+_ENDS = (f"{_PREFIX}low", f"{_PREFIX}high")
+
+
+@dataclass
+class ValidationEpisodes:
+    """The episodes that the policy acts in.
+
+    Attributes:
+        acting: the policy that trains, ready to act; its weights are those of the moment.
+        count: of the episodes, from number 0 on.
+        compiled: whether its passes are compiled.
+        seconds: that they took the last time.
+    """
+
+    acting: Acting
+    count: int
+    seed: int
+    compiled: bool = False
+    seconds: float = math.inf
+
+    def figures(self, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
+        """What a line of metrics says of the policy as it is now.
+
+        A success is in [0, 1], a return in the task's rewards, and so are the ends of its 95 %
+        interval, which the return of one episode does not have. The first process acts, and the
+        others wait: a shared episode would have other noise than `aegis rollout` draws.
+        """
+        started = time.perf_counter()
+        report = ranks.by_first(lambda: self._played(on_event))
+        self.seconds = time.perf_counter() - started
+        return _line(report)
+
+    def longest_s(self, ranks: Ranks) -> float:
+        """About how many seconds they take if none ends early."""
+        return ranks.by_first(self._longest_s)
+
+    def _played(self, on_event: OnEvent) -> RolloutReport:
+        def named(event: Event) -> None:
+            on_event(dataclasses.replace(event, stage=_STAGE))
+
+        with self._as_it_is():
+            return play(
+                self.acting, self.count, DEFAULT, VALIDATION, on_event=named, seed=self.seed
+            )
+
+    def _longest_s(self) -> float:
+        with self._as_it_is():
+            return longest_s(self.acting, self.count, DEFAULT, VALIDATION, self.seed)
+
+    def _as_it_is(self) -> contextlib.AbstractContextManager[object]:
+        """Let no pass inside the block compile anything.
+
+        Episodes end one by one, and each number that is left would be another shape to compile.
+        """
+        if not self.compiled:
+            return contextlib.nullcontext()
+        return torch.compiler.set_stance("force_eager")
+
+
+def _line(report: RolloutReport) -> dict[str, float]:
+    """The figures of a report by their names in a line of metrics."""
+    found: dict[str, float] = {}
+    for measure, interval in _INTERVALS.items():
+        value, ends = getattr(report, measure), getattr(report, interval)
+        if value is not None:
+            found[_PREFIX + measure] = value
+            found |= {} if ends is None else dict(zip(_ENDS, ends, strict=True))
+    return found
+
+
+def of_line(line: Mapping[str, Any]) -> dict[str, Any]:
+    """What a line of metrics says of the episodes, by the names in a report of `aegis rollout`.
+
+    That is `success` with its `interval`, or `mean_return` with its `return_interval`; nothing
+    where none were played.
+    """
+    found: dict[str, Any] = {}
+    for measure, interval in _INTERVALS.items():
+        value = line.get(_PREFIX + measure)
+        if value is not None:
+            ends = [line.get(end) for end in _ENDS]
+            found = {measure: value, interval: None if None in ends else ends}
+    return found
+
+
+def chosen(
+    recipe: Recipe, policy: Policy, meta: PolicyMeta, ranks: Ranks
+) -> ValidationEpisodes | None:
+    """The episodes that a recipe's training plays; None where it plays none.
+
+    Args:
+        meta: what a user of the policy has to know, such as its task.
+
+    Raises:
+        AegisError: demonstrations of no simulated task, one that is not installed, or no OpenGL.
+    """
+    count, task = recipe.rollout.while_training, meta["task"]
+    if count is None:
+        return None
+    if task is None:
+        raise AegisError(
+            f"rollout.while_training: {count} with demonstrations of no simulated task",
+            "demonstrations of a task in which the policy can act",
+            "delete rollout.while_training: the validation loss shows how training goes, and "
+            "aegis evaluate RUN --demos DATA has the errors of the actions afterwards",
+        )
+    cameras = checkpoint.cameras_of(meta, task)
+    if ranks.first:  # the others never act
+        gl.check()
+        sim.make(task, seen_by=cameras)
+    acting = Acting(
+        policy, task, meta["replan"], cameras, meta.get("ensemble"), checkpoint.sizes_of(meta)
+    )
+    return ValidationEpisodes(acting, count, recipe.rollout.seed, recipe.train.compile)

@@ -1,0 +1,416 @@
+"""Episodes played while a run trains: they show success, and training does not notice them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples import lerobot
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    TIMES,
+    Start,
+    assert_resumes,
+    metrics,
+    stop_at,
+)
+
+from aegis_cli import recipes
+from aegis_cli.common import files, gl
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import Event, Progress
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.data.vqa.metrics import wilson_interval
+from aegis_cli.evaluation import kept_figures, rollout
+from aegis_cli.inspection import folders
+from aegis_cli.methods import METHODS
+from aegis_cli.models import acting
+from aegis_cli.models.acting import RolloutReport
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
+from aegis_cli.models.expert import ActionExpert
+from aegis_cli.recipes import Kfac, Nullspace, Recipe
+from aegis_cli.reporting import gather
+from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION
+from aegis_cli.training import checkpoint, dry_run, parallel, train, validation_rollout
+
+COUNT, SEED = 2, 5
+FIGURES = {"rollout_success", "rollout_low", "rollout_high"}
+Reports = list[RolloutReport]
+
+
+@pytest.fixture
+def playing(recipe: Recipe) -> Recipe:
+    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within."""
+    return replace(
+        recipe,
+        rollout=replace(recipe.rollout, while_training=COUNT, seed=SEED),
+        nullspace=Nullspace(every=4),
+        kfac=Kfac(every=4),
+    )
+
+
+def without(recipe: Recipe) -> Recipe:
+    return replace(recipe, rollout=replace(recipe.rollout, while_training=None))
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> Reports:
+    """The whole report of what is played while a run trains, validation by validation."""
+    found: Reports = []
+    play = validation_rollout.play
+
+    def noted(*given: Any, **named: Any) -> RolloutReport:
+        found.append(play(*given, **named))
+        return found[-1]
+
+    monkeypatch.setattr(validation_rollout, "play", noted)
+    return found
+
+
+def again(run: Path, stream: int = VALIDATION) -> RolloutReport:
+    """What the same episodes show of a run's last checkpoint, or of a checkpoint."""
+    return rollout.run(run, None, COUNT, "seen", stream=stream, seed=SEED)
+
+
+def assert_same_episodes(one: RolloutReport, other: RolloutReport, rel: float = 1e-4) -> None:
+    """How far from its target each ended, and how it moved, tell two policies apart."""
+    assert one.outcomes == other.outcomes and one.interval == other.interval
+    assert one.final_distance_m == pytest.approx(other.final_distance_m, rel=rel)
+    assert one.action_change == pytest.approx(other.action_change, rel=rel)
+
+
+@pytest.mark.parametrize("method", ["naive", "kfac", "lora"])
+def test_training_does_not_notice_the_episodes(
+    method: str, playing: Recipe, start: Start, tmp_path: Path
+) -> None:
+    start(method, tmp_path / "played", recipe=playing)
+    start(method, tmp_path / "plain", recipe=without(playing))
+    assert metrics(tmp_path / "played", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    for name in ("backbone/model.safetensors", "expert.safetensors"):
+        one, other = (checkpoint.last(tmp_path / run) / name for run in ("played", "plain"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("changes", [{}, {"ema_decay": 0.6}], ids=str)
+@pytest.mark.parametrize("method", ["naive", "lora"])
+def test_the_figures_are_those_of_the_checkpoint(
+    method: str,
+    changes: dict[str, Any],
+    playing: Recipe,
+    start: Start,
+    played: Reports,
+    tmp_path: Path,
+) -> None:
+    settings = replace(SETTINGS, checkpoint_every=3, **changes)
+    report = start(method, tmp_path / "run", recipe=replace(playing, train=settings))
+    early, late = played
+    assert_same_episodes(early, again(tmp_path / "run" / "checkpoints" / "000003"))
+    assert_same_episodes(late, again(tmp_path / "run"))
+    assert early.action_change != pytest.approx(late.action_change, rel=1e-3)
+    last = metrics(tmp_path / "run")[-1]
+    low, high = wilson_interval(late.success * COUNT, COUNT)
+    assert {name: last[name] for name in FIGURES} == {
+        "rollout_success": late.success,
+        "rollout_low": low,
+        "rollout_high": high,
+    }
+    assert report.validation_rollout == {"success": late.success, "interval": [low, high]}
+
+
+def test_no_evaluation_plays_these_episodes_and_tuning_does(
+    playing: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[tuple[int, int, int]] = []
+    draw = acting.episode_rng
+
+    def noted(*place: int) -> Any:
+        drawn.append(place)
+        return draw(*place)
+
+    monkeypatch.setattr(acting, "episode_rng", noted)
+    start("naive", tmp_path / "run", recipe=playing)
+    mine = set(drawn)
+    assert mine == {(SEED, VALIDATION, number) for number in range(COUNT)}
+    drawn.clear()
+    again(tmp_path / "run", EVALUATION)
+    # A seed's streams share no episode, whatever the seed of demonstrations and evaluations is.
+    assert len(drawn) == COUNT and not mine & set(drawn)
+    assert {stream for _, stream, _ in mine} & {DEMOS, EVALUATION} == set()
+    first = {stream: draw(SEED, stream, 0).random() for stream in (DEMOS, EVALUATION, VALIDATION)}
+    assert len(set(first.values())) == 3
+
+
+def test_they_are_played_with_every_validation_loss_and_no_other_time(
+    playing: Recipe, start: Start, played: Reports, tmp_path: Path
+) -> None:
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=playing, on_event=events.append)
+    lines = metrics(tmp_path / "run")
+    for line in lines:
+        assert ("validation_loss" in line) == FIGURES.issubset(line)
+    assert len(played) == STEPS // SETTINGS.validate_every
+    shown = [e for e in events if isinstance(e, Progress) and e.stage == "rollout"]
+    # Those of the first time; they were short, so that others would be two lines of a log each.
+    assert [e.done for e in shown] == sorted(e.done for e in shown) and shown[-1].done > 0
+    assert shown[-1].done == shown[-1].total
+    told = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
+    names = {"success": "success", "at least": "low", "at most": "high"}
+    for label, name in names.items():
+        assert told[label] == lines[-1][f"rollout_{name}"]
+
+
+def test_episodes_that_took_long_are_shown_again(
+    playing: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "_LONG_S", 0.0)
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=playing, on_event=events.append)
+    ends = [e for e in events if isinstance(e, Progress) and e.stage == "rollout"]
+    assert [e.done == e.total for e in ends].count(True) == STEPS // SETTINGS.validate_every
+
+
+def test_a_run_goes_on_with_the_same_episodes(
+    playing: Recipe, start: Start, tmp_path: Path
+) -> None:
+    assert_resumes(start, "naive", playing, tmp_path)
+    events: list[Event] = []
+    report = start("naive", tmp_path / "whole", recipe=playing, resume=True, on_event=events.append)
+    # A run that has ended tells its figures and plays nothing.
+    assert not [e for e in events if "rollout" in getattr(e, "stage", "")]
+    last = metrics(tmp_path / "whole")[-1]
+    assert report.validation_rollout["success"] == last["rollout_success"]
+
+
+def test_a_run_may_begin_or_cease_to_play_when_it_goes_on(
+    playing: Recipe, start: Start, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(4, KeyboardInterrupt())
+        start("naive", tmp_path / "run", recipe=without(playing), on_event=stop)
+    start("naive", tmp_path / "run", recipe=playing, resume=True)
+    start("naive", tmp_path / "whole", recipe=playing)
+    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    assert one == other
+    assert recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe).rollout.while_training
+
+
+def test_inspect_and_the_page_tell_them(playing: Recipe, start: Start, tmp_path: Path) -> None:
+    report = start("naive", tmp_path / "run", recipe=playing)
+    found = folders.inspect(tmp_path / "run")
+    assert found.facts["validation_rollout"] == report.validation_rollout
+    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
+    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
+    told = early.facts["validation_rollout"]
+    assert told == {
+        "success": line["rollout_success"],
+        "interval": [line["rollout_low"], line["rollout_high"]],
+    }
+    # `aegis run` keeps the report, and reads it again for its page.
+    files.save_json(tmp_path / "train.json", report.to_json())
+    kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
+    assert kept["validation_rollout"] == report.validation_rollout
+    drawn = gather.run_document(tmp_path / "run").metrics
+    assert [at["step"] for at in drawn if "rollout_success" in at] == [3, STEPS]
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("interval", [(70.0, 90.0), None])
+def test_a_task_without_success_has_its_return(interval: tuple[float, float] | None) -> None:
+    report = RolloutReport(
+        task="suite/cartpole-swingup",
+        mean_return=80.0,
+        return_interval=interval,
+        episodes=2,
+        episodes_per_s=1.0,
+    )
+    line = validation_rollout._line(report)
+    ends = {} if interval is None else {"rollout_low": 70.0, "rollout_high": 90.0}
+    assert line == {"rollout_mean_return": 80.0} | ends
+    wanted = None if interval is None else list(interval)
+    assert validation_rollout.of_line(line) == {"mean_return": 80.0, "return_interval": wanted}
+    assert validation_rollout.of_line({"step": 3, "loss": 1.0}) == {}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"weights": "bf16-master"},
+        {"weights": "bf16-master", "freeze": "vision"},
+        {"gradient_checkpointing": True},
+        {"weights": "bf16"},
+    ],
+    ids=str,
+)
+def test_models_of_the_hub_act_too(
+    changes: dict[str, Any],
+    playing: Recipe,
+    start: Start,
+    played: Reports,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+) -> None:
+    settings = replace(SETTINGS, steps=2, validate_every=2, **changes)
+    own = replace(playing, backbone=str(hf_folder("smolvlm")), train=settings)
+    start("naive", tmp_path / "run", recipe=own, anchor=None)
+    start("naive", tmp_path / "plain", recipe=without(own), anchor=None)
+    for name in ("backbone/model.safetensors", "expert.safetensors"):
+        one, other = (checkpoint.last(tmp_path / run) / name for run in ("run", "plain"))
+        assert one.read_bytes() == other.read_bytes()
+    # A checkpoint is read in float32, whatever it is stored in.
+    rel = 1e-2 if changes.get("weights") == "bf16" else 1e-4
+    assert_same_episodes(played[0], again(tmp_path / "run"), rel)
+
+
+# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_nothing_is_compiled_for_episodes(
+    playing: Recipe,
+    start: Start,
+    played: Reports,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graphs: list[object] = []
+
+    def counted(graph: Any, _: object) -> Any:
+        graphs.append(graph)
+        return graph.forward
+
+    for owner, name in ((EmbeddedVLM, "compile_passes"), (ActionExpert, "compile_layers")):
+        real = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda part, real=real: real(part, counted))
+    compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=2, compile=True))
+    start("naive", tmp_path / "plain", recipe=without(compiling))
+    before = len(graphs)
+    graphs.clear()
+    torch._dynamo.reset()
+    start("naive", tmp_path / "run", recipe=compiling)
+    assert len(graphs) == before > 0
+    assert_same_episodes(played[0], again(tmp_path / "run"))
+
+
+def test_one_process_acts_and_the_others_are_told(
+    playing: Recipe, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(_: Ranks, box: list[Any]) -> Any:
+        assert box == [None]
+        return RolloutReport(
+            task="reach", success=0.5, interval=(0.1, 0.9), episodes=COUNT, episodes_per_s=1.0
+        )
+
+    monkeypatch.setattr(Ranks, "_told", told)
+    monkeypatch.setattr(validation_rollout, "play", lambda *_, **__: pytest.fail("acted"))
+    monkeypatch.setattr(gl, "check", lambda: pytest.fail("opened"))
+    meta: Any = {"task": "reach", "replan": 2}
+    nobody: Any = None
+    second = validation_rollout.chosen(playing, nobody, meta, Ranks(1, 2))
+    assert second is not None
+    found = second.figures(Ranks(1, 2), lambda _: None)
+    assert found == {"rollout_success": 0.5, "rollout_low": 0.1, "rollout_high": 0.9}
+
+
+def test_a_dry_run_tells_how_long_they_take(
+    playing: Recipe, demos_file: Path, tmp_path: Path, played: Reports
+) -> None:
+    plan = dry_run.run(playing, "naive", demos_file, None, tmp_path / "run")
+    assert not played and not (tmp_path / "run").exists()
+    assert plan.rollout_s > 0
+    validations = STEPS // SETTINGS.validate_every
+    seconds = STEPS * plan.step_s + validations * plan.rollout_s
+    assert plan.hours == pytest.approx(seconds / 3600)
+    plain = dry_run.run(without(playing), "naive", demos_file, None, tmp_path / "run")
+    assert plain.rollout_s is None and plain.hours == pytest.approx(STEPS * plain.step_s / 3600)
+
+
+def test_memory_that_does_not_suffice_to_act_is_told(
+    playing: Recipe, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(validation_rollout, "longest_s", full)
+    plan = dry_run.run(playing, "naive", demos_file, None, tmp_path / "run")
+    assert plan.memory_fits is False and plan.memory_measured_mb is None
+    assert (plan.rollout_s, plan.step_s, plan.hours) == (None, None, None)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("frame_cache")
+def test_a_robot_that_is_not_simulated_is_refused_before_the_first_step(
+    playing: Recipe, start: Start, tmp_path: Path
+) -> None:
+    demos = tmp_path / "arm"
+    lerobot.save(demos, lerobot.episodes(4, texts=("move the finger to the red target",)))
+    said = "rollout.while_training: 2 with demonstrations of no simulated task"
+    with pytest.raises(AegisError, match=said) as refused:
+        start("naive", tmp_path / "run", recipe=playing, demos=demos)
+    assert "aegis evaluate RUN" in refused.value.fix
+    assert not (tmp_path / "run" / "recipe.yaml").exists()
+    with pytest.raises(AegisError, match=said):
+        dry_run.run(playing, "naive", demos, None, tmp_path / "run")
+
+
+def test_without_opengl_no_step_is_taken(
+    playing: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise AegisError("neither libEGL nor libOSMesa", "one of them", "install it")
+
+    monkeypatch.setattr(gl, "check", missing)
+    with pytest.raises(AegisError, match="libEGL"):
+        start("naive", tmp_path / "run", recipe=playing)
+    assert not (tmp_path / "run" / "recipe.yaml").exists()
+    start("naive", tmp_path / "plain", recipe=without(playing))
+
+
+@pytest.mark.fast
+def test_shares_of_the_weights_do_not_act(playing: Recipe) -> None:
+    sharded = replace(playing, train=replace(SETTINGS, parallel="fsdp"))
+    with pytest.raises(AegisError, match="rollout.while_training: 2 with train.parallel: fsdp"):
+        parallel.check(sharded, METHODS["naive"], Ranks(1, 2))
+    parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("recipe_file", "count", "expected"),
+    [
+        ("quickstart", 10**8, "10,000,000"),
+        ("quickstart", 0, "from 1"),
+        ("igsp-robot", 7, "delete 'rollout.while_training'"),
+    ],
+)
+def test_numbers_that_cannot_be_played_are_refused(
+    recipe_file: str, count: int, expected: str
+) -> None:
+    with pytest.raises(AegisError) as refused:
+        recipes.load_training(f"recipes/{recipe_file}.yaml", [f"rollout.while_training={count}"])
+    assert "rollout.while_training" in refused.value.found and expected in str(refused.value)
+
+
+def test_a_figure_that_is_not_finite_ends_the_run(
+    playing: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = validation_rollout.ValidationEpisodes.figures
+
+    def broken(*given: Any) -> dict[str, float]:
+        return figures(*given) | {"rollout_success": float("nan")}
+
+    monkeypatch.setattr(validation_rollout.ValidationEpisodes, "figures", broken)
+    with pytest.raises(Diverged, match="rollout_success"):
+        start("naive", tmp_path / "run", recipe=playing)
+    assert all("rollout_success" not in line for line in metrics(tmp_path / "run"))
+
+
+@pytest.mark.fast
+def test_no_record_of_earlier_work_knows_the_key(playing: Recipe) -> None:
+    assert recipes.training_part(playing) == recipes.training_part(without(playing))
+    assert "while_training" not in recipes.recorded(without(playing).rollout)
+    assert asdict(playing)["rollout"]["while_training"] == COUNT
