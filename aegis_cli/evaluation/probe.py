@@ -17,7 +17,7 @@ from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
 from aegis_cli.core.transport import w2_diag
-from aegis_cli.data.vqa import easy, sets
+from aegis_cli.data.vqa import easy, knowledge, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.gate import MEAN, passes
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, prediction, score
@@ -223,30 +223,9 @@ def _answered(
 def warn_of_little_knowledge(
     report: ProbeReport, model: str, ask: str, stage: str, on_event: OnEvent
 ) -> None:
-    """Warn where a drop says nothing, since the questions were not answered before either.
-
-    Args:
-        ask: how the questions were asked.
-    """
-    known = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
-    if known >= report.majority:
-        return
-    text = (
-        f"'{model}' answers {100 * known:.1f} % of these questions, and always the commonest "
-        f"answer of their family would answer {100 * report.majority:.1f} %: it can hardly lose "
-        "what it does not know. "
-    )
-    if ask == sets.PLAIN:
-        text += (
-            "A model that answers in sentences needs e.g. --ask '{} Answer with a single word or "
-            "phrase.' (anchor.ask and probe.ask in a recipe)"
-        )
-    else:
-        text += (
-            f"They were asked as '{ask}': see what it answers (--predictions of aegis probe), or "
-            "ask in the way that its own documentation has"
-        )
-    on_event(Warned(stage, text))
+    """Warn where the questions were not answered before either; `ask` is how they were asked."""
+    before = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
+    knowledge.warn_if_little(before, report.majority, model, ask, stage, on_event)
 
 
 def warn_of_few_questions(

@@ -190,7 +190,9 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
     if questions is None:
         return None
     with run.masters.as_written(), _evaluating(run.policy):
-        return questions.asked_before(backbone, run.ranks, on_event)
+        questions = questions.asked_before(backbone, run.ranks, on_event)
+    questions.warn_of_little_knowledge(run.recipe, on_event)
+    return questions
 
 
 def _machine(run: TrainingRun) -> dict[str, str | int]:

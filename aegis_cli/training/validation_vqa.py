@@ -14,7 +14,7 @@ from typing import Any
 
 from aegis_cli.common.events import Event, OnEvent
 from aegis_cli.common.ranks import Ranks
-from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa import knowledge, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.gate import passes
 from aegis_cli.data.vqa.metrics import Graded, drop_interval, score
@@ -22,6 +22,7 @@ from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Recipe
 
+_BEFORE = "VQA before training"  # the stage's name
 _PREFIX = "vqa_"  # of its figures in a line of metrics
 _FIGURES = ("accuracy", "cross_entropy", "drop_points", "drop_low", "drop_high")
 ToldOfSet = dict[str, Any]  # floats, and under `drop_interval` two
@@ -46,9 +47,18 @@ class ValidationQuestions:
     ) -> ValidationQuestions:
         """The same, with the answers of a backbone that has not learned yet."""
         started = time.perf_counter()
-        before = self._answers(backbone, ranks, on_event, "VQA before training")
+        before = self._answers(backbone, ranks, on_event, _BEFORE)
         taken = time.perf_counter() - started
         return dataclasses.replace(self, before=before, seconds=taken)
+
+    def warn_of_little_knowledge(self, recipe: Recipe, on_event: OnEvent) -> None:
+        """Warn of each set whose answers the backbone did not know: none of it can be lost."""
+        model, prompt = recipe.backbone, recipe.probe.ask
+        for then in self.before:
+            known = score(then)
+            knowledge.warn_if_little(
+                known.accuracy, known.majority, model, prompt, _BEFORE, on_event
+            )
 
     def figures(self, backbone: Backbone, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
         """What a line of metrics says of the backbone as it is now.

@@ -460,6 +460,20 @@ def test_weights_that_are_pickles(bad: Bad, model: Path) -> None:
     bad(*MEASURE, "model", says=("no *.safetensors", "but pytorch_model.bin", "save_pretrained"))
 
 
+def test_the_weights_of_a_model_without_its_folder(bad: Bad, model: Path) -> None:
+    bad(*MEASURE, "model/model.safetensors", says=("weights of a Hugging Face", "give 'model'"))
+
+
+@pytest.mark.parametrize("named", ["folder", "file", "folder with a config.json"])
+def test_a_model_of_llama_cpp(named: str, bad: Bad, model: Path) -> None:
+    (model / "model.safetensors").unlink()
+    (model / "model-Q8_0.gguf").write_bytes(b"GGUF" + bytes(60))
+    if named == "folder":
+        (model / "config.json").unlink()
+    given = "model/model-Q8_0.gguf" if named == "file" else "model"
+    bad(*MEASURE, given, says=("GGUF: 'model/model-Q8_0.gguf'", "the model that it was made from"))
+
+
 def test_layers_of_the_embedded_vlm_are_not_named(bad: Bad, place: Path) -> None:
     for name in ("embedded", "model.safetensors"):
         bad(*MEASURE, f"{name}#layers", says=("'#layers'", "leave it out"))

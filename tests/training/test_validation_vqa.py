@@ -96,6 +96,23 @@ def test_the_figures_are_those_of_the_checkpoint(
     assert {key for key in line if key.startswith("vqa_")} == FIGURES
 
 
+@pytest.mark.parametrize("knows", [False, True])
+def test_a_model_that_has_nothing_to_lose_is_warned_of_before_the_first_step(
+    knows: bool, asking: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if knows:
+
+        def right(*given: Any) -> list[Any]:
+            return [replace(graded, correct=True) for graded in ask(*given)]
+
+        monkeypatch.setattr(validation_vqa, "ask", right)
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=asking, on_event=events.append)
+    first = next(n for n, e in enumerate(events) if isinstance(e, Progress) and e.stage == "train")
+    found = [n for n, e in enumerate(events) if isinstance(e, Warned) and "hardly lose" in e.text]
+    assert len(found) == (not knows) and all(number < first for number in found)
+
+
 def test_they_are_asked_with_every_validation_loss_and_no_other_time(
     asking: Recipe, start: Start, tmp_path: Path
 ) -> None:

@@ -17,6 +17,8 @@ from aegis_cli.data.vqa.questions import Question
 
 # Halves of characters (surrogates): JSON can hold them, but no tokenizer takes them.
 _HALVES = re.compile("[\ud800-\udfff]")
+# What the answers of a question are called, the first that is there.
+ANSWERS = ("answers", "answer", "multiple_choice_answer")
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 

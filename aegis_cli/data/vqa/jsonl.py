@@ -1,6 +1,7 @@
 """`--vqa FILE.jsonl`: a question per line.
 
 A line is `{"image": "a/b.jpg", "question": "...", "answers": ["..."]}`, with an optional `"id"`.
+The answers may be called `answer` or `multiple_choice_answer`, too.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.data.vqa.images import Picture
 
 
@@ -58,7 +59,8 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
             "one image of each question, as a path",
             "name the one that is asked about, or join them into one picture",
         )
-    missing = [key for key in ("image", "question", "answers") if key not in raw]
+    answers = next((key for key in ANSWERS if key in raw), ANSWERS[0])
+    missing = [key for key in ("image", "question", answers) if key not in raw]
     if missing:
         raise bad(
             where,
@@ -76,7 +78,7 @@ def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
     name = raw.get("id")
     # Without an id the line is the name by which predictions tell the question.
     own = f"line {number}" if name is None else name
-    question = make_question(where, raw["question"], raw["answers"], own, "all")
+    question = make_question(where, raw["question"], raw[answers], own, "all")
     path = images.find(where, raw["image"])
     # Not as it is spelt: two spellings of one image would put it into two parts.
     return Entry(where, question, Picture(images.name(path), where, path))

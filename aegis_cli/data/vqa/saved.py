@@ -16,10 +16,9 @@ from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import refuse_special, sha256_file
-from aegis_cli.data.vqa.entries import Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.data.vqa.images import Picture
 
-_ANSWERS = ("answers", "answer", "multiple_choice_answer")
 _NAMES = ("question_id", "id")
 # Files that save_to_disk writes for one split, and for several.
 _SAVED, _SPLITS = "state.json", "dataset_dict.json"
@@ -133,11 +132,11 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     rows = _open(path, files)
     stored = _Stored(path, files, rows)
     columns = rows.column_names
-    answers = next((c for c in _ANSWERS if c in columns), None)
+    answers = next((c for c in ANSWERS if c in columns), None)
     if "image" not in columns or "question" not in columns or answers is None:
         raise AegisError(
             f"the columns {', '.join(columns)} in '{path}'",
-            f"image, question and one of {', '.join(_ANSWERS)}",
+            f"image, question and one of {', '.join(ANSWERS)}",
             "rename the columns (datasets: rename_column)",
         )
     keyed = "image_id" in columns  # then no image has to be read to tell which images are the same

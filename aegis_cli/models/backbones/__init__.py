@@ -34,6 +34,8 @@ def locate(name: str) -> Path:
         AegisError: no such model, or one whose path is no text, which no reader of it takes.
     """
     name = divided(name)[0]
+    model_folder.refuse_gguf(Path(name))
+    model_folder.refuse_part(Path(name))
     # The disk goes before the hub: a folder `models/x` is no id.
     if (here := _on_disk(name)) is not None:
         files.check_utf8(here, files.RENAME)

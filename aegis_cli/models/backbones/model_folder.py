@@ -265,6 +265,28 @@ def refuse_adapter(folder: Path) -> None:
         )
 
 
+def refuse_part(path: Path) -> None:
+    """Raise AegisError for a file of weights out of a model's folder, where the folder is meant."""
+    folder = path.parent
+    if path.suffix == ".safetensors" and is_model(folder) and not is_policy(folder):
+        raise AegisError(
+            f"'{path}', the weights of a Hugging Face model",
+            "the model's folder, which has its configuration and its processor too",
+            f"give '{folder}'",
+        )
+
+
+def refuse_gguf(path: Path) -> None:
+    """Raise AegisError for a model in llama.cpp's form: a file, or a folder without others."""
+    found = [path] if path.suffix == ".gguf" else sorted(path.glob("*.gguf"))
+    if found and not weights(path):
+        raise AegisError(
+            f"a model in llama.cpp's form, GGUF: '{found[0]}'",
+            "the folder of a Hugging Face model: config.json, *.safetensors and the processor",
+            "take the model that it was made from",
+        )
+
+
 def check_attention(layers: nn.ModuleList) -> None:
     """Raise AegisError unless each layer has one attention module, over the tokens themselves."""
     for number, layer in enumerate(layers):

@@ -128,6 +128,15 @@ def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
     } == {"images/0.png"}
 
 
+@pytest.mark.parametrize("key", ["answers", "answer", "multiple_choice_answer"])
+def test_lines_may_call_answers_as_a_hugging_face_data_set_does(key: str, tmp_path: Path) -> None:
+    write_jsonl(tmp_path, 1)
+    line = json.dumps(row("images/0.png", answers=None) | {key: "red"})
+    (tmp_path / "own.jsonl").write_text(line)
+    (entry,) = sets.read(str(tmp_path / "own.jsonl")).entries
+    assert entry.question.answers == ("red",)
+
+
 @pytest.mark.parametrize(("release", "own_folder"), [("v2_", True), ("", False)])
 def test_the_official_pair_as_it_is_distributed(
     release: str, own_folder: bool, tmp_path: Path
