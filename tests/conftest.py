@@ -10,7 +10,7 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from samples.command import command
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
+from aegis_cli.common import garbage
 from aegis_cli.data import record
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
@@ -83,6 +84,13 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     path = collection_path.relative_to(TESTS).as_posix()
     return None if fast.may_be_fast(path) else True
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look for no garbage while the tests are imported."""
+    with garbage.left_out():
+        return (yield)
 
 
 @pytest.hookimpl(trylast=True)
