@@ -67,7 +67,7 @@ def run(
         seed: seeds the noise of every connection alike.
         precision, ensemble: see `load_policy`.
         on_ready: is told where, once the server listens.
-        tell: is told in a line who connects, what is refused, and who has gone.
+        tell: is told in a line what is loaded, who connects, what is refused, and who has gone.
 
     Raises:
         AegisError: no such run, an address that cannot be listened at, or a prompt that the
@@ -78,6 +78,7 @@ def run(
         raise AegisError("an empty --host", "an address of this machine", "--host 127.0.0.1")
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
+    tell(f"loading '{run_path}'")  # of a large VLM for a minute and longer
     policy = load_policy(run_path, task, seed, precision, ensemble=ensemble)
     if prompt is not None:
         policy.check_instruction(prompt)

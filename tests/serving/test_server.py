@@ -349,7 +349,8 @@ def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:
                 client.socket.recv()
         assert process.wait(20) == 128 + signal.SIGTERM
         assert process.stdout.read() == ""
-        *visit, said = process.stderr.read().splitlines()
+        loading, *visit, said = process.stderr.read().splitlines()
+        assert loading == f"loading '{naive_run}'"
         assert said == "ended by SIGTERM; the server is closed"
         assert [line.split(" ", 1)[1] for line in visit] == [
             "has connected",

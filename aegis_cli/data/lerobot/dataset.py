@@ -93,9 +93,14 @@ class Dataset:
             if camera in cameras:
                 return self.own(camera)
         listed = ", ".join(cameras) or "no camera at all"
-        raise AegisError(
-            f"no camera '{name}' in '{self.folder}'", f"one of: {listed}", _choose(cameras)
-        )
+        found = f"no camera '{name}' in '{self.folder}'"
+        if any(self._is_depth(camera) for camera in (name, layout.CAMERA + name)):
+            found = f"the camera '{name}' in '{self.folder}' shows depth, which no backbone reads"
+        raise AegisError(found, f"one of: {listed}", _choose(cameras))
+
+    def _is_depth(self, camera: str) -> bool:
+        feature = self.info.features.get(self.own(camera))
+        return feature is not None and feature.is_depth
 
     def size(self, feature: str) -> int:
         """How many numbers a vector feature has in each frame.

@@ -13,8 +13,9 @@ from samples.lerobot import TEXTS, edit_info, episodes, joined, save
 
 from aegis_cli import inspection
 from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
 from aegis_cli.data import record
-from aegis_cli.data.lerobot import layout
+from aegis_cli.data.lerobot import dataset, layout
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -99,6 +100,9 @@ def test_a_picture_of_depth_has_no_colours(aegis: Any, tmp_path: Path) -> None:
     features = {feature["name"]: feature for feature in inspected(aegis, folder)["features"]}
     assert features["observation.images.depth"]["components"] == ["depth"]
     assert features["observation.images.top"]["components"] == ["red", "green", "blue"]
+    for name in ("depth", "observation.images.depth"):
+        with pytest.raises(AegisError, match=f"(?s)'{name}' in .* shows depth.*one of: [^,]*top\n"):
+            dataset.load(folder).cameras(name)
 
 
 def test_a_dataset_without_statistics_or_names(aegis: Any, tmp_path: Path) -> None:
