@@ -15,7 +15,7 @@ from torch import Tensor
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
@@ -210,7 +210,8 @@ def _on_questions(
     files.check_utf8(out, "choose another --out")
     files.check_writable(out)
     files.check_apart("--out", out, [*source.files, *backbones.model_files(backbone)])
-    model = backbones.load(backbone).to(devices.pick())
+    with loading_told("anchor", on_event):
+        model = backbones.load(backbone).to(devices.pick())
     asked = source.choose(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
@@ -243,7 +244,8 @@ def _on_frames(
     files.check_writable(out)
     files.check_apart("--out", out, [demos, *backbones.model_files(backbone)])
     mixture.check_rename((demos,), selection.rename)
-    model = backbones.load(backbone).to(devices.pick())
+    with loading_told("anchor", on_event):
+        model = backbones.load(backbone).to(devices.pick())
     # None: all episodes are held out from training, so that all their frames are in `validation`.
     found = demonstrations.load(
         demos, None, 0, selection, model.image_size, on_event=on_event, cache=False

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 
@@ -34,3 +35,14 @@ OnEvent = Callable[[Event], None]
 
 def ignore(_: Event) -> None:
     """The default listener: a stage called as a library function stays silent."""
+
+
+@contextmanager
+def loading_told(stage: str, on_event: OnEvent) -> Generator[None]:
+    """Tell that a stage loads its model and what it reads, and when it has.
+
+    Otherwise nobody hears of a stage for a minute or more, if its log is a pipe.
+    """
+    on_event(Progress(f"{stage} (loading)", 0, 1, "model"))
+    yield
+    on_event(Progress(f"{stage} (loading)", 1, 1, "model"))

@@ -19,7 +19,7 @@ from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands, devices, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.estimates import t_quantile
-from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
 from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
 from aegis_cli.data.demonstrations import Demonstrations
@@ -187,7 +187,8 @@ def run(
     """
     run_path, data = Path(run_path), Path(data)
     source = _Source.find(run_path)
-    policy, meta = checkpoint.load_policy(source.checkpoint)
+    with loading_told("evaluate", on_event):
+        policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
     _check_robot(policy, meta, data, learned, on_event)

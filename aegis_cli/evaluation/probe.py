@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from aegis_cli.anchors import anchor_file, moments
 from aegis_cli.common import artifacts, devices, files
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.ranks import ALONE, Ranks, joined
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import merge
@@ -131,8 +131,9 @@ def run(
     if predictions is not None:
         models = [name for name in (target, baseline) if name is not None]
         _check_predictions(predictions, source.files, models, anchor)
-    model = backbones.load(target)
-    before = None if baseline is None else backbones.load(baseline)
+    with loading_told("probe", on_event):
+        model = backbones.load(target)
+        before = None if baseline is None else backbones.load(baseline)
     if before is not None:
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)

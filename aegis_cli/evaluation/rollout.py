@@ -9,7 +9,7 @@ from pathlib import Path
 from aegis_cli import sim
 from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.core import ensemble as temporal
 from aegis_cli.evaluation import results
@@ -77,7 +77,8 @@ def run(
     if video_out is not None:
         media.check_video(video_out)
     gl.check()
-    acting = (load or load_run)(Path(run_path), task)
+    with loading_told("rollout", on_event):
+        acting = (load or load_run)(Path(run_path), task)
     if acting.rate is not None:
         _check_rate(acting.rate, acting.task, on_event)
     # Whoever asks for another number of executed actions does without the policy's own ensemble,

@@ -17,7 +17,7 @@ from aegis_cli import recipes
 from aegis_cli.anchors import curvature, inputs
 from aegis_cli.common import artifacts, devices, files, machine
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, loading_told
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data import mixture
@@ -108,9 +108,10 @@ class PolicyRun:
         self._recipe = recipes.load(self._run / "recipe.yaml")
         self._header = artifacts.read_header(self._checkpoint / checkpoint.EXPERT)
         self.base_name = settings.base or self._recipe.backbone
-        self.base = backbones.load(self.base_name).to(devices.pick())
-        self._check_base()  # before the policy is loaded, which is as large again
-        policy, self._meta = checkpoint.load_policy(self._checkpoint)
+        with loading_told("merge", on_event):
+            self.base = backbones.load(self.base_name).to(devices.pick())
+            self._check_base()  # before the policy is loaded, which is as large again
+            policy, self._meta = checkpoint.load_policy(self._checkpoint)
         self._policy = policy.to(devices.pick())
         self.backbone = self._policy.backbone
         _check_alike(self.backbone, self.base)
@@ -265,8 +266,9 @@ class ModelFolder:
                 "give the run's folder, or the task as questions: --task-vqa SET",
             )
         self._settings, self._on_event, self.base_name = settings, on_event, settings.base
-        self.backbone = backbones.load(target).to(devices.pick())
-        self.base = backbones.load(settings.base).to(devices.pick())
+        with loading_told("merge", on_event):
+            self.backbone = backbones.load(target).to(devices.pick())
+            self.base = backbones.load(settings.base).to(devices.pick())
         _check_alike(self.backbone, self.base)
 
     def task_spectra(self, part: str) -> dict[str, Spectrum]:

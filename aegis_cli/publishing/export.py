@@ -18,7 +18,7 @@ import yaml
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
 from aegis_cli.data.lerobot import layout
 from aegis_cli.inspection import steps_taken
@@ -103,7 +103,8 @@ def run(
             "leave --camera out, or give --format lerobot",
         )
     run_path = download.locate(run_path)
-    policy, meta = checkpoint.load_policy(run_path)
+    with loading_told("export", on_event):
+        policy, meta = checkpoint.load_policy(run_path)
     steps, planned = warn_of_steps_left(run_path, "export", on_event)
     warn_of_a_merge(run_path, "export", on_event)
     meta, rounded = _rounded(policy.backbone, meta, dtype)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from aegis_cli import methods
 from aegis_cli.common import devices, launch, memory
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
@@ -30,7 +30,6 @@ from aegis_cli.training import (
     assemble,
     checkpoint,
     inputs,
-    loading,
     longer,
     optimizers,
     parallel,
@@ -169,7 +168,7 @@ def _planned(
     ranks.wait()
     method = methods.get(recipe.train.method)
     told = on_event if ranks.first else ignore
-    with loading.told("dry run", told):
+    with loading_told("dry run", told):
         training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     # They are not asked here: that they can be is all that a plan needs to know.
     validation_vqa.chosen(recipe, training.policy.backbone, told)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from aegis_cli import recipes
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices, launch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, Warned
+from aegis_cli.common.events import OnEvent, Warned
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
@@ -56,17 +55,6 @@ class Loaded:
     watched: WatchedFiles
     anchor: str | None
     measured: Anchor | None
-
-
-@contextlib.contextmanager
-def told(stage: str, on_event: OnEvent) -> Generator[None]:
-    """Tell that a stage loads its model and what it learns from, and when it has.
-
-    Otherwise nobody hears of a stage for minutes, before its first step, whose log is a pipe.
-    """
-    on_event(Progress(f"{stage} (loading)", 0, 1, "model"))
-    yield
-    on_event(Progress(f"{stage} (loading)", 1, 1, "model"))
 
 
 def load(

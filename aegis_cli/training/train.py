@@ -28,7 +28,7 @@ from aegis_cli.common import (
     prefetch,
 )
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
-from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
 from aegis_cli.common.headers import rewrite
 from aegis_cli.common.kinds import is_finite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
@@ -50,7 +50,6 @@ from aegis_cli.training import (
     eight_bit,
     folder,
     inputs,
-    loading,
     longer,
     parallel,
     step,
@@ -149,7 +148,7 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
-        with loading.told("train", on_event):
+        with loading_told("train", on_event):
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
         is_finished = goes_on and checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
         if not is_finished:

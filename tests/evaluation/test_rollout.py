@@ -369,6 +369,9 @@ def test_progress_and_more_episodes_than_one_group(
     puppet(expert)
     events: list = []
     report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)
+    loading, events = events[:2], events[2:]
+    assert [e.stage for e in loading] == 2 * ["rollout (loading)"]
+    assert [e.done for e in loading] == [0, 1]
     done, longest = [e.done for e in events], sim.make("reach").spec.max_steps
     assert done == sorted(done) and done[-1] == 5 * longest and report.success >= 4 / 5
     assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(

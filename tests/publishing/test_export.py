@@ -20,12 +20,14 @@ from samples.training import images, make_policy, policy_over
 from aegis_cli import load_policy, recipes
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.policy import Policy
 from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint
 
 META = {"method": "naive", "task": None, "replan": 2, "normalization": "mean_std"}
+LOADED = [Progress("export (loading)", done, 1, "model") for done in (0, 1)]
 TEXTS = ["go to the red target", "go to the blue target"]
 Aegis = Callable[..., tuple[int, str, str]]
 
@@ -64,15 +66,18 @@ def test_lerobot_finds_its_files_with_the_features_of_the_run(exported: Path) ->
 def test_a_run_that_is_not_finished_is_exported_with_a_word_on_it(
     run_folder: Path, tmp_path: Path, aegis: Aegis
 ) -> None:
-    run, told = tmp_path / "run", []
+    run, told = tmp_path / "run", list[Event]()
     shutil.copytree(run_folder, run, symlinks=True)
     whole = export.run(run, tmp_path / "whole", on_event=told.append)
-    assert (whole.steps, whole.planned_steps) == (2, 2) and not told
+    assert (whole.steps, whole.planned_steps) == (2, 2)
+    assert told == LOADED
+    told.clear()
     recipe = run / "recipe.yaml"
     recipe.write_text(recipe.read_text().replace("steps: 2", "steps: 3000"))
     found = export.run(run, tmp_path / "part", on_event=told.append)
     assert (found.steps, found.planned_steps) == (2, 3000)
-    (warned,) = told
+    *loaded, warned = told
+    assert loaded == LOADED and isinstance(warned, Warned)
     assert f"'{run}' is not finished: 2 of 3,000 steps" in warned.text
     card = (tmp_path / "part" / "README.md").read_text(encoding="utf-8")
     assert "2 of 3,000 steps" in card

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import fixed, number, plain_table
+from aegis_cli.cli.render.layout import number, plain_table
 
 
 def plan(report: Any) -> RenderableType:
@@ -31,7 +31,7 @@ def _of_job(report: Any) -> Iterator[RenderableType]:
     due = sum(one.due is not None for one in report.stages)
     told = f"{due} of {len(report.stages)} stages would run"
     if report.hours is not None:
-        told += f"; their trainings take about {fixed(report.hours, 2)} hours"
+        told += f"; their trainings take about {number(report.hours, 2)} hours"
     if report.disk_free_mb is not None:
         told += f" and {report.disk_mb:,.0f} MB of the {report.disk_free_mb:,.0f} MB that are free"
     yield Text(f"{told}, in '{report.out}'")
@@ -44,7 +44,7 @@ def _trainings(asked: dict[str, Any]) -> RenderableType:
         "Free MB": lambda r: number(r.memory_free_mb),
         "Disk MB": lambda r: f"{r.disk_mb:,.0f}",
         "Step s": lambda r: number(r.step_s),
-        "Hours": lambda r: fixed(r.hours, 2),
+        "Hours": lambda r: number(r.hours, 2),
     }
     rows = [(method, *(show(one) for show in shown.values())) for method, one in asked.items()]
     return plain_table(("Training", *shown), rows)

@@ -438,6 +438,13 @@ def test_a_corrupt_video(damage: str, bad: Bad, filmed: Path) -> None:
     bad(*FROM_FOLDER, says=(VIDEO,))
 
 
+def test_a_video_that_was_not_downloaded(bad: Bad, filmed: Path) -> None:
+    """It is the same whether frames are decoded before the training or on demand."""
+    (filmed / VIDEO).unlink()
+    for cache in ("true", "false"):
+        bad(*FROM_FOLDER, "--set", f"demos.cache={cache}", says=(VIDEO, "get the dataset again"))
+
+
 def test_a_video_that_ends_too_early(bad: Bad, filmed: Path, place: Path) -> None:
     shorter = save(place / "short", episodes(2, size=(64, 64), smooth=True), as_video=True)
     shutil.copy(shorter / VIDEO, filmed / VIDEO)
