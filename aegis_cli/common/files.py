@@ -42,9 +42,9 @@ def sha256_value(obj: Any) -> str:
     return hashlib.sha256(canonical(obj).encode()).hexdigest()
 
 
-def sha256_file(path: str | Path) -> str:
-    """Hex digest of a file's bytes."""
-    with reading(path, "check the path"), open(path, "rb") as file:
+def sha256_file(path: str | Path, fix: str = "check the path") -> str:
+    """Hex digest of a file's bytes; `fix` is for a missing one."""
+    with reading(path, fix), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

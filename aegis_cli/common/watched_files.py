@@ -11,8 +11,6 @@ from pathlib import Path
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
-_CHECK = "check the path"
-
 
 class WatchedFiles:
     """Tells when somebody writes into a file that is being read.
@@ -38,7 +36,7 @@ class WatchedFiles:
         self._open: dict[Path, int] = {}
         weakref.finalize(self, _close, self._open)
         for path in paths:
-            with files.reading(path, _CHECK):
+            with files.reading(path, "check the path"):
                 self._open[Path(path)] = os.open(path, os.O_RDONLY)
         self._noted = {path: _stamp(number) for path, number in self._open.items()}
         self.sha256: dict[Path, str] = {}
@@ -64,22 +62,18 @@ class WatchedPaths:
     open.
     """
 
-    def __init__(self, paths: Iterable[Path], fix: str = _CHECK) -> None:
+    def __init__(self, paths: Iterable[Path]) -> None:
         """Note which file each path has, its size and its time.
-
-        Args:
-            fix: what to do about one that is missing.
 
         Raises:
             AegisError: one cannot be read.
         """
-        self._fix = fix
-        self._noted = {Path(path): _stamp_of(path, fix) for path in paths}
+        self._noted = {Path(path): _stamp_of(path) for path in paths}
 
     def check(self) -> None:
         """Raise AegisError if one of the paths has another file since, or a changed one."""
         for path, stamp in self._noted.items():
-            if _stamp_of(path, self._fix) != stamp:
+            if _stamp_of(path) != stamp:
                 raise _written_to(path)
 
 
@@ -91,8 +85,8 @@ def _written_to(path: Path) -> AegisError:
     )
 
 
-def _stamp_of(path: Path, fix: str) -> tuple[int, int, int]:
-    with files.reading(path, fix):
+def _stamp_of(path: Path) -> tuple[int, int, int]:
+    with files.reading(path, "check the path"):
         found = os.stat(path)
     return found.st_ino, found.st_size, found.st_mtime_ns
 
@@ -104,7 +98,7 @@ def _stamp(number: int) -> tuple[int, int]:
 
 def _digest(path: Path, number: int) -> str:
     """sha256 of an open file's content, whatever lies at its path by now."""
-    with files.reading(path, _CHECK), open(number, "rb", closefd=False) as file:
+    with files.reading(path, "check the path"), open(number, "rb", closefd=False) as file:
         file.seek(0)
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -472,7 +472,7 @@ def _load_folder(
         sha256=sources.joined_digest(digests, "cameras"),
         cameras=tuple(map(found.called, cameras)),
         # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
-        watched=(WatchedFiles(mapped, by_content=False), WatchedPaths(videos, layout.AGAIN)),
+        watched=(WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
         action_names=action_names,
         proprio_names=proprio_names,
         fps=found.info.fps,

@@ -238,7 +238,7 @@ def _sha256(path: Path) -> str:
     A job with several methods asks anew for each, and videos are many gigabytes.
     """
     if not path.is_file():
-        return files.sha256_file(path)  # which says what is wrong
+        return files.sha256_file(path, layout.AGAIN)  # which says what is wrong
     state = path.stat()
     # Size and time alone would miss a file that took another's place with its time.
     changes = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
