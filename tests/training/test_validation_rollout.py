@@ -285,6 +285,7 @@ def test_nothing_is_compiled_for_episodes(
         real = getattr(owner, name)
         monkeypatch.setattr(owner, name, lambda part, real=real: real(part, counted))
     compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=2, compile=True))
+    torch._dynamo.reset()  # an earlier test's graphs would serve as well
     start("naive", tmp_path / "plain", recipe=without(compiling))
     before = len(graphs)
     graphs.clear()
