@@ -29,9 +29,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from aegis_cli import Guard
+from aegis_cli.common import estimates
 from aegis_cli.core.moments import masked_moments
 from aegis_cli.core.transport import w2_diag
-from aegis_cli.common import estimates
 from aegis_cli.models import flow
 
 LAYERS = "model.layers"
