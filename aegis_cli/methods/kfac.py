@@ -9,7 +9,8 @@ not change its answers are freer, and it acts on all that has moved since the st
 the loss does not keep asking for returns.
 
 Between two proximal steps the steepest directions drift, and the loss is taken at drifted weights:
-a lower `every` lets them drift less and costs more. Normalisations, tables and lone rows do not learn.
+a lower `every` lets them drift less and costs more. Normalisations, tables and lone rows do not
+learn.
 
 Two options measure what that choice is worth. `step: gradient` adds the penalty's gradient to the
 task's instead, as elastic weight consolidation does. `growth` lets the weight grow as the learning
