@@ -11,6 +11,7 @@ from typing import Any
 import torch
 import transformers
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from transformers.utils import is_torchvision_available
 
 from aegis_cli.data.vqa.questions import vocabulary
 
@@ -29,6 +30,8 @@ SMOL = (
     "endif %}{% endfor %}"
     "<end_of_utterance>\n{% endfor %}{% if add_generation_prompt %}Assistant:{% endif %}"
 )
+# transformers 5.5 reads it as a regular expression.
+GEMMA_IMAGE = "<global-img>"
 SPECIAL = [
     "<pad>",
     "<bos>",
@@ -426,14 +429,14 @@ def _gemma3(**changes: Any) -> tuple[Any, Any]:
     """Its layers with a window have a rotary embedding of their own."""
     from transformers.models.gemma3.image_processing_pil_gemma3 import Gemma3ImageProcessorPil
 
-    named = {"boi_token": "<|vision_start|>", "eoi_token": "<|vision_end|>"}
+    named = {"boi_token": GEMMA_IMAGE, "eoi_token": "<|vision_end|>"}
     tokenizer = make_tokenizer("<|im_end|>", image_token="<image>", **named)
     images = Gemma3ImageProcessorPil(size={"height": SIZE, "width": SIZE})
     processor = transformers.Gemma3Processor(
         images,
         tokenizer,
         image_seq_length=4,
-        chat_template=CHATML.replace("IMAGE", "<|vision_start|>"),
+        chat_template=CHATML.replace("IMAGE", GEMMA_IMAGE),
     )
     text = _text(
         tokenizer,
@@ -454,7 +457,7 @@ def _gemma3(**changes: Any) -> tuple[Any, Any]:
         vision_config={"model_type": "siglip_vision_model", **_VISION, "vision_use_head": False},
         mm_tokens_per_image=4,
         image_token_index=ids("<image>"),
-        boi_token_index=ids("<|vision_start|>"),
+        boi_token_index=ids(GEMMA_IMAGE),
         eoi_token_index=ids("<|vision_end|>"),
         **changes,
     )
@@ -563,7 +566,8 @@ def write(
 
 def load_processor(family: str, folder: Path) -> Any:
     """As a user of transformers puts it together here, without the code under test."""
-    if not (folder / "chat_template.jinja").exists() or family == "idefics3":
+    written = (folder / "chat_template.jinja").exists()
+    if not written or family == "idefics3" or is_torchvision_available():
         return transformers.AutoProcessor.from_pretrained(folder)
     _, made = FAMILIES[family]()
     return made
@@ -585,7 +589,7 @@ def prompt_of(family: str, text: str, images: int = 1) -> str:
         "llava": chatml("<image>\n", text, images),
         "llava_next": chatml("<image>\n", text, images),
         "internvl": chatml("<|image_pad|>\n", text, images),
-        "gemma3": chatml("<|vision_start|>", text, images),
+        "gemma3": chatml(GEMMA_IMAGE, text, images),
         "mistral3": chatml("<image>", text, images),
     }[family]
 

@@ -11,20 +11,23 @@ from dataclasses import dataclass, field
 from typing import Any
 
 
-def _nothing(config: Any) -> tuple[str, ...]:
+def _nothing(model: Any) -> tuple[str, ...]:
     return ()
 
 
-def _beyond_features(config: Any) -> tuple[str, ...]:
+def _beyond_features(model: Any) -> tuple[str, ...]:
     """What lies behind the layer of a CLIP tower whose output the language model is given.
 
     `vision_feature_layer` counts the embeddings as 0, and -1 is the last layer.
     """
+    config, tower = model.config, "model.vision_tower"
     depth, chosen = config.vision_config.num_hidden_layers, config.vision_feature_layer
     layers = [chosen] if isinstance(chosen, int) else chosen
     last = max(layer if layer >= 0 else depth + 1 + layer for layer in layers)
     unread = [f"encoder.layers.{i}" for i in range(last, depth)]
-    return tuple(f"model.vision_tower.{part}" for part in (*unread, "post_layernorm"))
+    if hasattr(model.get_submodule(tower), "vision_model"):  # as in transformers 5.5
+        tower += ".vision_model"
+    return tuple(f"{tower}.{part}" for part in (*unread, "post_layernorm"))
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Family:
             tensor; 0 where nothing is named.
         held: names of parameters that no input describes, such as a matrix that is no map of
             torch's: they are protected by holding them still.
-        idle: the model's configuration -> dotted names of the parts whose outputs nothing reads.
+        idle: the model -> dotted names of the parts whose outputs nothing reads.
     """
 
     layers: str

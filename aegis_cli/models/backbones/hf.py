@@ -86,7 +86,7 @@ class HFBackbone(Backbone):
         limits = (text.max_position_embeddings, len(table.get_parameter("weight")))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.held = tuple(f"vlm.{name}" for name in family.held)
-        self.idle = tuple(f"vlm.{part}" for part in family.idle(model.config))
+        self.idle = tuple(f"vlm.{part}" for part in family.idle(model))
         self.width, self.heads = text.hidden_size, text.num_attention_heads
         self._layers_path = f"vlm.{family.layers}"
         self._language = self._layers_path.rpartition(".")[0]
@@ -121,8 +121,10 @@ class HFBackbone(Backbone):
         """
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
+            batch = self.prepare(black, ["a"])
             with torch.no_grad(), unrotated(self._layers) as plain:
-                encoding = self.encode(self.prepare(black, ["a"]))
+                seen = self._passed(batch)
+            encoding = self._encoding(seen, batch)
         except AegisError as error:
             # A text of one letter is refused only for what the processor makes of it.
             found = error.found
@@ -141,6 +143,7 @@ class HFBackbone(Backbone):
         if len(encoding.keys_values) != self.depth or not encoding.image.any():
             found = "no image token among the processor's, or a layer that keeps no keys"
             raise model_folder.misfit(found)
+        self._axes = seen.axes()
         self._check_rotation(encoding, plain)
         _, heads, _, head_dim = encoding.keys_values[0].key.shape
         return heads, head_dim
@@ -170,10 +173,13 @@ class HFBackbone(Backbone):
     # --- forward -------------------------------------------------------------------------------
 
     def encode(self, batch: Batch) -> Encoding:
+        return self._encoding(self._passed(batch), batch)
+
+    def _passed(self, batch: Batch) -> Seen:
+        """What a pass without the head leaves: an action expert reads no scores of words."""
         with recording(self._layers, self._rotary) as seen:
-            # Without its head: an action expert reads no scores of words.
             self.vlm.base_model(**_arguments(batch), use_cache=False)
-        return self._encoding(seen, batch)
+        return seen
 
     def _encoding(self, seen: Seen, batch: Batch) -> Encoding:
         layers = range(self.depth)
@@ -210,18 +216,33 @@ class HFBackbone(Backbone):
         """Each layer's rotary embedding of tokens at distances [S] from the first that follows."""
         assert encoding.next_position is not None
         like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
-        places = encoding.next_position[:, None] + ahead
+        places = encoding.next_position[:, None] + ahead  # [B, S]
+        if self._axes is not None:  # on each of which text stands at the same place
+            places = places.expand(self._axes, *places.shape)
         if self._layer_types is None:
-            return [Rotation(*self._rotary(like, places))] * self.depth
+            return [self._rotation(like, places)] * self.depth
         of_type = {}
         for kind in dict.fromkeys(self._layer_types):
-            of_type[kind] = Rotation(*self._rotary(like, places, kind))
+            of_type[kind] = self._rotation(like, places, kind)
         return [of_type[kind] for kind in self._layer_types]
+
+    def _rotation(self, *asked: Any) -> Rotation:
+        """What the rotary embedding answers, as cosines and sines [B, S, head_dim]."""
+        cosines, sines = self._rotary(*asked)
+        if cosines.ndim == 4:
+            # In transformers 5.5 Qwen2-VL's gives those of each axis, [3, B, S, head_dim], and
+            # attention chooses among them. At the places of text all axes have the same.
+            return Rotation(cosines[0], sines[0])
+        return Rotation(cosines, sines)
 
     def checkpoint_gradients(self) -> None:
         # Reentrant checkpointing would lose what the hooks record. The other kind needs no inputs
         # with a gradient either.
-        self.vlm.activation_checkpointing_enable({"use_reentrant": False})
+        how = {"use_reentrant": False}
+        if hasattr(self.vlm, "activation_checkpointing_enable"):
+            self.vlm.activation_checkpointing_enable(how)
+        else:  # its name before transformers 5.24
+            self.vlm.gradient_checkpointing_enable(how)
         self.vlm.disable_input_require_grads()
 
     def compile_passes(self, backend: str = "inductor") -> None:

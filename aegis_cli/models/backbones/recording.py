@@ -31,14 +31,21 @@ class Seen:
     keys_values: dict[int, KeyValue] = field(default_factory=dict)
     positions: Tensor | None = None
 
+    def axes(self) -> int | None:
+        """How many positions each token was given; None: a single one, without a dimension of it.
+
+        Qwen2.5-VL counts time, height and width apart: [3, B, T].
+        """
+        assert self.positions is not None
+        return len(self.positions) if self.positions.ndim == 3 else None
+
     def next_position(self, mask: Tensor) -> Tensor:
         """One more than each row's largest position [B] at its valid tokens.
 
         The mask is [B, T]; a position with several axes counts by its largest.
         """
         assert self.positions is not None
-        # Qwen2.5-VL counts time, height and width apart: [3, B, T].
-        positions = self.positions.amax(0) if self.positions.ndim == 3 else self.positions
+        positions = self.positions if self.axes() is None else self.positions.amax(0)
         # [1, T] for all rows, or [B, T]. Padding is below any position, so that it is no maximum.
         return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
 
