@@ -168,6 +168,7 @@ class TrainFigures:
     out: str | None = None
     validation_vqa: dict[str, dict[str, Number | list[Number]]] | None = None
     validation_rollout: dict[str, Number | Interval] | None = None
+    validation_actions: dict[str, Number | Interval] | None = None
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands, devices, hub
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.estimates import t_quantile
-from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
+from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
 from aegis_cli.data.demonstrations import Demonstrations
@@ -27,14 +26,15 @@ from aegis_cli.data.lerobot import layout
 from aegis_cli.data.mixture import Robot
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import Selection
-from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import backbones, download, lerobot_folder
+from aegis_cli.models.action_errors import ActionErrors, interval, mean, predict, training_std
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
 
+_STAGE = "evaluate"
 TRACED = 3  # episodes that a plot shows
 _BY_PART = ("dimensions", "horizon")  # of the report
 FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions
@@ -187,7 +187,7 @@ def run(
     """
     run_path, data = Path(run_path), Path(data)
     source = _Source.find(run_path)
-    with loading_told("evaluate", on_event):
+    with loading_told(_STAGE, on_event):
         policy, meta = checkpoint.load_policy(source.checkpoint)
     mixture.check_rename((data,), rename)
     learned = source.selection(meta, data, rename)
@@ -197,7 +197,7 @@ def run(
     shown = _shown(policy, meta, data, learned, chosen, on_event)
     at = _spread(shown, chosen.episodes, frames)
     policy = policy.to(devices.pick())
-    predicted = _predict(policy, shown, at, seed, batch_size, on_event)
+    predicted = predict(policy, shown, at, seed, batch_size, _STAGE, on_event)
     found = compare(shown, at, predicted, _training_std(policy, meta, on_event))
     report = dataclasses.replace(
         found,
@@ -225,7 +225,7 @@ def _warn_of_standing_still(report: OpenLoopReport, on_event: OnEvent) -> None:
             f"the policy's error of {error:.3f} is not below {hold:.3f}, which the current "
             "position has if it is repeated: it predicts the motion no better than standing still"
         )
-        on_event(Warned("evaluate", text))
+        on_event(Warned(_STAGE, text))
 
 
 # --- which episodes -------------------------------------------------------------------------------
@@ -386,7 +386,7 @@ def _warn_of_earlier_learning(
                 f"{len(known)} of these {len(episodes)} episodes were trained on by '{run}', with "
                 f"which '{source.name}' began: the policy has learned from them already"
             )
-            on_event(Warned("evaluate", text))
+            on_event(Warned(_STAGE, text))
 
 
 def _began_with(recipe: recipes.Recipe) -> list[Path]:
@@ -537,7 +537,7 @@ def _check_names(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) 
             f"trained on {known}: the errors mean something only if these are the same joints in "
             "the same order; --rename says which is which"
         )
-        on_event(Warned("evaluate", text))
+        on_event(Warned(_STAGE, text))
 
 
 def _check_rate(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
@@ -548,7 +548,7 @@ def _check_rate(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -
             f"'{data}' has {robot.fps:g} frames a second, and the policy was trained on {own:g}: "
             "its actions are meant for steps of another length"
         )
-        on_event(Warned("evaluate", text))
+        on_event(Warned(_STAGE, text))
 
 
 def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.Tensor:
@@ -557,29 +557,7 @@ def _spread(shown: Demonstrations, episodes: Sequence[int], most: int) -> torch.
     return own[spread.rows(len(own), most)]
 
 
-# --- predictions ----------------------------------------------------------------------------------
-
-
-def _predict(
-    policy: Policy,
-    shown: Demonstrations,
-    at: torch.Tensor,
-    seed: int,
-    batch_size: int,
-    on_event: OnEvent = ignore,
-) -> torch.Tensor:
-    """Chunks [N, H, A] at frames [N]."""
-    # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
-    noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
-    found = []
-    on_event(Progress("evaluate", 0, len(at), "frames"))
-    for first in range(0, len(at), batch_size):
-        part = slice(first, first + batch_size)
-        batch = shown.batch(at[part], 1)
-        acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
-        found.append(acted.cpu())
-        on_event(Progress("evaluate", min(first + batch_size, len(at)), len(at), "frames"))
-    return torch.cat(found)
+# --- what a plot shows ----------------------------------------------------------------------------
 
 
 def _traces(
@@ -603,7 +581,7 @@ def _trace(
     starts = shown.tensors["episode_starts"]
     first, end = int(starts[episode]), int(starts[episode + 1])
     at = torch.arange(first, end, replan)
-    chunks = _predict(policy, shown, at, seed, batch_size)[:, :replan]  # [n, replan, A]
+    chunks = predict(policy, shown, at, seed, batch_size, _STAGE)[:, :replan]  # [n, replan, A]
     joined = chunks.reshape(-1, chunks.shape[-1])
     return Trace(
         episode,
@@ -627,30 +605,21 @@ def compare(
         training_std: [A], the standard deviations that errors are relative to; 0 of an action that
             never varied there.
     """
-    actions, is_pad = shown.chunks(at, predicted.shape[1])
-    recorded, valid = actions.double().numpy(), ~is_pad.numpy()  # [N, H, A], [N, H]
-    error = predicted.double().numpy() - recorded
-    hold, places = None, _places(shown)
-    if places is not None:
-        # The position at the frame, for every step of the chunk: [N, 1, A] less [N, H, A].
-        hold = shown.tensors["proprio"][at][:, places].double().numpy()[:, None] - recorded
-    relative = _relative(error, training_std)  # [N, H]
-    held = None if hold is None else _relative(hold, training_std)
-    # The episode of each valid step, in the order of `relative[valid]`.
-    episode_of = np.broadcast_to(shown.episode_of[at].numpy()[:, None], valid.shape)[valid]
-    interval = None if relative is None else _interval(relative[valid], episode_of)
+    errors = ActionErrors.of(shown, at, predicted, training_std)
+    relative, held, valid = errors.relative, errors.held, errors.valid
     return OpenLoopReport(
         data="",
         split=CHOSEN,
-        episodes=sorted(set(episode_of.tolist())),
+        # Of a frame at least the first step is of its episode.
+        episodes=sorted(set(errors.episode_of.tolist())),
         trained_on=[],
         frames=len(at),
         chunk=predicted.shape[1],
         seed=0,
-        relative_error=_mean(relative, valid),
-        relative_interval=interval,
-        hold_error=_mean(held, valid),
-        dimensions=_dimensions(shown, recorded, error, hold, valid, training_std),
+        relative_error=mean(relative, valid),
+        relative_interval=errors.interval(),
+        hold_error=mean(held, valid),
+        dimensions=_dimensions(shown, errors),
         horizon=_horizon(relative, held, valid),
         fps=shown.fps,
         instructions=_instructions(shown, at, relative, held, valid),
@@ -658,82 +627,34 @@ def compare(
 
 
 def _training_std(policy: Policy, meta: PolicyMeta, on_event: OnEvent) -> np.ndarray:
-    """Each action's standard deviation [A] over the frames that the policy was trained on.
+    """As `training_std` has it; checkpoints of earlier versions may not tell it.
 
-    It is the policy's scale, unless that is one of relative actions or of quantiles. Checkpoints of
-    earlier versions do not say it then, and have their scale in its place.
+    They have their scale of relative actions or of quantiles in its place.
     """
-    if (told := meta.get("action_std")) is not None:
-        return np.array(told, np.float64)
-    if meta.get("relative") or meta.get("normalization", "mean_std") != "mean_std":
+    other_scale = meta.get("relative") or meta.get("normalization", "mean_std") != "mean_std"
+    if "action_std" not in meta and other_scale:
         text = (
             "the checkpoint is of an earlier version and does not say how far its actions vary: "
             "errors are relative to its scale of relative actions or quantiles, and do not compare "
             "with other runs'"
         )
-        on_event(Warned("evaluate", text))
-    return policy.action_scale.std.double().cpu().numpy()
-
-
-def _interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] | None:
-    """95 % interval of the mean of errors [n], by Student's t over episodes; None of a single one.
-
-    Steps of an episode are alike, and episodes are few.
-    """
-    error, episodes = clustered_error(errors, episode_of.tolist())
-    if episodes == 1:
-        return None
-    mean, half = float(errors.mean()), t_quantile(episodes - 1) * error
-    return max(0.0, mean - half), mean + half  # no squared error is below 0
-
-
-def _places(shown: Demonstrations) -> list[int] | None:
-    """The position that each action says to take, which is that of its name; None where one lacks.
-
-    A robot may tell more of itself than it is told to do, such as velocities or efforts.
-    """
-    names, positions = shown.action_names, shown.proprio_names
-    named = any(names) and len(names) == shown.tensors["actions"].shape[1]
-    if not named or len(positions) != shown.tensors["proprio"].shape[1]:
-        return None
-    if names == positions:  # in one order, even where two arms use one name
-        return list(range(len(names)))
-    if any(names.count(name) != 1 or positions.count(name) != 1 for name in names):
-        return None
-    return [positions.index(name) for name in names]
-
-
-def _relative(error: np.ndarray, training_std: np.ndarray) -> np.ndarray | None:
-    """Squared error over the variance [N, H], mean over the dimensions that varied."""
-    varies = training_std > 0
-    if not varies.any():
-        return None
-    return np.square(error[..., varies] / training_std[varies]).mean(axis=-1)
-
-
-def _mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
-    return None if values is None or not valid.any() else float(values[valid].mean())
+        on_event(Warned(_STAGE, text))
+    return training_std(policy, meta)
 
 
 def _rmse(error: np.ndarray) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def _dimensions(
-    shown: Demonstrations,
-    recorded: np.ndarray,
-    error: np.ndarray,
-    hold: np.ndarray | None,
-    valid: np.ndarray,
-    training_std: np.ndarray,
-) -> list[DimensionError]:
+def _dimensions(shown: Demonstrations, errors: ActionErrors) -> list[DimensionError]:
+    hold, valid = errors.hold, errors.valid
     unit = None if shown.task is None else FULL_ACTION
     # Padding is at a chunk's end. So the steps that any frame has are the first ones, and their
     # places among these are their numbers.
     rows_of_step = [valid[:, h] for h in range(valid.shape[1]) if valid[:, h].any()]
     found = []
     for d, name in enumerate(action_names(shown)):
-        by_step, std = error[..., d], float(training_std[d])  # [N, H]
+        by_step, std = errors.error[..., d], float(errors.training_std[d])  # [N, H]
         own = by_step[valid]
         found.append(
             DimensionError(
@@ -742,7 +663,7 @@ def _dimensions(
                 mae=float(np.abs(own).mean()),
                 rmse=_rmse(own),
                 training_std=std,
-                constant_rmse=float(recorded[..., d][valid].std()),
+                constant_rmse=float(errors.recorded[..., d][valid].std()),
                 hold_rmse=None if hold is None else _rmse(hold[..., d][valid]),
                 relative_error=float(np.square(own / std).mean()) if std else None,
                 rmse_by_step=[_rmse(by_step[rows, h]) for h, rows in enumerate(rows_of_step)],
@@ -789,18 +710,18 @@ def _instructions(
     for text, rows in rows_of.items():
         own = valid[rows]
         episode_of = shown.episode_of[at[rows]].numpy()
-        interval = None
+        ends = None
         if relative is not None:
             of_steps = np.broadcast_to(episode_of[:, None], own.shape)[own]
-            interval = _interval(relative[rows][own], of_steps)
+            ends = interval(relative[rows][own], of_steps)
         found.append(
             InstructionError(
                 instruction=text,
                 episodes=len(set(episode_of.tolist())),
                 frames=len(rows),
-                relative_error=_mean(None if relative is None else relative[rows], own),
-                relative_interval=interval,
-                hold_error=_mean(None if held is None else held[rows], own),
+                relative_error=mean(None if relative is None else relative[rows], own),
+                relative_interval=ends,
+                hold_error=mean(None if held is None else held[rows], own),
             )
         )
     return sorted(found, key=lambda one: one.relative_error or 0.0, reverse=True)

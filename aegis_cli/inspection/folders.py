@@ -30,7 +30,13 @@ from aegis_cli.inspection.report import (
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
 from aegis_cli.recipes import Demos, Recipe
-from aegis_cli.training import checkpoint, folder, validation_rollout, validation_vqa
+from aegis_cli.training import (
+    checkpoint,
+    folder,
+    validation_actions,
+    validation_rollout,
+    validation_vqa,
+)
 from aegis_cli.training.up_to_date import refuse_unfinished
 
 # What a merged checkpoint and a report of `aegis run` tell alike.
@@ -152,6 +158,8 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         facts["validation_vqa"] = asked
     if not merged and (acted := validation_rollout.of_line(metrics)):
         facts["validation_rollout"] = acted
+    if not merged and (predicted := validation_actions.of_line(metrics)):
+        facts["validation_actions"] = predicted
     facts |= _data_facts(header, settings.demos)
     if base_model := header.meta.get("base_model"):
         facts["base_model"] = base_model

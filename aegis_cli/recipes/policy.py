@@ -380,6 +380,16 @@ class Train:
         SHARE, default=0.05, doc="Share of the episodes that is kept for the validation loss."
     )
     validate_every: int = key(POSITIVE, default=250, doc="Steps between two validation losses.")
+    validate_actions: int | None = key(
+        POSITIVE,
+        default=None,
+        later=True,
+        shapes=False,
+        doc="Held-out frames at which `aegis train` predicts actions with every validation loss. "
+        "Their error, as `aegis evaluate` has it, is in its log and in trackers: 1 is that of "
+        "always predicting the mean, and of a robot that is not simulated nothing else shows how "
+        "well it acts. Null: none.",
+    )
     checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
     keep_checkpoints: int | None = key(
         POSITIVE,

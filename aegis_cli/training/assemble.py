@@ -49,6 +49,7 @@ from aegis_cli.training.average import Average
 from aegis_cli.training.masters import BF16_MASTER, NONE, Masters, check_masters
 from aegis_cli.training.schedule import BatchOrder
 from aegis_cli.training.step_figures import UnreadFigures
+from aegis_cli.training.validation_actions import ValidationActions
 from aegis_cli.training.validation_rollout import ValidationEpisodes
 from aegis_cli.training.validation_vqa import ValidationQuestions
 
@@ -71,6 +72,7 @@ class TrainingRun:
         began_as: as of `loading.Loaded`.
         questions: what the backbone is asked with every validation loss; None for nothing.
         episodes: which the policy acts in with every validation loss; None for none.
+        actions: held-out frames at which it predicts with every validation loss; None for none.
         told_of_drop: whether it has been said that more is lost than the recipe allows.
     """
 
@@ -95,6 +97,7 @@ class TrainingRun:
     began_as: str | None = None
     questions: ValidationQuestions | None = None
     episodes: ValidationEpisodes | None = None
+    actions: ValidationActions | None = None
     told_of_drop: bool = False
 
     @property

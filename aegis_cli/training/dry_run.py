@@ -36,6 +36,7 @@ from aegis_cli.training import (
     retention,
     track,
     train,
+    validation_actions,
     validation_rollout,
     validation_vqa,
 )
@@ -75,8 +76,8 @@ class DryRunReport:
             gradient serves; None where memory does not suffice to take them.
         rollout_s: of the episodes of one validation, if none ends early; None where the recipe has
             no `rollout.while_training`, or where memory does not suffice.
-        hours: of the steps still to be taken and such episodes, without validation losses and
-            checkpoints.
+        hours: of the steps still to be taken and such episodes, without validation losses,
+            predicted actions and checkpoints.
         checkpoints, disk_mb: those still to be written, as many as lie there at one time;
             disk_free_mb: where they would be.
     """
@@ -173,6 +174,7 @@ def _planned(
     # They are not asked here: that they can be is all that a plan needs to know.
     validation_vqa.chosen(recipe, training.policy.backbone, told)
     training.episodes = validation_rollout.chosen(recipe, training.policy, training.meta, ranks)
+    validation_actions.chosen(recipe, training.policy, training.demos, training.meta)
     held = _held(training, there)
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)

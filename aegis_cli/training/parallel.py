@@ -86,16 +86,16 @@ def _check_sharding(settings: Train, method: Method) -> None:
 def _check_nothing_is_watched(recipe: Recipe) -> None:
     """Refuse to measure, while it trains, what no process has whole."""
     watched = {
-        "probe": (recipe.probe.while_training, "write its answers"),
-        "rollout": (recipe.rollout.while_training, "act"),
+        "probe.while_training": (recipe.probe.while_training, "write its answers", "probe"),
+        "rollout.while_training": (recipe.rollout.while_training, "act", "rollout"),
+        "train.validate_actions": (recipe.train.validate_actions, "predict actions", "evaluate"),
     }
-    for section, (count, does) in watched.items():
+    for key, (count, does, command) in watched.items():
         if count is not None:
             raise AegisError(
-                f"{section}.while_training: {count} with train.parallel: fsdp",
+                f"{key}: {count} with train.parallel: fsdp",
                 f"a model that each process has whole, to {does}",
-                f"delete {section}.while_training, and aegis {section} the checkpoints; or --set "
-                "train.parallel=ddp",
+                f"delete {key}, and aegis {command} the checkpoints; or --set train.parallel=ddp",
             )
 
 

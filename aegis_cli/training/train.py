@@ -54,6 +54,7 @@ from aegis_cli.training import (
     parallel,
     step,
     track,
+    validation_actions,
     validation_rollout,
     validation_vqa,
 )
@@ -65,7 +66,8 @@ LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
 # A validation has progress of its own if steps with as many batches would take longer than this;
-# so have questions whose answers took longer before training, and episodes that did the last time.
+# so have questions whose answers took longer before training, and episodes and predicted actions
+# that did the last time.
 _LONG_S = 20.0
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
 # What the progress shows of such a line, and under which name.
@@ -76,6 +78,7 @@ _SHOWN = {
     "rollout_mean_return": "return",
     "rollout_low": "at least",
     "rollout_high": "at most",
+    "action_error": "action error",
 }
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
@@ -90,7 +93,8 @@ class TrainReport:
     are those of a LeRobot folder, in their order. `validation_vqa` is what the last step's weights
     answer, by the set's name, as `validation_vqa.of_line` has it; empty where nothing was asked.
     `validation_rollout` is how they act, as `validation_rollout.of_line` has it; empty where
-    nothing was played.
+    nothing was played. `validation_actions` is how far from held-out ones their actions are, as
+    `validation_actions.of_line` has it; empty where none were predicted.
     """
 
     method: str
@@ -103,6 +107,7 @@ class TrainReport:
     out: str
     validation_vqa: dict[str, ToldOfSet] = field(default_factory=dict)
     validation_rollout: dict[str, Any] = field(default_factory=dict)
+    validation_actions: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -154,6 +159,9 @@ def run(
         if not is_finished:
             training.episodes = validation_rollout.chosen(
                 recipe, training.policy, training.meta, ranks
+            )
+            training.actions = validation_actions.chosen(
+                recipe, training.policy, training.demos, training.meta
             )
             training.questions = _asked_before(training, on_event)
         if goes_on:
@@ -804,7 +812,9 @@ def _log(
 
 
 def _watched(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, float]:
-    """What a checkpoint written now answers, and how it acts; empty where neither is asked for.
+    """What a checkpoint written now answers, how it acts, and how far its actions are from others.
+
+    It is empty where none of them is asked for.
 
     Raises:
         Diverged: a figure that is not finite, as an answer's likelihood can be.
@@ -817,6 +827,9 @@ def _watched(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, fl
         if run.episodes is not None:
             heard = on_event if run.episodes.seconds > _LONG_S else ignore
             found |= run.episodes.figures(run.ranks, heard)
+        if run.actions is not None:
+            heard = on_event if run.actions.seconds > _LONG_S else ignore
+            found |= run.actions.figures(run.policy, run.ranks, heard)
     check_finite(found, f"after step {finished}", LOWER, finished)
     return found
 
@@ -943,4 +956,5 @@ def _report(run: TrainingRun) -> TrainReport:
         out=str(run.out),
         validation_vqa=validation_vqa.of_line(run.recipe, lines[-1]),
         validation_rollout=validation_rollout.of_line(lines[-1]),
+        validation_actions=validation_actions.of_line(lines[-1]),
     )

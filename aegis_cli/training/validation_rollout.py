@@ -135,8 +135,8 @@ def chosen(
         raise AegisError(
             f"rollout.while_training: {count} with demonstrations of no simulated task",
             "demonstrations of a task in which the policy can act",
-            "delete rollout.while_training: the validation loss shows how training goes, and "
-            "aegis evaluate RUN --demos DATA has the errors of the actions afterwards",
+            "delete rollout.while_training; --set train.validate_actions=500 shows how far the "
+            "policy's actions are from held-out ones",
         )
     cameras = checkpoint.cameras_of(meta, task)
     if ranks.first:  # the others never act

@@ -2,7 +2,7 @@
 
     python -m venv .venv-lerobot && . .venv-lerobot/bin/activate
     pip install 'lerobot[smolvla,training,evaluation]==0.6.1'
-    pip install -e . -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
+    pip install -e '.[hf]' -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
     python plugins/check/check.py
 
 It takes a few minutes of two cores, and is no part of the tests.

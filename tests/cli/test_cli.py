@@ -74,6 +74,7 @@ class Report:
     families: dict[str, Any] = field(default_factory=dict)
     validation_vqa: dict[str, Any] = field(default_factory=dict)
     validation_rollout: dict[str, Any] = field(default_factory=dict)
+    validation_actions: dict[str, Any] = field(default_factory=dict)
     layers: tuple[Any, ...] = ()
     gate_failed: tuple[str, ...] = ()
 

@@ -26,7 +26,15 @@ from aegis_cli.cli.render.markdown import markdown
 from aegis_cli.cli.render.open_loops import open_loop
 from aegis_cli.cli.render.progress import Lines, Live, _warning
 from aegis_cli.cli.render.studies import shown_as, study
-from aegis_cli.cli.render.tables import facts, pairs, pipeline, pretrain, probe, validation_rollout
+from aegis_cli.cli.render.tables import (
+    facts,
+    pairs,
+    pipeline,
+    pretrain,
+    probe,
+    validation_actions,
+    validation_rollout,
+)
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.evaluation.open_loop import (
@@ -388,6 +396,26 @@ def test_validation_episodes_are_a_table_with_their_interval(acted: Any, row: st
     (table,) = validation_rollout(acted)
     assert row in [" ".join(line.split()) for line in text_of(table).splitlines()]
     assert not list(validation_rollout({}))
+
+
+@pytest.mark.parametrize(
+    ("predicted", "rows"),
+    [
+        (
+            {"relative_error": 0.25, "relative_interval": [0.125, 0.5], "hold_error": 0.75},
+            ["the policy's 0.25 0.125 to 0.5", "standing still 0.75"],
+        ),
+        (
+            {"relative_error": 0.25, "relative_interval": None, "hold_error": None},
+            ["the policy's 0.25 -"],
+        ),
+    ],
+)
+def test_errors_of_held_out_actions_are_a_table(predicted: Any, rows: list[str]) -> None:
+    (table,) = validation_actions(predicted)
+    lines = [" ".join(line.split()) for line in text_of(table).splitlines()]
+    assert [line for line in lines if line][2:] == rows
+    assert not list(validation_actions({}))
 
 
 def test_the_pretraining_table_lists_families():

@@ -352,7 +352,7 @@ def test_a_robot_that_is_not_simulated_is_refused_before_the_first_step(
     said = "rollout.while_training: 2 with demonstrations of no simulated task"
     with pytest.raises(AegisError, match=said) as refused:
         start("naive", tmp_path / "run", recipe=playing, demos=demos)
-    assert "aegis evaluate RUN" in refused.value.fix
+    assert "--set train.validate_actions=500" in refused.value.fix
     assert not (tmp_path / "run" / "recipe.yaml").exists()
     with pytest.raises(AegisError, match=said):
         dry_run.run(playing, "naive", demos, None, tmp_path / "run")

@@ -303,6 +303,7 @@ _CURVES = (
     ("vqa_drop_points", "VQA drop, validation (points)", False, 1.0),
     ("rollout_success", "Success, validation (%)", False, 100.0),
     ("rollout_mean_return", "Mean return, validation", False, 1.0),
+    ("action_error", "Error of held-out actions (1: of their mean)", False, 1.0),
     ("energy_shed", "Energy shed (%)", True, 100.0),
     ("lr_backbone", "Learning rate of the backbone", False, 1.0),
     ("step_s", "Time of a step (s)", False, 1.0),

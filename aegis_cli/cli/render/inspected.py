@@ -13,17 +13,17 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
-from aegis_cli.cli.render.tables import pairs, validation_rollout, validation_vqa
+from aegis_cli.cli.render.tables import pairs, watched
 from aegis_cli.data.episodes import as_text
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
     """The facts, then the tables that there are; tensors are listed where they are asked for."""
-    facts = {"kind": report.kind, "path": report.path, **_as_they_are_read(report.facts)}
+    told = dict(report.facts)
+    measured_while_it_trained = watched(told)
+    facts = {"kind": report.kind, "path": report.path, **_as_they_are_read(told)}
     facts["energy_shed_mean"] = report.energy_shed_mean  # without a line where it is None
-    parts: list[RenderableType] = [pairs(facts)]
-    parts += validation_vqa(report.facts.get("validation_vqa", {}))
-    parts += validation_rollout(report.facts.get("validation_rollout", {}))
+    parts: list[RenderableType] = [pairs(facts), *measured_while_it_trained]
     if report.kind == "run":
         parts += _measured(report)
     if report.tensors and not tensors:
@@ -66,7 +66,7 @@ def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts with one line on a run's steps, of how many where some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
     # An anchor's maps that share a spectrum are rows of its table, with the same figures.
-    apart = ("planned_steps", "measured_before", "shared", "validation_vqa", "validation_rollout")
+    apart = ("planned_steps", "measured_before", "shared")
     left = {name: value for name, value in facts.items() if name not in apart}
     merged = facts.get("merge")
     if merged:

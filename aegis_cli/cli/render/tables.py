@@ -52,10 +52,18 @@ def facts(report: Any) -> Table:
 
 
 def trained(report: Any) -> RenderableType:
-    """How a training ended, what its weights answered where it asked, and how they acted."""
+    """How a training ended, and what it measured of its weights where it was asked to."""
     values = dataclasses.asdict(report)
-    asked, acted = values.pop("validation_vqa"), values.pop("validation_rollout")
-    return Group(pairs(values), *validation_vqa(asked), *validation_rollout(acted))
+    shown = watched(values)
+    return Group(pairs(values), *shown)
+
+
+def watched(found: dict[str, Any]) -> list[Table]:
+    """Take what a training measured of its last weights out of its figures, as tables."""
+    asked = validation_vqa(found.pop("validation_vqa", {}))
+    acted = validation_rollout(found.pop("validation_rollout", {}))
+    predicted = validation_actions(found.pop("validation_actions", {}))
+    return [*asked, *acted, *predicted]
 
 
 def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
@@ -81,6 +89,16 @@ def validation_rollout(found: Mapping[str, Any]) -> Iterator[Table]:
             between = "-" if ends is None else " to ".join(map(show, ends))
             head = ("Validation episodes", "Mean", "95 % interval")
             yield plain_table(head, [(name, show(found[measure]), between)])
+
+
+def validation_actions(found: Mapping[str, Any]) -> Iterator[Table]:
+    """A table of how far predicted actions were from held-out ones; none where none were."""
+    if found:
+        ends, hold = found["relative_interval"], found["hold_error"]
+        between = "-" if ends is None else " to ".join(map(number, ends))
+        rows = [("the policy's", number(found["relative_error"]), between)]
+        rows += [] if hold is None else [("standing still", number(hold), "")]
+        yield plain_table(("Error of held-out actions", "Mean", "95 % interval"), rows)
 
 
 def serving(report: Any) -> RenderableType:

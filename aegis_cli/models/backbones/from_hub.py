@@ -11,7 +11,7 @@ import torch
 from huggingface_hub.errors import StrictDataclassError
 from safetensors import SafetensorError
 from torch import nn
-from transformers.utils import logging
+from transformers.utils import is_torchvision_available, logging
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError, in_short
@@ -51,10 +51,14 @@ def loading(folder: Path, what: str) -> Generator[None]:
                 "torchvision, of the version that belongs to the installed torch",
                 "pip install torchvision",
             ) from error
+        fix = "download or export the model again"
+        if what == "processor" and not is_torchvision_available():
+            # Earlier releases of transformers do not know such a processor then.
+            fix += ", or `pip install torchvision`, which its images may need"
         raise AegisError(
             f"the {what} in '{folder}' does not load: {in_short(error)}",
             f"a complete {what} folder of the Hugging Face hub",
-            "download or export the model again",
+            fix,
         ) from error
 
 

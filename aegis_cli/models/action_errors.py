@@ -1,0 +1,156 @@
+"""How far the actions that a policy predicts are from those that were recorded.
+
+Each prediction begins at a recorded frame, and nothing is executed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from aegis_cli.common.estimates import t_quantile
+from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.vqa.metrics import clustered_error
+from aegis_cli.models.policy import Policy
+from aegis_cli.models.policy_meta import PolicyMeta
+
+
+def predict(
+    policy: Policy,
+    shown: Demonstrations,
+    at: torch.Tensor,
+    seed: int,
+    batch_size: int,
+    stage: str,
+    on_event: OnEvent = ignore,
+) -> torch.Tensor:
+    """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise."""
+    # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
+    noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
+    found = []
+    on_event(Progress(stage, 0, len(at), "frames"))
+    for first in range(0, len(at), batch_size):
+        part = slice(first, first + batch_size)
+        batch = shown.batch(at[part], 1)
+        acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
+        found.append(acted.cpu())
+        on_event(Progress(stage, min(first + batch_size, len(at)), len(at), "frames"))
+    return torch.cat(found)
+
+
+def training_std(policy: Policy, meta: PolicyMeta) -> np.ndarray:
+    """Each action's standard deviation [A] over the frames that the policy was trained on.
+
+    It is the policy's scale, unless that is one of relative actions or of quantiles, and `meta`
+    tells the deviations.
+    """
+    told = meta.get("action_std")
+    if told is not None:
+        return np.array(told, np.float64)
+    return policy.action_scale.std.double().cpu().numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class ActionErrors:
+    """Errors of chunks that were predicted at N frames.
+
+    Attributes:
+        recorded: [N, H, A], what was done, in raw units.
+        error: [N, H, A], what was predicted less what was done.
+        hold: [N, H, A], the position at the frame less what was done; None where actions are no
+            positions.
+        valid: [N, H], whether the step is of the frame's episode, and not past its end.
+        episode_of: [N].
+        training_std: [A], the standard deviations that errors are relative to; 0 of an action that
+            never varied there.
+    """
+
+    recorded: np.ndarray
+    error: np.ndarray
+    hold: np.ndarray | None
+    valid: np.ndarray
+    episode_of: np.ndarray
+    training_std: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        shown: Demonstrations,
+        at: torch.Tensor,
+        predicted: torch.Tensor,
+        training_std: np.ndarray,
+    ) -> ActionErrors:
+        """The errors of chunks [N, H, A] that were predicted at frames [N]."""
+        actions, is_pad = shown.chunks(at, predicted.shape[1])
+        recorded = actions.double().numpy()  # [N, H, A]
+        error = predicted.double().numpy() - recorded
+        hold, places = None, _places(shown)
+        if places is not None:
+            # The position at the frame, for every step of the chunk: [N, 1, A] less [N, H, A].
+            hold = shown.tensors["proprio"][at][:, places].double().numpy()[:, None] - recorded
+        episode_of = shown.episode_of[at].numpy()
+        return cls(recorded, error, hold, ~is_pad.numpy(), episode_of, training_std)
+
+    @property
+    def relative(self) -> np.ndarray | None:
+        """Squared error over the training's variance [N, H]; None where nothing varied there.
+
+        It is the mean over the dimensions that varied.
+        """
+        return self._relative(self.error)
+
+    @property
+    def held(self) -> np.ndarray | None:
+        """The same of repeating the current position; None where actions are no positions."""
+        return None if self.hold is None else self._relative(self.hold)
+
+    def _relative(self, error: np.ndarray) -> np.ndarray | None:
+        varies = self.training_std > 0
+        if not varies.any():
+            return None
+        return np.square(error[..., varies] / self.training_std[varies]).mean(axis=-1)
+
+    def interval(self) -> tuple[float, float] | None:
+        """95 % interval of the mean relative error over all steps; None of a single episode."""
+        relative = self.relative
+        if relative is None:
+            return None
+        # The episode of each valid step, in the order of `relative[valid]`.
+        episode_of = np.broadcast_to(self.episode_of[:, None], self.valid.shape)[self.valid]
+        return interval(relative[self.valid], episode_of)
+
+
+def mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
+    """The mean of what is valid; None where nothing is."""
+    return None if values is None or not valid.any() else float(values[valid].mean())
+
+
+def interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of the mean of errors [n], by Student's t over episodes; None of a single one.
+
+    Steps of an episode are alike, and episodes are few.
+    """
+    error, episodes = clustered_error(errors, episode_of.tolist())
+    if episodes == 1:
+        return None
+    middle, half = float(errors.mean()), t_quantile(episodes - 1) * error
+    return max(0.0, middle - half), middle + half  # no squared error is below 0
+
+
+def _places(shown: Demonstrations) -> list[int] | None:
+    """The position that each action says to take, which is that of its name; None where one lacks.
+
+    A robot may tell more of itself than it is told to do, such as velocities or efforts.
+    """
+    names, positions = shown.action_names, shown.proprio_names
+    named = any(names) and len(names) == shown.tensors["actions"].shape[1]
+    if not named or len(positions) != shown.tensors["proprio"].shape[1]:
+        return None
+    if names == positions:  # in one order, even where two arms use one name
+        return list(range(len(names)))
+    if any(names.count(name) != 1 or positions.count(name) != 1 for name in names):
+        return None
+    return [positions.index(name) for name in names]

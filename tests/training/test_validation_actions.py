@@ -1,0 +1,269 @@
+"""Held-out actions predicted while a run trains: their error shows, and training is not changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples import lerobot
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    TIMES,
+    Start,
+    assert_resumes,
+    metrics,
+    stop_at,
+)
+
+from aegis_cli import recipes
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Progress
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.evaluation import kept_figures, open_loop
+from aegis_cli.evaluation.open_loop import OpenLoopReport
+from aegis_cli.inspection import folders
+from aegis_cli.methods import METHODS
+from aegis_cli.recipes import Kfac, Recipe
+from aegis_cli.reporting import gather
+from aegis_cli.training import checkpoint, dry_run, parallel, train, validation_actions
+
+COUNT = 9
+FIGURES = {"action_error", "action_error_low", "action_error_high"}
+PREDICTING = replace(SETTINGS, validate_actions=COUNT, validation_share=0.4)
+
+
+@pytest.fixture
+def predicting(recipe: Recipe) -> Recipe:
+    """A proximal step of `kfac` covers four steps, and a validation comes within."""
+    return replace(recipe, train=PREDICTING, kfac=Kfac(every=4))
+
+
+def without(recipe: Recipe) -> Recipe:
+    return replace(recipe, train=replace(recipe.train, validate_actions=None))
+
+
+def of_report(report: OpenLoopReport) -> dict[str, float]:
+    """The figures that a line of metrics has of what `aegis evaluate` found."""
+    assert report.relative_error is not None and report.relative_interval is not None
+    low, high = report.relative_interval
+    found = {
+        "action_error": report.relative_error,
+        "action_error_low": low,
+        "action_error_high": high,
+    }
+    return found if report.hold_error is None else found | {"action_hold": report.hold_error}
+
+
+def of_metrics(line: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in line.items() if name.startswith("action_")}
+
+
+@pytest.mark.parametrize("method", ["naive", "kfac", "lora"])
+def test_training_does_not_notice_them(
+    method: str, predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    start(method, tmp_path / "told", recipe=predicting)
+    start(method, tmp_path / "plain", recipe=without(predicting))
+    assert metrics(tmp_path / "told", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    for name in ("backbone/model.safetensors", "expert.safetensors"):
+        one, other = (checkpoint.last(tmp_path / run) / name for run in ("told", "plain"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"ema_decay": 0.6},
+        {"normalization": "quantiles"},
+        {"validate_actions": 10_000},  # more than there are: `aegis evaluate` takes all of them too
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("method", ["naive", "lora"])
+def test_the_figures_are_those_of_evaluate_on_the_checkpoint(
+    method: str,
+    changes: dict[str, Any],
+    predicting: Recipe,
+    start: Start,
+    demos_file: Path,
+    tmp_path: Path,
+) -> None:
+    settings = replace(PREDICTING, checkpoint_every=3, **changes)
+    start(method, tmp_path / "run", recipe=replace(predicting, train=settings))
+    count, lines = settings.validate_actions, metrics(tmp_path / "run")
+    early = open_loop.run(tmp_path / "run" / "checkpoints" / "000003", demos_file, frames=count)
+    late = open_loop.run(tmp_path / "run", demos_file, frames=count)
+    assert late.split == "validation" and len(late.episodes) > 1
+    assert of_metrics(lines[2]) == pytest.approx(of_report(early), rel=1e-4)
+    assert of_metrics(lines[-1]) == pytest.approx(of_report(late), rel=1e-4)
+    assert early.relative_error != pytest.approx(late.relative_error, rel=1e-3)
+
+
+@pytest.mark.usefixtures("frame_cache")
+@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+def test_a_real_robot_has_its_position_beside_them(
+    relative: bool, predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    """Its actions are positions; a policy of actions relative to them is compared alike."""
+    demos = tmp_path / "arm"
+    lerobot.save(demos, lerobot.episodes(6, texts=lerobot.READABLE), action_names=("x", "z"))
+    own = replace(predicting, train=replace(PREDICTING, relative_actions=relative))
+    report = start("naive", tmp_path / "run", recipe=own, demos=demos)
+    found = open_loop.run(tmp_path / "run", demos, frames=COUNT)
+    line = metrics(tmp_path / "run")[-1]
+    assert of_metrics(line) == pytest.approx(of_report(found), rel=1e-4)
+    assert line["action_hold"] == found.hold_error
+    assert report.validation_actions == {
+        "relative_error": line["action_error"],
+        "relative_interval": [line["action_error_low"], line["action_error_high"]],
+        "hold_error": line["action_hold"],
+    }
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"weights": "bf16-master"}, {"weights": "bf16-master", "freeze": "vision"}],
+    ids=str,
+)
+def test_models_of_the_hub_predict_too(
+    changes: dict[str, Any],
+    predicting: Recipe,
+    start: Start,
+    demos_file: Path,
+    hf_folder: Callable[[str], Path],
+    tmp_path: Path,
+) -> None:
+    settings = replace(PREDICTING, steps=2, validate_every=2, **changes)
+    own = replace(predicting, backbone=str(hf_folder("smolvlm")), train=settings)
+    start("naive", tmp_path / "run", recipe=own, anchor=None)
+    start("naive", tmp_path / "plain", recipe=without(own), anchor=None)
+    for name in ("backbone/model.safetensors", "expert.safetensors"):
+        one, other = (checkpoint.last(tmp_path / run) / name for run in ("run", "plain"))
+        assert one.read_bytes() == other.read_bytes()
+    found = open_loop.run(tmp_path / "run", demos_file, frames=COUNT)
+    assert of_metrics(metrics(tmp_path / "run")[-1]) == pytest.approx(of_report(found), rel=1e-3)
+
+
+def test_they_are_predicted_with_every_validation_loss_and_no_other_time(
+    predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=predicting, on_event=events.append)
+    lines = metrics(tmp_path / "run")
+    for line in lines:
+        assert ("validation_loss" in line) == FIGURES.issubset(line)
+    shown = [e for e in events if isinstance(e, Progress) and e.stage == "actions"]
+    # Those of the first time; they were short, so that others would be two lines of a log each.
+    assert [e.done for e in shown] == sorted(e.done for e in shown) and shown[-1].done == COUNT
+    told = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
+    assert told["action error"] == lines[-1]["action_error"]
+
+
+def test_predictions_that_took_long_are_shown_again(
+    predicting: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "_LONG_S", 0.0)
+    events: list[Event] = []
+    start("naive", tmp_path / "run", recipe=predicting, on_event=events.append)
+    ends = [e for e in events if isinstance(e, Progress) and e.stage == "actions"]
+    assert [e.done == e.total for e in ends].count(True) == STEPS // SETTINGS.validate_every
+
+
+def test_a_run_goes_on_with_the_same_frames(
+    predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    assert_resumes(start, "naive", predicting, tmp_path)
+    events: list[Event] = []
+    whole = tmp_path / "whole"
+    report = start("naive", whole, recipe=predicting, resume=True, on_event=events.append)
+    # A run that has ended tells its figures and predicts nothing.
+    assert not [e for e in events if getattr(e, "stage", "") == "actions"]
+    assert report.validation_actions["relative_error"] == metrics(whole)[-1]["action_error"]
+
+
+def test_a_run_may_begin_or_cease_to_predict_when_it_goes_on(
+    predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(4, KeyboardInterrupt())
+        start("naive", tmp_path / "run", recipe=without(predicting), on_event=stop)
+    start("naive", tmp_path / "run", recipe=predicting, resume=True)
+    start("naive", tmp_path / "whole", recipe=predicting)
+    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    assert one == other
+    kept = recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe)
+    assert kept.train.validate_actions == COUNT
+
+
+def test_inspect_and_the_page_tell_them(predicting: Recipe, start: Start, tmp_path: Path) -> None:
+    report = start("naive", tmp_path / "run", recipe=predicting)
+    found = folders.inspect(tmp_path / "run")
+    assert found.facts["validation_actions"] == report.validation_actions
+    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
+    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
+    assert early.facts["validation_actions"]["relative_error"] == line["action_error"]
+    # `aegis run` keeps the report, and reads it again for its page.
+    files.save_json(tmp_path / "train.json", report.to_json())
+    kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
+    assert kept["validation_actions"] == report.validation_actions
+    drawn = gather.run_document(tmp_path / "run").metrics
+    assert [at["step"] for at in drawn if "action_error" in at] == [3, STEPS]
+
+
+def test_one_process_predicts_and_the_others_are_told(
+    predicting: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Ranks, "_told", lambda *_: {"action_error": 0.5})
+    monkeypatch.setattr(validation_actions, "predict", lambda *_: pytest.fail("predicted"))
+    nobody: Any = None
+    second = validation_actions.ValidationActions(nobody, torch.arange(3), np.ones(2), 4)
+    assert second.figures(nobody, Ranks(1, 2), lambda _: None) == {"action_error": 0.5}
+
+
+@pytest.mark.fast
+def test_one_episode_has_no_interval() -> None:
+    line = {"action_error": 0.5, "action_hold": 0.75}
+    told = {"relative_error": 0.5, "hold_error": 0.75, "relative_interval": None}
+    assert validation_actions.of_line(line) == told
+    assert validation_actions.of_line({"step": 3, "loss": 1.0}) == {}
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("frame_cache")
+def test_actions_that_never_vary_are_refused_before_the_first_step(
+    predicting: Recipe, start: Start, tmp_path: Path
+) -> None:
+    demos = tmp_path / "arm"
+    still = lerobot.episodes(6, texts=lerobot.READABLE)
+    for episode in still:
+        episode.actions[:] = 1.0
+    lerobot.save(demos, still)
+    with pytest.raises(AegisError, match="train.validate_actions: 9 with actions that never vary"):
+        start("naive", tmp_path / "run", recipe=predicting, demos=demos)
+    assert not (tmp_path / "run" / "recipe.yaml").exists()
+    with pytest.raises(AegisError, match="never vary"):
+        dry_run.run(predicting, "naive", demos, None, tmp_path / "run")
+
+
+@pytest.mark.fast
+def test_shares_of_the_weights_predict_nothing(predicting: Recipe) -> None:
+    sharded = replace(predicting, train=replace(PREDICTING, parallel="fsdp"))
+    with pytest.raises(AegisError, match="train.validate_actions: 9 with train.parallel: fsdp"):
+        parallel.check(sharded, METHODS["naive"], Ranks(1, 2))
+    parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
+
+
+@pytest.mark.fast
+def test_no_record_of_earlier_work_knows_the_key(predicting: Recipe) -> None:
+    assert recipes.training_part(predicting) == recipes.training_part(without(predicting))
+    assert "validate_actions" not in recipes.recorded(without(predicting).train)
