@@ -11,11 +11,13 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch import distributed as dist
+from torch.utils import _pytree as pytree
 
 from aegis_cli import recipes
 from aegis_cli.common import devices
@@ -26,7 +28,7 @@ from aegis_cli.methods.backward import Groups
 from aegis_cli.methods.base import Method
 from aegis_cli.methods.lora import LowRankLinear
 from aegis_cli.models import structure
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import Backbone, Encoding
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, Train
 
@@ -119,6 +121,7 @@ def shard(policy: Policy, precision: str, device: torch.device) -> None:
         register_fsdp_forward_method,
     )
 
+    _tell_of_encodings()
     mesh = init_device_mesh(device.type, (dist.get_world_size(),))
     as_kept = MixedPrecisionPolicy()
     policies = dict.fromkeys(_blocks(policy.backbone), as_kept)
@@ -139,6 +142,15 @@ def shard(policy: Policy, precision: str, device: torch.device) -> None:
             module.set_force_sum_reduction_for_comms(True)  # gloo knows no scaled sums
     # Keys and values are views of a layer's products. Nothing here writes into them.
     warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view tensor")
+
+
+@cache
+def _tell_of_encodings() -> None:
+    """Let PyTorch find the tensors of an `Encoding`, as it does by itself since 2.13.
+
+    By the gradients of a module's output it knows when to gather the module's weights again.
+    """
+    pytree.register_dataclass(Encoding)
 
 
 def _halved(blocks: Iterable[nn.Module]) -> dict[nn.Module, MixedPrecisionPolicy]:

@@ -22,6 +22,7 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.data import spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.models.action_errors import ActionErrors, mean, predict, training_std
+from aegis_cli.models.backbones.compiling import uncompiled
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
@@ -40,6 +41,7 @@ class ValidationActions:
     Attributes:
         at: [N], numbers of the frames.
         training_std: [A], the standard deviations that errors are relative to.
+        compiled: whether the policy's passes are compiled.
         seconds: that the predictions took the last time.
     """
 
@@ -47,6 +49,7 @@ class ValidationActions:
     at: Tensor
     training_std: np.ndarray
     batch_size: int
+    compiled: bool = False
     seconds: float = math.inf
 
     def figures(self, policy: Policy, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
@@ -62,7 +65,9 @@ class ValidationActions:
         return found
 
     def _compared(self, policy: Policy, on_event: OnEvent) -> dict[str, float]:
-        predicted = predict(policy, self.demos, self.at, _SEED, self.batch_size, _STAGE, on_event)
+        given = policy, self.demos, self.at, _SEED, self.batch_size, _STAGE, on_event
+        with uncompiled(self.compiled):
+            predicted = predict(*given)
         errors = ActionErrors.of(self.demos, self.at, predicted, self.training_std)
         own = {
             "action_error": mean(errors.relative, errors.valid),
@@ -106,4 +111,4 @@ def chosen(
         )
     held_out = demos.validation
     at = held_out[spread.rows(len(held_out), count)]
-    return ValidationActions(demos, at, std, recipe.train.batch_size)
+    return ValidationActions(demos, at, std, recipe.train.batch_size, recipe.train.compile)

@@ -6,7 +6,6 @@ evaluation plays them, and what they show is no result. Nothing learns from them
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import time
@@ -14,14 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from aegis_cli import sim
 from aegis_cli.common import gl
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.models.acting import DEFAULT, Acting, RolloutReport, longest_s, play
+from aegis_cli.models.backbones.compiling import uncompiled
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
@@ -72,23 +70,15 @@ class ValidationEpisodes:
         def named(event: Event) -> None:
             on_event(dataclasses.replace(event, stage=_STAGE))
 
-        with self._as_it_is():
+        # Episodes end one by one, and each number that is left would be another shape to compile.
+        with uncompiled(self.compiled):
             return play(
                 self.acting, self.count, DEFAULT, VALIDATION, on_event=named, seed=self.seed
             )
 
     def _longest_s(self) -> float:
-        with self._as_it_is():
+        with uncompiled(self.compiled):
             return longest_s(self.acting, self.count, DEFAULT, VALIDATION, self.seed)
-
-    def _as_it_is(self) -> contextlib.AbstractContextManager[object]:
-        """Let no pass inside the block compile anything.
-
-        Episodes end one by one, and each number that is left would be another shape to compile.
-        """
-        if not self.compiled:
-            return contextlib.nullcontext()
-        return torch.compiler.set_stance("force_eager")
 
 
 def _line(report: RolloutReport) -> dict[str, float]:

@@ -497,6 +497,20 @@ def test_a_suffix_sees_as_far_back_as_the_layers_windows(name: str, hf_backbone:
 # --- weights -------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_products_in_bf16_leave_each_token_nearly_where_it_was(backbone: HFBackbone) -> None:
+    """Where an image's features meet words they have two types, which autocast has made."""
+    batch = backbone.prepare(images(2), TEXTS[:2])
+    with torch.no_grad():
+        wide = backbone.encode(batch)
+        with torch.autocast("cpu", torch.bfloat16):
+            narrow = backbone.encode(batch)
+    for one, other in zip(wide.hidden, narrow.hidden, strict=True):
+        assert other.dtype == torch.float32
+        own = one[wide.mask]
+        assert (other[wide.mask] - own).norm() < 0.1 * own.norm()
+
+
 def test_bf16_weights_leave_positions_alone(backbone: HFBackbone) -> None:
     before = {name: buffer.clone() for name, buffer in backbone.named_buffers()}
     backbone.round_weights(torch.bfloat16)

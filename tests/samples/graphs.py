@@ -1,4 +1,4 @@
-"""Whether a training keeps what it computed.
+"""Whether a training keeps what it computed, and what it compiles.
 
 A graph that outlives its step costs its activations, once per step.
 """
@@ -10,8 +10,12 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
+
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
+from aegis_cli.models.expert import ActionExpert
 
 
 def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
@@ -29,6 +33,20 @@ def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
         hook.remove()
     gc.collect()
     return len(made), sum(output() is not None for output in made)
+
+
+def compiled_graphs(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Will hold each graph that a training of the embedded family compiles, which it then runs."""
+    found: list[object] = []
+
+    def noted(graph: Any, _: object) -> Any:
+        found.append(graph)
+        return graph.forward
+
+    for owner, name in ((EmbeddedVLM, "compile_passes"), (ActionExpert, "compile_layers")):
+        real = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda part, real=real: real(part, noted))
+    return found
 
 
 class Keeper(nn.Module):

@@ -15,14 +15,16 @@ from samples import processes
 from samples.parallel_runs import Averaging, Job, Measuring, free_ports, lose_one, run_together
 from samples.training_runs import TIMES, metrics
 from torch import multiprocessing
+from torch.utils import _pytree as pytree
 
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.common.ranks import Ranks
+from aegis_cli.core.attention import KeyValue
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
-from aegis_cli.models.backbones.base import Batch
+from aegis_cli.models.backbones.base import Batch, Encoding
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import Recipe
 from aegis_cli.training import assemble, checkpoint, loading, parallel, step
@@ -373,3 +375,15 @@ def test_a_part_of_each_share_is_no_part_of_the_batch(make: Make, tmp_path: Path
     parallel.check(recipe, METHODS["aegis"], Ranks())
     with pytest.raises(AegisError, match=r"aegis\.fraction: 0\.5 in 2 processes"):
         parallel.check(recipe, METHODS["aegis"], Ranks(0, 2))
+
+
+@pytest.mark.fast
+def test_pytorch_finds_every_tensor_of_an_encoding() -> None:
+    """By them it gathers sharded weights for the backward pass; before 2.13 it has to be told."""
+    parallel._tell_of_encodings()
+    tensors = [torch.full((1,), float(i)) for i in range(5)]
+    hidden, key, value, mask, image = tensors
+    encoding = Encoding((hidden,), (KeyValue(key, value),), mask, image)
+    leaves, shape = pytree.tree_flatten(encoding)
+    assert [leaf for leaf in leaves if leaf is not None] == tensors
+    assert pytree.tree_unflatten(leaves, shape) == encoding

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from samples import lerobot
+from samples.graphs import compiled_graphs
 from samples.training_runs import (
     SETTINGS,
     STEPS,
@@ -150,6 +151,29 @@ def test_models_of_the_hub_predict_too(
         assert one.read_bytes() == other.read_bytes()
     found = open_loop.run(tmp_path / "run", demos_file, frames=COUNT)
     assert of_metrics(metrics(tmp_path / "run")[-1]) == pytest.approx(of_report(found), rel=1e-3)
+
+
+# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_nothing_is_compiled_for_predictions(
+    predicting: Recipe,
+    start: Start,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graphs = compiled_graphs(monkeypatch)
+    settings = replace(PREDICTING, steps=2, validate_every=2, compile=True)
+    compiling = replace(predicting, train=settings)
+    torch._dynamo.reset()  # an earlier test's graphs would serve as well
+    start("naive", tmp_path / "plain", recipe=without(compiling))
+    before = len(graphs)
+    graphs.clear()
+    torch._dynamo.reset()
+    start("naive", tmp_path / "run", recipe=compiling)
+    assert len(graphs) == before > 0
+    found = open_loop.run(tmp_path / "run", demos_file, frames=COUNT)
+    assert of_metrics(metrics(tmp_path / "run")[-1]) == pytest.approx(of_report(found), rel=1e-4)
 
 
 def test_they_are_predicted_with_every_validation_loss_and_no_other_time(

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from samples import lerobot
+from samples.graphs import compiled_graphs
 from samples.training_runs import (
     SETTINGS,
     STEPS,
@@ -31,8 +32,6 @@ from aegis_cli.inspection import folders
 from aegis_cli.methods import METHODS
 from aegis_cli.models import acting
 from aegis_cli.models.acting import RolloutReport
-from aegis_cli.models.backbones.embedded import EmbeddedVLM
-from aegis_cli.models.expert import ActionExpert
 from aegis_cli.recipes import Kfac, Nullspace, Recipe
 from aegis_cli.reporting import gather
 from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION
@@ -275,15 +274,7 @@ def test_nothing_is_compiled_for_episodes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    graphs: list[object] = []
-
-    def counted(graph: Any, _: object) -> Any:
-        graphs.append(graph)
-        return graph.forward
-
-    for owner, name in ((EmbeddedVLM, "compile_passes"), (ActionExpert, "compile_layers")):
-        real = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda part, real=real: real(part, counted))
+    graphs = compiled_graphs(monkeypatch)
     compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=2, compile=True))
     torch._dynamo.reset()  # an earlier test's graphs would serve as well
     start("naive", tmp_path / "plain", recipe=without(compiling))

@@ -8,7 +8,7 @@ compiled for one of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -93,6 +93,14 @@ def compiled(
     dynamo.recompile_limit = max(dynamo.recompile_limit, _RECOMPILED)
     functorch.donated_buffer = False
     return torch.compile(function, dynamic=dynamic, backend=backend)
+
+
+def uncompiled(holds: bool = True) -> AbstractContextManager[object]:
+    """Let no pass inside the block compile anything, unless this does not hold.
+
+    Frames and episodes of which some are left over make shapes that are soon of no more use.
+    """
+    return torch.compiler.set_stance("force_eager") if holds else nullcontext()
 
 
 def compile_layers(layers: Iterable[nn.Module], backend: str, keeps_keys: bool) -> None:

@@ -44,6 +44,8 @@ class Family:
             tensor; 0 where nothing is named.
         held: names of parameters that no input describes, such as a matrix that is no map of
             torch's: they are protected by holding them still.
+        connector: dotted name of what makes tokens of image features, where transformers 5.5 puts
+            them among words without looking at their type, which autocast changes; None elsewhere.
         idle: the model -> dotted names of the parts whose outputs nothing reads.
     """
 
@@ -52,6 +54,7 @@ class Family:
     answer: str = "{}"
     answer_types: Mapping[str, int] = field(default_factory=dict)
     held: tuple[str, ...] = ()
+    connector: str | None = None
     idle: Callable[[Any], tuple[str, ...]] = _nothing
 
 
@@ -62,7 +65,7 @@ FAMILIES: dict[str, Family] = {
         prompt="answer en {}",
         answer_types={"token_type_ids": 1},
     ),
-    "smolvlm": Family("model.text_model.layers", answer=" {}"),
+    "smolvlm": Family("model.text_model.layers", answer=" {}", connector="model.connector"),
     "idefics3": Family("model.text_model.layers", answer=" {}"),
     "qwen2_5_vl": Family("model.language_model.layers"),
     "llava_onevision": Family("model.language_model.layers"),

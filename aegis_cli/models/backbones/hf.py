@@ -87,6 +87,8 @@ class HFBackbone(Backbone):
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.held = tuple(f"vlm.{name}" for name in family.held)
         self.idle = tuple(f"vlm.{part}" for part in family.idle(model))
+        if family.connector is not None:
+            model.get_submodule(family.connector).register_forward_hook(_in_own_type)
         self.width, self.heads = text.hidden_size, text.num_attention_heads
         self._layers_path = f"vlm.{family.layers}"
         self._language = self._layers_path.rpartition(".")[0]
@@ -469,6 +471,11 @@ def _layer_types(text: Any, rotary: nn.Module) -> Sequence[str] | None:
     """
     by_kind = "layer_type" in inspect.signature(rotary.forward).parameters
     return text.layer_types if by_kind else None
+
+
+def _in_own_type(module: nn.Module, _: tuple[Any, ...], output: Tensor) -> Tensor:
+    """A module's output in the type of its weights, whatever autocast has made of it."""
+    return output.to(next(module.parameters()).dtype)
 
 
 @contextmanager
