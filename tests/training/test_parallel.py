@@ -377,7 +377,6 @@ def test_a_part_of_each_share_is_no_part_of_the_batch(make: Make, tmp_path: Path
         parallel.check(recipe, METHODS["aegis"], Ranks(0, 2))
 
 
-@pytest.mark.fast
 def test_pytorch_finds_every_tensor_of_an_encoding() -> None:
     """By them it gathers sharded weights for the backward pass; before 2.13 it has to be told."""
     parallel._tell_of_encodings()

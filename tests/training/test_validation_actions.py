@@ -252,7 +252,6 @@ def test_one_process_predicts_and_the_others_are_told(
     assert second.figures(nobody, Ranks(1, 2), lambda _: None) == {"action_error": 0.5}
 
 
-@pytest.mark.fast
 def test_one_episode_has_no_interval() -> None:
     line = {"action_error": 0.5, "action_hold": 0.75}
     told = {"relative_error": 0.5, "hold_error": 0.75, "relative_interval": None}
@@ -279,7 +278,6 @@ def test_actions_that_never_vary_are_refused_before_the_first_step(
         dry_run.run(predicting, "naive", demos, None, tmp_path / "run")
 
 
-@pytest.mark.fast
 def test_shares_of_the_weights_predict_nothing(predicting: Recipe) -> None:
     sharded = replace(predicting, train=replace(PREDICTING, parallel="fsdp"))
     with pytest.raises(AegisError, match="train.validate_actions: 9 with train.parallel: fsdp"):
@@ -287,7 +285,6 @@ def test_shares_of_the_weights_predict_nothing(predicting: Recipe) -> None:
     parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
 
 
-@pytest.mark.fast
 def test_no_record_of_earlier_work_knows_the_key(predicting: Recipe) -> None:
     assert recipes.training_part(predicting) == recipes.training_part(without(predicting))
     assert "validate_actions" not in recipes.recorded(without(predicting).train)
