@@ -222,6 +222,7 @@ def said_plainly(hf_backbone: Loaded) -> Callable[[str], list[str]]:
         {"do_sample": True, "temperature": 9.0, "top_k": 3},
         {"num_beams": 3},
         {"min_new_tokens": 9},
+        {"pad_token_id": 10**6},
     ],
 )
 def test_a_models_own_ways_to_generate_change_no_answer(

@@ -294,7 +294,7 @@ class HFBackbone(Backbone):
         """The answers that the model generates, each up to its own number of tokens."""
         batch = prompts.to(self.device)
         assert isinstance(self.vlm, transformers.GenerationMixin)
-        with _greedy(self.vlm):
+        with _greedy(self.vlm, self._prompter.filler):
             said = self.vlm.generate(**_arguments(batch), max_new_tokens=max(most))
         rows = said[:, batch.ids.shape[1] :].tolist()  # what is generated follows the prompts
         return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
@@ -493,14 +493,16 @@ def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Generator[None]:
 
 
 @contextmanager
-def _greedy(model: transformers.PreTrainedModel) -> Generator[None]:
+def _greedy(model: transformers.PreTrainedModel, filler: int) -> Generator[None]:
     """Inside the block, a model generates the likeliest token after each, until one that ends it.
 
     Its own settings may sample, and may penalise the words that a question has, such as
-    `repetition_penalty`. Of them the tokens that begin, end and fill a text are left.
+    `repetition_penalty`. Of them the tokens that begin and end a text are left. What fills a row
+    that has ended is the tokenizer's: the model's own may be none of its words.
     """
     own = model.generation_config
-    tokens = {name: getattr(own, name) for name in ("bos_token_id", "eos_token_id", "pad_token_id")}
+    tokens = {"bos_token_id": own.bos_token_id, "eos_token_id": own.eos_token_id}
+    tokens["pad_token_id"] = filler
     model.generation_config = transformers.GenerationConfig(**tokens, do_sample=False, num_beams=1)
     try:
         yield

@@ -155,6 +155,11 @@ class Prompter:
             tokenize=False,
         )
 
+    @property
+    def filler(self) -> int:
+        """The token that fills a row up to the longest."""
+        return self._tokenizer.pad_token_id
+
     def places_image(self) -> bool:
         """Whether the mark of an image is in what the model is asked about one."""
         return any(marker in self._prompt("a") for marker in self._markers)
