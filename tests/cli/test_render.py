@@ -384,17 +384,14 @@ def test_the_probe_table_lists_families_and_layers():
     assert ["0", "1.5", "0.5"] in [line.split() for line in said.splitlines()]
 
 
-@pytest.mark.parametrize(
-    ("acted", "row"),
-    [
+def test_validation_episodes_are_a_table_with_their_interval() -> None:
+    for acted, row in (
         ({"success": 0.2, "interval": [0.036, 0.624]}, "success % 20.0 3.6 to 62.4"),
         ({"mean_return": 83.25, "return_interval": [70.0, 96.5]}, "mean return 83.25 70 to 96.5"),
         ({"mean_return": 83.25, "return_interval": None}, "mean return 83.25 -"),
-    ],
-)
-def test_validation_episodes_are_a_table_with_their_interval(acted: Any, row: str) -> None:
-    (table,) = validation_rollout(acted)
-    assert row in [" ".join(line.split()) for line in text_of(table).splitlines()]
+    ):
+        (table,) = validation_rollout(acted)
+        assert row in [" ".join(line.split()) for line in text_of(table).splitlines()]
     assert not list(validation_rollout({}))
 
 

@@ -362,6 +362,7 @@ def test_without_opengl_no_step_is_taken(
     start("naive", tmp_path / "plain", recipe=without(playing))
 
 
+@pytest.mark.fast
 def test_shares_of_the_weights_do_not_act(playing: Recipe) -> None:
     sharded = replace(playing, train=replace(SETTINGS, parallel="fsdp"))
     with pytest.raises(AegisError, match="rollout.while_training: 2 with train.parallel: fsdp"):
@@ -369,6 +370,7 @@ def test_shares_of_the_weights_do_not_act(playing: Recipe) -> None:
     parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     ("recipe_file", "count", "expected"),
     [
@@ -399,6 +401,7 @@ def test_a_figure_that_is_not_finite_ends_the_run(
     assert all("rollout_success" not in line for line in metrics(tmp_path / "run"))
 
 
+@pytest.mark.fast
 def test_no_record_of_earlier_work_knows_the_key(playing: Recipe) -> None:
     assert recipes.training_part(playing) == recipes.training_part(without(playing))
     assert "while_training" not in recipes.recorded(without(playing).rollout)
