@@ -387,8 +387,8 @@ class Train:
         shapes=False,
         doc="Held-out frames at which `aegis train` predicts actions with every validation loss. "
         "Their error, as `aegis evaluate` has it, is in its log and in trackers: 1 is that of "
-        "always predicting the mean, and of a robot that is not simulated nothing else shows how "
-        "well it acts. Null: none.",
+        "always predicting the mean. Of a robot that is not simulated no other figure tells of "
+        "whole actions while it trains. Null: none.",
     )
     checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
     keep_checkpoints: int | None = key(

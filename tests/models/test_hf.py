@@ -9,6 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -158,6 +159,26 @@ def test_any_of_several_ends_ends_an_answer(backbone: HFBackbone) -> None:
     close(alone[2], torch.logaddexp(alone[0], alone[1]))
 
 
+@pytest.mark.parametrize("family", ["paligemma", "smolvlm"])
+def test_what_fills_a_row_that_has_ended_is_a_word_of_the_model(
+    backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another row's answer goes on meanwhile."""
+    said: list[list[int]] = []
+    decode = backbone._prompter.decode
+    monkeypatch.setattr(backbone._prompter, "decode", lambda ids: said.extend(ids) or decode(ids))
+    backbone.answer(images(4), TEXTS)
+    ends = next(row[0] for row in said if any(row[0] not in other for other in said))
+    going_on = [i for i, row in enumerate(said) if ends not in row]
+    free = said[going_on[0]]
+    said.clear()
+    config = backbone.vlm.generation_config
+    config.eos_token_id, config.pad_token_id = ends, 10**6
+    backbone.answer(images(4), TEXTS)
+    assert said[going_on[0]] == free
+    assert any(row[0] == ends for row in said)
+
+
 def test_every_mask_takes_a_byte_a_number(backbone: HFBackbone) -> None:
     """That of pixels is as large as the pictures themselves."""
     batch = backbone.process(images(2), TEXTS[:2])
@@ -222,7 +243,6 @@ def said_plainly(hf_backbone: Loaded) -> Callable[[str], list[str]]:
         {"do_sample": True, "temperature": 9.0, "top_k": 3},
         {"num_beams": 3},
         {"min_new_tokens": 9},
-        {"pad_token_id": 10**6},
     ],
 )
 def test_a_models_own_ways_to_generate_change_no_answer(
@@ -501,15 +521,65 @@ def test_a_suffix_sees_as_far_back_as_the_layers_windows(name: str, hf_backbone:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_products_in_bf16_leave_each_token_nearly_where_it_was(backbone: HFBackbone) -> None:
     """Where an image's features meet words they have two types, which autocast has made."""
-    batch = backbone.prepare(images(2), TEXTS[:2])
+    batch, types = backbone.prepare(images(2), TEXTS[:2]), list[torch.dtype]()
+    if backbone._family.connector is not None:
+        connector = backbone.vlm.get_submodule(backbone._family.connector)
+        connector.register_forward_hook(lambda _, __, output: types.append(output.dtype))
     with torch.no_grad():
         wide = backbone.encode(batch)
         with torch.autocast("cpu", torch.bfloat16):
             narrow = backbone.encode(batch)
+    assert set(types) <= {torch.float32}
     for one, other in zip(wide.hidden, narrow.hidden, strict=True):
         assert other.dtype == torch.float32
         own = one[wide.mask]
         assert (other[wide.mask] - own).norm() < 0.1 * own.norm()
+
+
+def test_axes_that_attention_would_mix_have_one_rotation_at_the_places_of_text(
+    hf_backbone: Callable[[str], HFBackbone], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """transformers 5.5 leaves the mixing to Qwen2.5-VL's attention."""
+    backbone = hf_backbone("qwen2_5_vl")
+    encoding, ahead = encode(backbone, images(2), TEXTS[:2]), torch.arange(3)
+    mixed, rotary = backbone._rotations(encoding, ahead)[0], type(backbone._rotary)
+    answer = rotary.forward
+
+    def apart(*given: Tensor) -> tuple[Tensor, ...]:
+        assert given[-1].shape == (3, 2, 3)  # axes, rows and places
+        return tuple(each.expand(3, *each.shape) for each in answer(*given))
+
+    monkeypatch.setattr(rotary, "forward", apart)
+    for one, other in zip(mixed, backbone._rotations(encoding, ahead)[0], strict=True):
+        assert torch.equal(one, other)
+
+
+def test_gradients_are_checkpointed_by_either_name(
+    hf_backbone: Callable[[str], HFBackbone], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backbone, asked = hf_backbone("paligemma"), list[dict[str, bool]]()
+    monkeypatch.delattr(transformers.PreTrainedModel, "activation_checkpointing_enable", False)
+    monkeypatch.setattr(
+        type(backbone.vlm), "gradient_checkpointing_enable", lambda _, how: asked.append(how)
+    )
+    backbone.checkpoint_gradients()
+    assert asked == [{"use_reentrant": False}]
+
+
+@pytest.mark.parametrize("deeper", ["", ".vision_model"])
+def test_what_a_clip_tower_leaves_unread_is_found_in_both_its_places(deeper: str) -> None:
+    class Model(torch.nn.Module):
+        config = SimpleNamespace(
+            vision_config=SimpleNamespace(num_hidden_layers=3), vision_feature_layer=-2
+        )
+
+    model, at = Model(), Model()
+    model.add_module("model", at)
+    for name in f"vision_tower{deeper}".split("."):
+        at.add_module(name, Model())
+        at = at.get_submodule(name)
+    tower = f"model.vision_tower{deeper}"
+    assert FAMILIES["llava"].idle(model) == (f"{tower}.encoder.layers.2", f"{tower}.post_layernorm")
 
 
 def test_bf16_weights_leave_positions_alone(backbone: HFBackbone) -> None:

@@ -243,7 +243,7 @@ class HFBackbone(Backbone):
         how = {"use_reentrant": False}
         if hasattr(self.vlm, "activation_checkpointing_enable"):
             self.vlm.activation_checkpointing_enable(how)
-        else:  # its name before transformers 5.24
+        else:  # its name in earlier releases, such as transformers 5.5
             self.vlm.gradient_checkpointing_enable(how)
         self.vlm.disable_input_require_grads()
 
