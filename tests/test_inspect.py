@@ -296,6 +296,15 @@ def test_what_is_no_artifact_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "found"),
+    [("adapter_config.json", "an adapter of PEFT"), ("model.gguf", "llama.cpp's form, GGUF")],
+)
+def test_a_model_in_a_form_that_no_command_takes_is_named(tmp_path, name, found):
+    (tmp_path / name).write_text("{}")
+    assert found in refusal(tmp_path).found
+
+
+@pytest.mark.parametrize(
     "name", ["v2_OpenEnded_mscoco_val2014_questions.json", "part.parquet", "dataset_info.json"]
 )
 def test_a_folder_of_questions_is_told_by_what_they_are_asked(name, tmp_path):

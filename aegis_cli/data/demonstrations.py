@@ -388,12 +388,8 @@ def playable_task(
     if not path.is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = dataset.load(path, rename)
-    task = found.info.task
-    names = [layout.short(found.called(own)) for own in found.cameras(camera)]
-    # A single picture needs no name: the task's own camera takes its place.
-    if task is None or len(names) == 1:
-        return task
-    return task if {*names} <= {*sim.cameras(task)} else None
+    seen_by = {layout.short(found.called(own)) for own in found.cameras(camera)}
+    return sim.playable(found.info.task, seen_by)
 
 
 def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:

@@ -73,6 +73,8 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
             return _hub_model(inside)
         if (inside / "model.safetensors").is_file():
             return file.inspect(inside / "model.safetensors")
+    model_folder.refuse_adapter(path)
+    model_folder.refuse_gguf(path)
     refuse_unfinished(path, "inspect")  # a job that has no table yet
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")

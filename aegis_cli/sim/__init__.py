@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 
 from aegis_cli.common.errors import AegisError
@@ -41,6 +41,14 @@ def member(name: str, number: int) -> str:
 def cameras(name: str) -> tuple[str, ...]:
     """The cameras that a task can be seen by; the first takes the pictures if none is asked for."""
     return metaworld_table.CAMERAS if name.startswith(METAWORLD) else (TOP,)
+
+
+def playable(task: str | None, seen_by: Collection[str]) -> str | None:
+    """The task, if a policy of these cameras can act in it; None if none of ours shows as much."""
+    # A single picture needs no name: the task's own camera takes its place.
+    if task is None or len(seen_by) == 1 or {*seen_by} <= {*cameras(task)}:
+        return task
+    return None
 
 
 def check(name: str) -> None:

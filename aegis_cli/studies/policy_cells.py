@@ -848,11 +848,9 @@ def _sha256(run: Path) -> list[str]:
 
 def _playable(meta: PolicyMeta, recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
-    task = meta["task"]
-    cameras = {layout.short(name) for name in meta.get("cameras", ())}
-    if task is None or (len(cameras) > 1 and not cameras <= {*sim.cameras(task)}):
-        return ()
-    return _colors(task, recipe)
+    seen_by = {layout.short(name) for name in meta.get("cameras", ())}
+    task = sim.playable(meta["task"], seen_by)
+    return () if task is None else _colors(task, recipe)
 
 
 def playable_colors(recipe: Recipe) -> tuple[str, ...]:

@@ -221,8 +221,9 @@ class TrainingRun:
             wide=self.recipe.train.weights == BF16_MASTER,
             averaged=averaged,
         )
-        if self.temporary is not None and self.temporary != saved:
-            shutil.rmtree(self.temporary, ignore_errors=True)
+        if self.temporary is not None and not (going_on and self.temporary == saved):
+            if self.temporary != saved:
+                shutil.rmtree(self.temporary, ignore_errors=True)
             self.temporary = None
         kept = self.recipe.train.keep_checkpoints
         # That of an interruption goes with the next one, and takes the place of none until then.

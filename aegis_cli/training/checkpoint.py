@@ -112,7 +112,7 @@ def save(
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
     If `last` already points at a complete checkpoint of this step, that stays: there has to be one
-    at every moment.
+    at every moment. From the header of its training state goes what an interruption has left there.
 
     Args:
         policy: its weights are those of `state`, or of its average.
@@ -121,10 +121,25 @@ def save(
         wide: as of `plain_backbone`.
         averaged: inside its block the policy has the weights that others are to use.
     """
-    going_on = going_on or {}
+    described = {**meta, "step": step, optimizer_state.STATELESS: state.stateless}
     target = folder / "checkpoints" / f"{step:06d}"
     link = target.with_name(LAST)
+
+    def write_state(path: Path) -> None:
+        artifacts.save(
+            path,
+            "training-state",
+            state.tensors,
+            seed=seed,
+            inputs=inputs,
+            meta={**described, **(going_on or {})},
+        )
+
     if (link / EXPERT).is_file() and link.resolve() == target.resolve():
+        there = artifacts.read_header(target / STATE, "training-state").meta
+        if not going_on and not there.keys() <= described.keys():
+            with writing(folder):
+                write_state(target / STATE)
         return target
     aside = target.with_name(f".{target.name}.tmp")
     try:
@@ -137,14 +152,7 @@ def save(
                 plain = plain_backbone(policy.backbone, method, wide)
                 write_policy(aside, plain, policy, meta, inputs, seed, card)
             files.begin_to_write(aside)
-            artifacts.save(
-                aside / STATE,
-                "training-state",
-                state.tensors,
-                seed=seed,
-                inputs=inputs,
-                meta={**meta, **going_on, "step": step, optimizer_state.STATELESS: state.stateless},
-            )
+            write_state(aside / STATE)
             files.reach_disk(aside)
             # `last` moves only when the new checkpoint is complete under its own name. What may lie
             # under that name, as in a run that was taken back to an earlier step, is not `last`.

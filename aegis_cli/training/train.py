@@ -28,7 +28,7 @@ from aegis_cli.common import (
     prefetch,
 )
 from aegis_cli.common.errors import AegisError, Diverged, check_finite
-from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned, ignore, loading_told
 from aegis_cli.common.headers import rewrite
 from aegis_cli.common.kinds import is_finite
 from aegis_cli.common.ranks import ALONE, Ranks, joined, rows_here, whole
@@ -82,6 +82,7 @@ _SHOWN = {
 }
 LOWER = "try a lower train.backbone_lr or train.expert_lr"
 _NOISE, _VALIDATION = 1, 2  # streams of a step's generator
+_Hearing = Callable[[float], OnEvent]
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def run(
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
         with loading_told("train", on_event):
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
-        is_finished = goes_on and checkpoint.step_of(checkpoint.last(out)) >= recipe.train.steps
+        is_finished = goes_on and _has_ended(out, recipe)
         if not is_finished:
             training.episodes = validation_rollout.chosen(
                 recipe, training.policy, training.meta, ranks
@@ -185,6 +186,15 @@ def run(
             files.save_json(out / machine.NAME, _machine(training))
             _warn_of_learned_episodes(training, places, on_event)
         return _train(training, 0, Window(), on_event)
+
+
+def _has_ended(out: Path, recipe: Recipe) -> bool:
+    """Whether a run has taken all steps, and written the last one's line as well."""
+    steps = recipe.train.steps
+    if checkpoint.step_of(checkpoint.last(out)) < steps:
+        return False
+    lines = folder.read_metrics(out, "step")
+    return not lines or lines[-1]["step"] >= steps
 
 
 def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | None:
@@ -271,7 +281,8 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
     """State, ledger and metrics as they were after the last checkpoint.
 
     Returns:
-        How many steps lie behind it, and the sums since the last line of metrics.
+        How many steps lie behind it, and the sums since the last line of metrics: of no step where
+        the last one's line has been written.
     """
     state = checkpoint.kept_state(run.out)
     # The header alone: other inputs are refused before gigabytes of state are read.
@@ -294,7 +305,10 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
     if INTERRUPTED in meta:
         run.temporary = checkpoint.last(run.out).resolve()
         with reading_meta(run.temporary / checkpoint.STATE):
-            window = Window.read(meta[INTERRUPTED])
+            summed = Window.read(meta[INTERRUPTED])
+        # The line may have been written when the run went on before, and was interrupted again.
+        if all(line["step"] != done for line in lines):
+            window = summed
     if run.ranks.first:
         folder.truncate_metrics(run.out, done)
     return done, window
@@ -445,15 +459,17 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     with ahead as batches, signals as signaled, tracked as log:
         if done < settings.steps:
             on_event(Progress("train", done, settings.steps, "steps"))
-        for index in range(done, settings.steps):
-            finished = index + 1
+        # A run that was interrupted while it validated owes the line of a step that it has taken.
+        owed = window.steps > 0 and _Due.after(done, settings).line
+        for finished in range(done if owed else done + 1, settings.steps + 1):
             due = _Due.after(finished, settings)
-            _take_step(run, index, batches, window, due)
-            if index == done:
+            if finished > done:
+                _take_step(run, finished - 1, batches, window, due)
+            if finished == done + 1:
                 warn_of_written(run.policy.backbone, buffers, on_event)
             # First the line: by its validation loss the checkpoint chooses which others stay.
             if due.line:
-                shown = _log(run, finished, window, due.validation, on_event)
+                shown = _log(run, finished, window, due.validation, signaled, on_event)
                 log(shown)
                 window = Window()
             if due.checkpoint:
@@ -686,7 +702,6 @@ def update(
         Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
     """
     settings = run.recipe.train
-    factor = rate_factor(index, settings)
     moving = moving_steps(settings.steps, settings.backbone_until)
     still = index >= moving
     method, parts = run.method, run.parts
@@ -719,9 +734,9 @@ def update(
         run.reused = result.taken
     run.unread.stop(run.optimizers)
     if still:
-        _move(run, factor, still=True)
+        _move(run, index, still=True)
     else:
-        move = partial(_move, run, factor)
+        move = partial(_move, run, index)
         left, moves = rate_left(index, settings), run.unread.moves
         run.stepper.step(index + 1, move, result.anchor, left, moves)
         # The backbone's last step is constrained in any case: none after it would be its turn.
@@ -751,16 +766,13 @@ def read_figures(run: TrainingRun, window: Window) -> None:
             run.ledger.append(index + 1, row.tt, row.ta, row.aa, row.w2)
 
 
-def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
-    """Take the optimizers' step at the schedule's rate, of which a method may leave a share.
+def _move(run: TrainingRun, index: int, still: bool = False) -> None:
+    """Take the optimizers' step at the schedule's rates, of which a method may leave a share.
 
-    With `still`, the backbone's rate is 0.
+    With `still`, the backbone does not move.
     """
     shares = {} if still or run.parts.shares is None else run.parts.shares()
-    # `rate` is the schedule's, which the log shows; `lr`, which the optimizer reads, may be less.
-    for group in run.rates:
-        group["rate"] = 0.0 if still and group["name"] == "backbone" else group["peak"] * factor
-    for group, rate in zip(run.rates, _rates(run, shares), strict=True):
+    for group, rate in zip(run.rates, _rates(run, index, shares), strict=True):
         group["lr"] = rate
         if eight_bit.is_marked(group):
             group["lr"] = float(group["lr"])  # its kernel takes no tensor
@@ -768,50 +780,118 @@ def _move(run: TrainingRun, factor: float, still: bool = False) -> None:
         optimizer.step()
 
 
-def _rates(run: TrainingRun, shares: Mapping[Tensor, float | Tensor]) -> list[float | Tensor]:
-    """The learning rate of each group of parameters, of which a method may leave a share."""
-    found: list[float | Tensor] = [group["rate"] for group in run.rates]
+def _scheduled(run: TrainingRun, index: int) -> list[float]:
+    """The schedule's learning rate of each group of parameters in the step after `index` others."""
+    settings = run.recipe.train
+    factor = rate_factor(index, settings)
+    still = index >= moving_steps(settings.steps, settings.backbone_until)
+    rates = []
+    for group in run.rates:
+        stands = still and group["name"] == "backbone"
+        rates.append(0.0 if stands else group["peak"] * factor)
+    return rates
+
+
+def _rates(
+    run: TrainingRun, index: int, shares: Mapping[Tensor, float | Tensor]
+) -> list[float | Tensor]:
+    """What the optimizer reads: the schedule's rates, of which a method may leave a share."""
+    scheduled = _scheduled(run, index)
+    found: list[float | Tensor] = [*scheduled]
     # A method with shares has every parameter of the backbone in a group of its own.
     left = [shares.get(group["params"][0], 1.0) for group in run.rates]
-    unread = {index: share for index, share in enumerate(left) if isinstance(share, Tensor)}
+    unread = {place: share for place, share in enumerate(left) if isinstance(share, Tensor)}
     if unread:
         # One kernel for all of them.
-        rates = [run.rates[index]["rate"] for index in unread]
+        rates = [scheduled[place] for place in unread]
         scaled = torch._foreach_mul(list(unread.values()), rates)
-        for index, rate in zip(unread, scaled, strict=True):
-            found[index] = rate
-    for index, share in enumerate(left):
-        if index not in unread:
-            found[index] *= share
+        for place, rate in zip(unread, scaled, strict=True):
+            found[place] = rate
+    for place, share in enumerate(left):
+        if place not in unread:
+            found[place] *= share
     return found
 
 
 def _log(
-    run: TrainingRun, finished: int, window: Window, validate: bool, on_event: OnEvent
+    run: TrainingRun,
+    finished: int,
+    window: Window,
+    validate: bool,
+    signaled: interrupts.Deferred,
+    on_event: OnEvent,
 ) -> dict[str, float]:
     """Append one line to metrics.jsonl and return it."""
     line: dict[str, float] = {"step": finished, **window.means(run.recipe.train.batch_size)}
-    line |= {f"lr_{group['name']}": group["rate"] for group in run.rates}
+    rates = zip(run.rates, _scheduled(run, finished - 1), strict=True)
+    line |= {f"lr_{group['name']}": rate for group, rate in rates}
     recent = run.ledger.tensors(after=finished - window.steps)
     if len(recent["step"]):  # steps in which the backbone stands still have no row
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
-        settings, noise = run.recipe.train, validation_noise(run.recipe.seed)
-        batches = min(len(run.demos.validation), VALIDATION_FRAMES) / settings.batch_size
-        heard = on_event if batches * line["step_s"] > _LONG_S else ignore
-        # Of the weights that a checkpoint holds, seen as training's passes see them.
-        with run.average.in_place(), run.masters.rounded():
-            loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
-        check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
-        line["validation_loss"] = loss
-        line |= _watched(run, finished, on_event)
+        with _saved_where_left(run, finished, window):
+            line |= _validation(run, finished, line["step_s"], _hearing(run, signaled, on_event))
         _warn_of_drop(run, line, on_event)
     if run.ranks.first:
         folder.append_metrics(run.out, line)
     return line
 
 
-def _watched(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, float]:
+@contextmanager
+def _saved_where_left(run: TrainingRun, finished: int, window: Window) -> Generator[None]:
+    """Write a checkpoint where the block, a validation, fails or is left after a signal.
+
+    A run goes on from it with the same validation. Of several processes none does so: where one
+    alone fails, the others would wait for it.
+    """
+    try:
+        yield
+    except Diverged:
+        raise  # its weights are no good to go on from
+    except BaseException:
+        if not run.ranks.several:
+            _save_interrupted(run, finished, window)
+        raise
+
+
+def _hearing(run: TrainingRun, signaled: interrupts.Deferred, on_event: OnEvent) -> _Hearing:
+    """What hears of the progress of a part of a validation, by the seconds that the part takes.
+
+    It leaves once a signal has come: at an event no work is half-done. Several processes leave a
+    validation together, at its end.
+    """
+
+    def hearing(seconds: float) -> OnEvent:
+        def heard(event: Event) -> None:
+            if seconds > _LONG_S:
+                on_event(event)
+            if signaled.number is not None and not run.ranks.several:
+                signaled.leave()
+
+        return heard
+
+    return hearing
+
+
+def _validation(
+    run: TrainingRun, finished: int, step_s: float, hearing: _Hearing
+) -> dict[str, float]:
+    """The validation loss of a checkpoint written now, and what else is to be told of it.
+
+    Args:
+        step_s: how long a step takes.
+    """
+    settings, noise = run.recipe.train, validation_noise(run.recipe.seed)
+    batches = min(len(run.demos.validation), VALIDATION_FRAMES) / settings.batch_size
+    heard = hearing(batches * step_s)
+    # Of the weights that a checkpoint holds, seen as training's passes see them.
+    with run.average.in_place(), run.masters.rounded():
+        loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
+    check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
+    return {"validation_loss": loss, **_watched(run, finished, hearing)}
+
+
+def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, float]:
     """What a checkpoint written now answers, how it acts, and how far its actions are from others.
 
     It is empty where none of them is asked for.
@@ -822,13 +902,12 @@ def _watched(run: TrainingRun, finished: int, on_event: OnEvent) -> dict[str, fl
     found: dict[str, float] = {}
     with run.average.in_place(), run.masters.as_written(), _evaluating(run.policy):
         if run.questions is not None:
-            heard = on_event if run.questions.seconds > _LONG_S else ignore
+            heard = hearing(run.questions.seconds)
             found |= run.questions.figures(run.policy.backbone, run.ranks, heard)
         if run.episodes is not None:
-            heard = on_event if run.episodes.seconds > _LONG_S else ignore
-            found |= run.episodes.figures(run.ranks, heard)
+            found |= run.episodes.figures(run.ranks, hearing(run.episodes.seconds))
         if run.actions is not None:
-            heard = on_event if run.actions.seconds > _LONG_S else ignore
+            heard = hearing(run.actions.seconds)
             found |= run.actions.figures(run.policy, run.ranks, heard)
     check_finite(found, f"after step {finished}", LOWER, finished)
     return found

@@ -61,11 +61,11 @@ def test_a_refused_training_waits_for_nothing(start: Start, tmp_path: Path) -> N
 # --- signals --------------------------------------------------------------------------------------
 
 
-def signal_at(done: int, *numbers: int) -> OnEvent:
-    """A process gets these signals after that step."""
+def signal_at(done: int, *numbers: int, stage: str = "train") -> OnEvent:
+    """A process gets these signals after that step, or that part of another stage."""
 
     def on_event(event: Event) -> None:
-        if isinstance(event, Progress) and (event.stage, event.done) == ("train", done):
+        if isinstance(event, Progress) and (event.stage, event.done) == (stage, done):
             for number in numbers:
                 os.kill(os.getpid(), number)
 
@@ -108,6 +108,57 @@ def test_lines_of_metrics_are_means_over_an_interruption(
         assert checkpoint.last(out).resolve().name == f"{at:06d}"
         start("aegis", out, recipe=slow, resume=True)
         assert_same_run(out, tmp_path / "whole")
+
+
+@pytest.mark.usefixtures("ctrl_c")
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("at", [3, 6])
+def test_a_validation_is_left_at_a_signal_and_made_again_by_the_resumed_run(
+    at: int,
+    times: int,
+    start: Start,
+    recipe: Recipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After step 3, of which no checkpoint stays, and after the last one; also left twice."""
+    settings = replace(SETTINGS, validate_every=at, log_every=4, ema_decay=0.5, keep_checkpoints=1)
+    one = replace(recipe, train=settings)
+    start("aegis", tmp_path / "whole", recipe=one)
+    monkeypatch.setattr(train, "_LONG_S", 0.0)
+    validated: list[int] = []
+
+    def left(event: Event) -> None:
+        if isinstance(event, Progress) and event.stage == "validation":
+            validated.append(event.done)
+        signal_at(4, signal.SIGTERM, stage="validation")(event)
+
+    out = tmp_path / "cut"
+    for time in range(times):
+        with pytest.raises(interrupts.Stopped), interrupts.listening():
+            start("aegis", out, recipe=one, on_event=left, resume=time > 0)
+        assert checkpoint.last(out).resolve().name == f"{at:06d}"
+    assert validated == [0, 4] * times
+    start("aegis", out, recipe=one, resume=True)
+    assert_same_run(out, tmp_path / "whole")
+
+
+@pytest.mark.parametrize("at", [3, 6])
+def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
+    at: int, start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = replace(recipe, train=replace(SETTINGS, validate_every=at))
+    start("naive", tmp_path / "whole", recipe=one)
+
+    def failing(*_: Any) -> float:
+        raise RuntimeError("no simulator")
+
+    with monkeypatch.context() as patched, pytest.raises(RuntimeError, match="no simulator"):
+        patched.setattr(train, "validation_loss", failing)
+        start("naive", tmp_path / "cut", recipe=one)
+    assert checkpoint.last(tmp_path / "cut").resolve().name == f"{at:06d}"
+    start("naive", tmp_path / "cut", recipe=one, resume=True)
+    assert_same_run(tmp_path / "cut", tmp_path / "whole")
 
 
 @pytest.mark.usefixtures("ctrl_c")
