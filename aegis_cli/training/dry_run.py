@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -38,9 +38,12 @@ from aegis_cli.training import (
     train,
     validation_actions,
     validation_rollout,
+    validation_time,
     validation_vqa,
 )
 from aegis_cli.training.assemble import TrainingRun
+
+T = TypeVar("T")
 
 _MB = 1e6
 _WRITTEN = 3  # copies of a tensor while it is checked, hashed and written, as measured
@@ -74,10 +77,9 @@ class DryRunReport:
         memory_free_mb: where training would run, None if that is not known.
         step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
             gradient serves; None where memory does not suffice to take them.
-        rollout_s: of the episodes of one validation, if none ends early; None where the recipe has
-            no `rollout.while_training`, or where memory does not suffice.
-        hours: of the steps still to be taken and such episodes, without validation losses,
-            predicted actions and checkpoints.
+        validation_s: of one validation, by what takes them: its `loss`, `questions`, `episodes` if
+            none ends early, and predicted `actions`; None where memory does not suffice.
+        hours: of the steps still to be taken and the validations, without checkpoints.
         checkpoints, disk_mb: those still to be written, as many as lie there at one time;
             disk_free_mb: where they would be.
     """
@@ -103,7 +105,7 @@ class DryRunReport:
     memory_free_mb: float | None
     memory_fits: bool | None
     step_s: float | None
-    rollout_s: float | None
+    validation_s: dict[str, float] | None
     hours: float | None
     checkpoints: int
     disk_mb: float
@@ -171,10 +173,11 @@ def _planned(
     told = on_event if ranks.first else ignore
     with loading_told("dry run", told):
         training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
-    # They are not asked here: that they can be is all that a plan needs to know.
-    validation_vqa.chosen(recipe, training.policy.backbone, told)
+    training.questions = validation_vqa.chosen(recipe, training.policy.backbone, told)
     training.episodes = validation_rollout.chosen(recipe, training.policy, training.meta, ranks)
-    validation_actions.chosen(recipe, training.policy, training.demos, training.meta)
+    training.actions = validation_actions.chosen(
+        recipe, training.policy, training.demos, training.meta
+    )
     held = _held(training, there)
     tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)
@@ -221,7 +224,7 @@ def _report(
         memory_free_mb=_in_mb(free),
         memory_fits=needs.fits,
         step_s=needs.step_s,
-        rollout_s=needs.rollout_s,
+        validation_s=needs.validation_s,
         hours=_hours(recipe.train, needs, done),
         checkpoints=disk.checkpoints,
         disk_mb=disk.needed / _MB,
@@ -232,11 +235,12 @@ def _report(
 
 
 def _hours(settings: Train, needs: _Needs, done: int) -> float | None:
-    """Hours of the steps after the first `done` ones, and of the episodes between them."""
-    if needs.step_s is None:
+    """Hours of the steps after the first `done` ones, and of their validations."""
+    if needs.step_s is None or needs.validation_s is None:
         return None
+    validations = _left(settings, settings.validate_every, done)
     seconds = needs.step_s * (settings.steps - done)
-    seconds += (needs.rollout_s or 0.0) * _left(settings, settings.validate_every, done)
+    seconds += sum(needs.validation_s.values()) * validations
     return seconds / 3600
 
 
@@ -269,7 +273,7 @@ class _Needs(NamedTuple):
         together: of the processes that share a machine's memory; None where none do.
         fits: whether every process has what it needs; None where it is not known what is free.
         step_s: seconds per step; None where none was taken.
-        rollout_s: seconds of the episodes of one validation; None where none was played.
+        validation_s: seconds of one validation, by what takes them; None where none was begun.
     """
 
     parts: dict[str, int]
@@ -277,7 +281,7 @@ class _Needs(NamedTuple):
     together: int | None
     fits: bool | None
     step_s: float | None
-    rollout_s: float | None
+    validation_s: dict[str, float] | None
 
 
 def _needs(
@@ -296,13 +300,12 @@ def _needs(
     """
     device, needed = training.policy.backbone.device, sum(parts.values())
     fits = _fits(needed, free, device, ranks)
-    step_s, rollout_s, measured = None, None, None
+    step_s, validation_s, measured = None, None, None
     if fits is not False:
         # Before the steps, which move the weights; what it takes is part of the training's peak.
-        if training.episodes is not None:
-            rollout_s = _seconds(partial(_acted, training, on_event), ranks)
-        if training.episodes is None or rollout_s is not None:
-            step_s = _seconds(partial(_timed, training, on_event), ranks)
+        validation_s = _where_it_fits(partial(validation_time.measured, training, on_event), ranks)
+        if validation_s is not None:
+            step_s = _where_it_fits(partial(_timed, training, on_event), ranks)
         fits = False  # unless the steps show that it does
     if step_s is not None:
         # Steps were taken, but no checkpoint was written: its share is still the estimate's.
@@ -311,7 +314,7 @@ def _needs(
         fits = _fits(needed, free, device, ranks)
     largest = max(ranks.gathered(parts), key=lambda found: sum(found.values()))
     together = _together(needed, device, ranks)
-    return _Needs(largest, measured, together, fits, step_s, rollout_s)
+    return _Needs(largest, measured, together, fits, step_s, validation_s)
 
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
@@ -515,8 +518,8 @@ def _while_saving(training: TrainingRun) -> int:
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _seconds(found: Callable[[], float], ranks: Ranks) -> float | None:
-    """The seconds that were found; None where a GPU has no memory left for what takes them.
+def _where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
+    """What was found; None where a GPU has no memory left for what takes it.
 
     With several processes that is an error, for the others wait in the same step.
     """
@@ -526,17 +529,6 @@ def _seconds(found: Callable[[], float], ranks: Ranks) -> float | None:
         if ranks.several:
             raise
         return None
-
-
-def _acted(training: TrainingRun, on_event: OnEvent) -> float:
-    """Seconds of the episodes of one validation, if none ends early."""
-    assert training.episodes is not None
-    training.policy.eval()
-    on_event(Progress("dry run (rollout)", 0, 2, "chunks"))
-    with training.masters.as_written():
-        found = training.episodes.longest_s(training.ranks)
-    on_event(Progress("dry run (rollout)", 2, 2, "chunks"))
-    return found
 
 
 def _timed(training: TrainingRun, on_event: OnEvent) -> float:

@@ -150,7 +150,7 @@ def test_bars_show_stage_share_and_metrics():
 
 
 def test_a_warning_is_shown_whole_and_progress_goes_on():
-    warned = Warned("anchor", "the backbone is [sure] of " + "these answers " * 20)
+    warned = Warned("anchor", "the backbone is [sure] of" + " these answers" * 20)
     events = [
         (0.0, Progress("anchor", 1, 3, "questions")),
         (0.1, warned),

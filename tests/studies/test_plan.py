@@ -158,7 +158,10 @@ def test_a_training_whose_inputs_are_there_says_what_it_needs(small: Recipe, roo
         # One training takes memory that the one before it has left to the process.
         assert report.memory_measured_mb is None
         assert report.memory_needed_mb == report.memory_total_mb > 0
-        assert report.step_s is not None and report.hours == pytest.approx(report.step_s * 9 / 3600)
+        assert report.step_s is not None and report.validation_s is not None
+        validations = -(-9 // longer.train.validate_every)
+        took = report.step_s * 9 + report.validation_s["loss"] * validations
+        assert report.hours == pytest.approx(took / 3600)
     assert found.disk_mb == sum(report.disk_mb for report in told.values()) > 0
     assert found.hours == sum(report.hours or 0 for report in told.values())
 
@@ -173,8 +176,10 @@ def test_a_training_that_was_interrupted_goes_on(small: Recipe, root: Path) -> N
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(longer, root, stop)
     report = job(longer, root).trainings["naive"]
-    assert report is not None and report.step_s is not None and report.hours is not None
-    left = report.hours * 3600 / report.step_s
+    assert report is not None and report.hours is not None
+    assert report.step_s is not None and report.validation_s is not None
+    # The one validation that is left is that of the end.
+    left = (report.hours * 3600 - report.validation_s["loss"]) / report.step_s
     assert round(left) < 6
 
 

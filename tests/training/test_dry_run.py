@@ -25,6 +25,7 @@ from aegis_cli.common.events import Event, Progress
 from aegis_cli.models import backbones
 from aegis_cli.recipes.keys import LARGEST
 from aegis_cli.training import checkpoint, dry_run, train
+from aegis_cli.training.dry_run import DryRunReport
 
 ROOT = Path(__file__).parent.parent.parent
 Made, Command = Callable[[str], Path], Callable[..., Any]
@@ -167,7 +168,8 @@ def test_processes_plan_what_each_of_them_needs(
     weights = 4e-6 * alone.parameters
     for way, planned in plans.items():
         first, second = (json.loads((planned.said / f"{k}.json").read_text()) for k in (0, 1))
-        ours = ("step_s", "hours", "memory_free_mb")  # of this process's own clock, and moment
+        # Of this process's own clock, and moment.
+        ours = ("step_s", "validation_s", "hours", "memory_free_mb")
         assert [k for k in first if first[k] != second[k] and k not in ours] == []
         assert (first["processes"], first["memory_fits"]) == (2, True)
         assert first["memory_together_mb"] > first["memory_measured_mb"] > 0 < first["hours"]
@@ -235,12 +237,19 @@ def test_a_dry_run_tells_what_it_does_before_its_first_step(
     ]
 
 
-def test_hours_are_those_of_the_steps_that_are_left(
+def seconds(plan: DryRunReport, steps: int, validations: int) -> float:
+    """How long so much takes by what a plan has measured."""
+    assert plan.step_s is not None and plan.step_s > 0 and plan.validation_s is not None
+    assert plan.validation_s.keys() == {"loss"} and plan.validation_s["loss"] > 0
+    return steps * plan.step_s + validations * plan.validation_s["loss"]
+
+
+def test_hours_are_those_of_the_steps_that_are_left_and_their_validations(
     tiny_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:
-    settings, run = small(tiny_folder, steps=6), tmp_path / "run"
+    settings, run = small(tiny_folder, steps=6, validate_every=2), tmp_path / "run"
     plan = dry_run.run(settings, "naive", demos_file, None, run)
-    assert plan.step_s > 0 and plan.hours == pytest.approx(6 * plan.step_s / 3600)
+    assert plan.hours == pytest.approx(seconds(plan, 6, 3) / 3600)
 
     def stop(event: Progress) -> None:
         if event.stage == "train" and event.done == 4:
@@ -249,7 +258,7 @@ def test_hours_are_those_of_the_steps_that_are_left(
     with pytest.raises(KeyboardInterrupt):
         train.run(settings, "naive", demos_file, None, run, on_event=stop)
     later = dry_run.run(settings, "naive", demos_file, None, run, resume=True)
-    assert later.hours == pytest.approx(2 * later.step_s / 3600)
+    assert later.hours == pytest.approx(seconds(later, 2, 1) / 3600)
 
 
 @pytest.mark.parametrize(("method", "steps"), [("naive", 4), ("nullspace", 5)])
@@ -277,7 +286,7 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
     monkeypatch.setattr(dry_run, "_timed", lambda *_: 0.0)
     assert dry_run.run(settings, *given).memory_mb == timed.memory_mb
     short = dataclasses.replace(settings, train=dataclasses.replace(settings.train, steps=1))
-    assert dry_run.run(short, *given).hours == 0.0
+    assert dry_run.run(short, *given).step_s == 0.0
 
 
 def test_what_a_gpu_has_no_memory_for_is_reported_and_no_error(

@@ -1,0 +1,98 @@
+"""How long a validation takes, by its first passes, which a dry run takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from functools import partial
+
+from aegis_cli.common.events import Event, OnEvent, Progress
+from aegis_cli.common.ranks import ALONE
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import train
+from aegis_cli.training.assemble import TrainingRun
+from aegis_cli.training.validation_actions import ValidationActions
+from aegis_cli.training.validation_vqa import ValidationQuestions
+
+_STAGE = "dry run (validation)"
+
+
+class _Enough(Exception):
+    """Two parts of the work are done.
+
+    Attributes:
+        seconds: that all of it takes.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(seconds)
+        self.seconds = seconds
+
+
+def expected_s(work: Callable[[OnEvent], object]) -> float:
+    """About how many seconds some work takes, by the second part of it that it tells of.
+
+    The first one also pays for what is done once. Then the work is left, by an exception through
+    its own events.
+    """
+    told: list[tuple[int, float]] = []  # what was done at which time
+
+    def heard(event: Event) -> None:
+        if not isinstance(event, Progress) or event.done == 0:
+            return
+        told.append((event.done, time.perf_counter()))
+        if len(told) == 2:
+            (before, then), (done, now) = told
+            raise _Enough((now - then) / (done - before) * event.total)
+
+    started = time.perf_counter()
+    try:
+        work(heard)
+    except _Enough as end:
+        return end.seconds
+    return time.perf_counter() - started
+
+
+def measured(run: TrainingRun, on_event: OnEvent) -> dict[str, float]:
+    """About how many seconds the parts of one validation take, the loss and what is asked for.
+
+    Of several processes the first asks, acts and predicts, and questions are divided among all.
+    """
+    ranks, masters = run.ranks, run.masters
+    parts = {"loss": (masters.rounded, partial(_loss_s, run))}
+    # A backbone of which nothing learns is not asked again.
+    if run.questions is not None and any(p.requires_grad for p in run.policy.backbone.parameters()):
+        asking = partial(_questions_s, run.questions, run.policy.backbone)
+        parts["questions"] = masters.as_written, lambda: ranks.by_first(asking) / ranks.count
+    if run.episodes is not None:
+        parts["episodes"] = masters.as_written, partial(run.episodes.longest_s, ranks)
+    if run.actions is not None:
+        predicting = partial(_actions_s, run.actions, run.policy)
+        parts["actions"] = masters.as_written, lambda: ranks.by_first(predicting)
+    found: dict[str, float] = {}
+    run.policy.eval()
+    on_event(Progress(_STAGE, 0, len(parts), "parts"))
+    for name, (seen, measure) in parts.items():
+        with seen():
+            found[name] = measure()
+        on_event(Progress(_STAGE, len(found), len(parts), "parts"))
+    return found
+
+
+def _loss_s(run: TrainingRun) -> float:
+    given = run.policy, run.demos, run.recipe.train, train.validation_noise(run.recipe.seed)
+    return expected_s(partial(train.validation_loss, *given, run.ranks))
+
+
+def _questions_s(questions: ValidationQuestions, backbone: Backbone) -> float:
+    seconds = 0.0
+    for one in questions.asked:
+        alone = dataclasses.replace(questions, asked=(one,))
+        seconds += expected_s(partial(alone.asked_before, backbone, ALONE))
+    return seconds
+
+
+def _actions_s(actions: ValidationActions, policy: Policy) -> float:
+    return expected_s(partial(actions.figures, policy, ALONE))
