@@ -27,7 +27,8 @@ RASTER = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "JPEG2000"
 def decoded(data: bytes) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8 of an image file, upright as a viewer shows them.
 
-    What is transparent lies on white, as transformers' processors have it.
+    What is transparent lies on white, as today's processors of transformers have it; those of 5.5
+    show what colour there is below, so that the rule is ours, whichever is installed.
 
     Raises:
         ValueError: no raster image or only a part of one, too many pixels, or grey of no known

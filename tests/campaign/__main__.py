@@ -1,4 +1,4 @@
-"""The whole campaign: `python -m tests.campaign --mutations 10000 --kills 200`.
+"""The whole campaign: `python tests/campaign --mutations 10000 --kills 200`.
 
 Cases are numbered, and what became of each is a line of --state; those that are there are not tried
 again, so that a campaign goes on where it was stopped.
@@ -57,7 +57,7 @@ def main() -> int:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tests/campaign", description=__doc__)
     parser.add_argument("--mutations", type=int, default=10_000, help="damaged files to read")
     parser.add_argument("--kills", type=int, default=200, help="trainings to end by signals")
     parser.add_argument("--troubles", type=int, default=200, help="neighbours, full disks, ...")

@@ -1,4 +1,4 @@
-"""Memory over a long training: `python -m tests.campaign.growth --steps 20000`.
+"""Memory over a long training: `python tests/campaign/growth.py --steps 20000`.
 
 What may grow is the ledger: a row per step, in buffers that double.
 """
@@ -68,7 +68,7 @@ def measure(folder: Path, steps: int, points: int) -> tuple[dict[int, int], int]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.campaign.growth", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tests/campaign/growth.py", description=__doc__)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--points", type=int, default=20)
     options = parser.parse_args()

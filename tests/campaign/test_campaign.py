@@ -19,7 +19,7 @@ def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> 
     """Each is read as what it was, or refused with one clear error; what was ended goes on."""
     counts = ("--mutations", str(MUTATIONS), "--kills", str(KILLS), "--troubles", "9")
     state = tmp_path / "state.jsonl"
-    command = [sys.executable, "-m", "tests.campaign", *counts, "--state", str(state)]
+    command = [sys.executable, "tests/campaign", *counts, "--state", str(state)]
     done = subprocess.run(
         [*command, "--scratch", str(tmp_path)],
         cwd=ROOT,

@@ -10,7 +10,7 @@ from samples.command import ROOT, finding
 
 def test_memory_does_not_grow_with_the_steps() -> None:
     """The ledger of 300 steps is 60 KB; a step that kept its batch would show as 100 KB each."""
-    command = [sys.executable, "-m", "tests.campaign.growth", "--steps", "300", "--points", "3"]
+    command = [sys.executable, "tests/campaign/growth.py", "--steps", "300", "--points", "3"]
     done = subprocess.run(
         command, cwd=ROOT, env=finding(ROOT), capture_output=True, text=True, check=True
     )
