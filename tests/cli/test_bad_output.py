@@ -189,18 +189,14 @@ def interrupted(
     alone, as `kill` sends it.
     """
     said = place.parent / "stderr.txt"
-    said.touch()
-    process = processes.aegis(args, place, said)
-    assert process.pid is not None
-    try:
+    with processes.aegis(args, place, said) as process:
+        assert process.pid is not None
         while not ready(process.pid, said.read_text()):
             assert process.exitcode is None, said.read_text()
             time.sleep(0.02)
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
         process.join(timeout=300)  # only a hang takes so long
         assert process.exitcode == 128 + number
-    finally:
-        process.kill()
     ended = "interrupted" if number == signal.SIGINT else number.name
     assert "Traceback" not in said.read_text() and said.read_text().count(ended) == 1, (
         said.read_text()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing.process import BaseProcess
@@ -43,16 +44,22 @@ def alone(function: Callable[..., Found], *args: Any) -> Found:
         return process.submit(_begun, function, *args).result()
 
 
-def aegis(args: Sequence[str], cwd: Path, said: Path) -> BaseProcess:
-    """Start `aegis ARGS` in a folder, as a terminal would: in a group of its own.
+@contextlib.contextmanager
+def aegis(args: Sequence[str], cwd: Path, said: Path) -> Iterator[BaseProcess]:
+    """`aegis ARGS`, started in a folder as by a terminal, in a group of its own; it ends at last.
 
     Args:
-        said: file that its stdout and its stderr go to.
+        said: file that its stdout and its stderr go to; it is made.
     """
+    said.touch()
     given = (_command, list(args), str(cwd), str(said))
     process = _server().Process(target=_begun, args=given)  # type: ignore[attr-defined]
     process.start()
-    return process
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
 
 
 def _command(args: Sequence[str], cwd: str, said: str) -> None:
