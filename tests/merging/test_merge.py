@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import shlex
@@ -68,7 +70,7 @@ def merging(place: Place, method: str) -> tuple[object, ...]:
 
 
 def _command(*words: object) -> None:
-    with pytest.raises(SystemExit) as caught:
+    with pytest.raises(SystemExit) as caught, contextlib.redirect_stdout(io.StringIO()):
         command()([str(word) for word in words], prog_name="aegis")
     assert not caught.value.code
 
