@@ -27,6 +27,7 @@ _SELF_TEST = (
     "demos.episodes=4",
     "anchor.samples=14",
     "train.steps=2",
+    "train.chunk=20",  # with as many executed: a rollout takes few predictions
     "train.batch_size=4",
     "train.flow_samples=1",
     "train.warmup=1",
@@ -34,6 +35,7 @@ _SELF_TEST = (
     "train.checkpoint_every=2",
     "probe.questions=14",
     "rollout.episodes=1",
+    "rollout.replan=20",
 )
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from samples import processes
 from samples.command import ROOT, finding, refused
 from samples.disk import disk
 from samples.user_folder import TRAIN, leftovers, snapshot, training
@@ -187,31 +188,15 @@ def interrupted(
     As a terminal does it, the whole group gets the signal; another than Ctrl-C goes to the command
     alone, as `kill` sends it.
     """
-    # A shell's background job starts with Ctrl-C ignored, and nohup's with SIGHUP. So would all
-    # that they start.
-    heed = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "signal.signal(signal.SIGHUP, signal.SIG_DFL)"
-    )
-    command = [sys.executable, "-c", f"{heed}; from aegis_cli.cli.app import main; main()", *args]
     said = place.parent / "stderr.txt"
-    with open(said, "w", encoding="utf-8") as err:
-        process = subprocess.Popen(
-            command,
-            cwd=place,
-            env=finding(ROOT),
-            stdout=err,
-            stderr=err,
-            start_new_session=True,
-        )
-    try:
+    with processes.aegis(args, place, said) as process:
+        assert process.pid is not None
         while not ready(process.pid, said.read_text()):
-            assert process.poll() is None, said.read_text()
+            assert process.exitcode is None, said.read_text()
             time.sleep(0.02)
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
-        assert process.wait(timeout=300) == 128 + number  # only a hang takes so long
-    finally:
-        process.kill()
+        process.join(timeout=300)  # only a hang takes so long
+        assert process.exitcode == 128 + number
     ended = "interrupted" if number == signal.SIGINT else number.name
     assert "Traceback" not in said.read_text() and said.read_text().count(ended) == 1, (
         said.read_text()
@@ -343,13 +328,17 @@ def output_of(*command: str, **environment: str) -> str:
     return done.stdout.decode(environment.get("PYTHONIOENCODING", "utf-8"))
 
 
-@pytest.mark.parametrize(("encoding", "columns"), [("ascii", 60), ("latin-1", 100)])
+@pytest.mark.parametrize(
+    ("command", "says", "encoding", "columns"),
+    [("inspect RUN", "Energy", "ascii", 60), ("recipes", "quickstart", "latin-1", 100)],
+)
 def test_a_pipe_gets_the_characters_that_it_knows_in_lines_as_wide_as_columns_says(
-    trained: Path, encoding: str, columns: int
+    trained: Path, command: str, says: str, encoding: str, columns: int
 ) -> None:
     """Without blanks at the lines' ends."""
-    shown = output_of("inspect", str(trained), PYTHONIOENCODING=encoding, COLUMNS=str(columns))
-    assert "Energy" in shown and "─" not in shown
+    words = [str(trained) if word == "RUN" else word for word in command.split()]
+    shown = output_of(*words, PYTHONIOENCODING=encoding, COLUMNS=str(columns))
+    assert says in shown and "─" not in shown
     lines = shown.splitlines()
     assert max(map(len, lines)) <= columns
     assert [line for line in lines if line != line.rstrip()] == []

@@ -2,42 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from samples import processes
+from samples.workers import peaks
 
 from aegis_cli.common import memory
 
 CPU = torch.device("cpu")
-
-# A process of its own: in this one, what earlier tests left behind may be given back meanwhile.
-_PEAKS = """
-import json
-import torch
-from aegis_cli.common import memory
-
-cpu, size = torch.device("cpu"), 400_000_000
-ballast = bytearray(size)
-before = memory.peak(cpu)
-del ballast
-base = memory.restart_peak(cpu)
-ballast = bytearray(size // 2)
-print(json.dumps([size, before, base, memory.peak(cpu)]))
-"""
 
 
 @pytest.mark.skipif(
     not os.access("/proc/self/clear_refs", os.W_OK), reason="needs a peak that can begin anew"
 )
 def test_a_peak_begins_anew() -> None:
-    command = [sys.executable, "-c", _PEAKS]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True)
-    size, before, base, after = json.loads(ran.stdout)
+    # In a process of its own: in this one, what earlier tests left may be given back meanwhile.
+    size, before, base, after = processes.alone(peaks)
     assert base < before - size / 2
     assert size / 4 < after - base < size
 

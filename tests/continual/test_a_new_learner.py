@@ -29,9 +29,9 @@ def test_a_file_and_a_name_are_enough(tmp_path: Path) -> None:
     package = package_copy.copied(tmp_path)
     (package / "continual" / "learners" / "idle.py").write_text(IDLE)
     package_copy.declare(package, "LEARNERS", "idle")
-    done = package_copy.run(package, "-c", PROGRAM)
+    done = package_copy.run(package, PROGRAM)
     assert done.returncode == 0, done.stderr
-    shown = package_copy.run(package, "-m", "aegis_cli", "train", "--help")
+    shown = package_copy.run(package, "aegis_cli", "train", "--help")
     assert shown.returncode == 0 and "idle" in shown.stdout
 
 

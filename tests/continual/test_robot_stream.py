@@ -327,7 +327,7 @@ def test_each_part_learns_at_its_own_rate(
 @pytest.mark.parametrize("method", ["igsp", "sequential"])
 def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
     """In both tasks, over more steps than the stream's tests take."""
-    built = train.build(make(method, steps=24, batch_size=16), tmp_path)
+    built = train.build(make(method, steps=24, batch_size=16, checkpoint_every=24), tmp_path)
     learn(built, 2)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     for task in range(2):

@@ -189,9 +189,8 @@ def test_a_task_that_comes_again_adds_little(
     added = {}
     for reuse in (0.0, 0.5):
         options = Igsp(rank=2, reuse=reuse, check_every=5, identify=0.6)
-        report = train.run(
-            recipe("igsp", stream="twins", steps=60, igsp=options), tmp_path / f"{reuse}"
-        )
+        learned = recipe("igsp", stream="twins", steps=60, checkpoint_every=60, igsp=options)
+        report = train.run(learned, tmp_path / f"{reuse}")
         added[reuse] = report.records[1].added / report.records[0].added
     assert added[0.5] < 0.5 and added[0.5] < added[0.0]
 

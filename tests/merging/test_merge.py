@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import shlex
 import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from samples.command import refused
+from samples.command import command, refused
 from samples.merges import QUESTIONS, SAMPLES, Place, parameters
 from samples.user_folder import leftovers, snapshot
 from samples.vqa_files import write_jsonl
@@ -25,9 +28,11 @@ from aegis_cli.merging.merge import MergePoint, _weakest
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGES
+from aegis_cli.training import inputs
 
 Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stderr
-SMALL = ("--samples", SAMPLES, "--frames", 40, "--questions", QUESTIONS)
+STRENGTH = 0.5
+SMALL = ("--samples", SAMPLES, "--frames", 16, "--questions", QUESTIONS)
 
 
 @pytest.fixture
@@ -42,6 +47,34 @@ def merge(aegis: Aegis) -> Callable[..., dict[str, Any]]:
     return call
 
 
+Merged = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def merged(merge_place: Place, tmp_path_factory: pytest.TempPathFactory) -> Merged:
+    """The run, merged by a method; made once, read only."""
+
+    @cache
+    def made(method: str) -> Path:
+        before, folder = snapshot(merge_place.run), tmp_path_factory.mktemp("merged")
+        _command(*merging(merge_place, method), "--out", folder / "merged")
+        assert snapshot(merge_place.run) == before and not leftovers(folder)
+        return folder / "merged"
+
+    return made
+
+
+def merging(place: Place, method: str) -> tuple[object, ...]:
+    """The words of the command that `merged` gives."""
+    return "merge", place.run, "--method", method, "--strength", STRENGTH, *SMALL, "--json"
+
+
+def _command(*words: object) -> None:
+    with pytest.raises(SystemExit) as caught, contextlib.redirect_stdout(io.StringIO()):
+        command()([str(word) for word in words], prog_name="aegis")
+    assert not caught.value.code
+
+
 def last(run: Path) -> Path:
     return run / "checkpoints" / "last"
 
@@ -51,13 +84,9 @@ def last(run: Path) -> Path:
 
 @pytest.mark.parametrize("method", MERGES)
 def test_a_merged_run_is_a_run_for_every_command(
-    method: str, aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    method: str, aegis: Aegis, merged: Merged, merge_place: Place
 ) -> None:
-    before, out = snapshot(merge_place.run), tmp_path / "merged"
-    report = merge(merge_place.run, "--method", method, "--strength", 0.5, "--out", out)
-    assert (report["method"], report["strength"], report["points"]) == (method, 0.5, [])
-    assert 0 < report["kept"] < 1 and not leftovers(tmp_path)
-    assert snapshot(merge_place.run) == before
+    out = merged(method)
     code, shown, _ = aegis("inspect", out, "--json")
     said = json.loads(shown)
     assert code == 0 and said["kind"] == "run"
@@ -163,12 +192,20 @@ def test_the_commands_of_a_merged_runs_report_merge_it_so_again(
 
 @pytest.mark.parametrize("method", MERGES)
 def test_the_same_commands_give_the_same_bytes(
-    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    method: str, aegis: Aegis, merged: Merged, merge_place: Place, tmp_path: Path
 ) -> None:
-    for name in ("a", "b"):
-        out = tmp_path / name
-        merge(merge_place.run, "--method", method, "--strength", 1, "--out", out)
-    assert snapshot(tmp_path / "a") == snapshot(tmp_path / "b")
+    first, again = merged(method), tmp_path / "again"
+    code, shown, err = aegis(*merging(merge_place, method), "--out", again)
+    report = json.loads(shown)
+    assert code == 0, err
+    assert (report["method"], report["strength"], report["points"]) == (method, STRENGTH, [])
+    assert 0 < report["kept"] < 1
+    # Their inputs are seen from where they lie.
+    assert inputs.of(first) == inputs.of(again)
+    both = [snapshot(out) for out in (first, again)]
+    for found in both:
+        found.pop(inputs.NAME, None)
+    assert both[0] == both[1]
 
 
 def test_a_checkpoint_can_be_merged_too(
@@ -232,13 +269,12 @@ def test_a_stronger_merge_keeps_less(
 
 @pytest.mark.parametrize("method", [m for m in MERGES if m != "linear"])
 def test_an_anchor_with_the_part_is_as_good_as_measuring_it(
-    method: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
+    method: str, aegis: Aegis, merged: Merged, merge_place: Place, tmp_path: Path
 ) -> None:
     """But for the eigenvectors, which a file has in float32."""
-    words = (merge_place.run, "--method", method, "--strength", 3, "--out")
-    merge(*words, tmp_path / "measured")
-    merge(*words, tmp_path / "given", "--anchor", merge_place.anchor)
-    measured, given = parameters(tmp_path / "measured"), parameters(tmp_path / "given")
+    words = (*merging(merge_place, method), "--anchor", merge_place.anchor)
+    assert aegis(*words, "--out", tmp_path / "given")[0] == 0
+    measured, given = parameters(merged(method)), parameters(tmp_path / "given")
     for name, found in given.items():
         torch.testing.assert_close(found, measured[name], rtol=1e-3, atol=1e-4, msg=name)
 

@@ -72,8 +72,7 @@ def trained(package: Path, method: str, backbone: Path, demos: Path, more: str =
     """The run of a copy of the package that knows the method."""
     recipe, run = package.parent / "recipe.yaml", package.parent / "run"
     recipe.write_text(RECIPE.format(method=method, backbone=backbone) + more)
-    command = ["-m", "aegis_cli", "train", recipe, "--demos", demos, "--out", run]
-    done = package_copy.run(package, *command)
+    done = package_copy.run(package, "aegis_cli", "train", recipe, "--demos", demos, "--out", run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert method in done.stdout
     return run

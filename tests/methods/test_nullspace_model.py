@@ -30,7 +30,7 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import step
 
-STEPS = 30
+STEPS = 16
 KINDS = ("maps", "norms", "embeddings", "stem")
 PIXELS = 16  # four image tokens, so that two questions do not span what the maps can read
 ASKED = (

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +22,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress, ignore
 from aegis_cli.common.files import canonical
 from aegis_cli.data.vqa import sets
-from aegis_cli.data.vqa.dataset import load_scenes
+from aegis_cli.data.vqa.dataset import Rendered, load_scenes
 from aegis_cli.data.vqa.metrics import by_family, grade, score
 from aegis_cli.data.vqa.questions import FAMILIES
 from aegis_cli.data.vqa.words import wide_vocabulary
@@ -43,9 +45,23 @@ RECIPE = PretrainRecipe(
 )
 
 
-@pytest.fixture(autouse=True)
-def few_validation_questions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+whole_easy_training = cache(vlm.easy_training)  # thousands of pictures are decoded
+
+
+@cache
+def few_easy_pictures() -> Rendered:
+    """More pictures of easy-VQA than the steps of a run here show."""
+    whole, few = whole_easy_training(), slice(60)
+    return Rendered(whole.images[few], whole.cells[few], whole.questions[few])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def little_to_read() -> Iterator[None]:
+    """A run asks few questions while it trains, and does not read all of easy-VQA anew."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
+        patch.setattr(vlm, "easy_training", few_easy_pictures)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +69,7 @@ def finished(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[vlm.PretrainReport, list[Progress], Path]:
     out, events = tmp_path_factory.mktemp("pretrain") / "vlm", []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
-        return vlm.run(RECIPE, out, on_event=events.append), events, out
+    return vlm.run(RECIPE, out, on_event=events.append), events, out
 
 
 class Stop(Exception):
@@ -122,7 +136,8 @@ def test_the_checkpoint_is_a_backbone_in_bfloat16(finished) -> None:
 def test_training_moves_the_loss(tmp_path: Path) -> None:
     """Forty steps on the same few scenes: the answers' loss falls by a lot, not by chance."""
     events: list[Progress] = []
-    vlm.run(replace(RECIPE, scenes=4, steps=40, lr=1e-2), tmp_path, on_event=events.append)
+    recipe = replace(RECIPE, scenes=4, steps=40, lr=1e-2, checkpoint_every=40)
+    vlm.run(recipe, tmp_path, on_event=events.append)
     losses = [e.metrics["loss"] for e in events if e.stage == "pretrain" and e.done]
     assert len(losses) == 40
     assert sum(losses[-4:]) < 0.75 * sum(losses[:4])
@@ -207,9 +222,7 @@ def finished_easy(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[vlm.PretrainReport, list[Progress], Path]:
     out, events = tmp_path_factory.mktemp("pretrain") / "easy", []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
-        return vlm.run(EASY, out, on_event=events.append), events, out
+    return vlm.run(EASY, out, on_event=events.append), events, out
 
 
 def test_easy_vqa_adds_its_words_its_figures_and_nothing_else(finished, finished_easy) -> None:
@@ -239,7 +252,7 @@ def test_a_resumed_run_with_easy_vqa_ends_with_the_same_bytes(
 
 def test_every_training_question_of_easy_vqa_is_in_one_row_with_its_picture() -> None:
     asked = sets.read("easy-vqa").choose("train", 10**6, 0).sized(64)
-    rows = vlm.easy_training()
+    rows = whole_easy_training()
     assert max(map(len, rows.questions)) <= vlm.BLOCKS and min(map(len, rows.questions)) >= 1
     assert (rows.cells == vlm.UNKNOWN_CELL).all() and rows.cells.shape == (len(rows.images), 64)
     assert sorted(q.id for own in rows.questions for q in own) == sorted(

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
+import tempfile
+from functools import partial
 from pathlib import Path
 
 import aegis_cli
-from samples.command import finding
+from samples import processes
 
 _SOURCE = Path(aegis_cli.__file__).parent
 
@@ -45,13 +50,29 @@ def declare_options(package: Path, source: str, kind: str, name: str) -> None:
     path.write_text(text.replace(last, f"\n    {name}: {kind} = {kind}(){last}"), encoding="utf-8")
 
 
-def run(package: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Python with these arguments, where `aegis_cli` is the copy."""
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)],
-        cwd=package.parent,
-        env=finding(package.parent),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def run(package: Path, program: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """What a program, given as Python or as a module's name, does where `aegis_cli` is the copy."""
+    given = (str(package.parent), program, list(map(str, arguments)))
+    return processes.alone(_ran, *given)
+
+
+def _ran(folder: str, program: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    for name in [name for name in sys.modules if name.partition(".")[0] == _SOURCE.name]:
+        del sys.modules[name]
+    sys.path.insert(0, folder)
+    os.chdir(folder)
+    sys.argv = [program, *arguments]
+    code = 0
+    # The command asks for the descriptors of its streams.
+    stream = partial(tempfile.TemporaryFile, "w+", encoding="utf-8")
+    with stream() as out, stream() as err:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                if program.isidentifier():
+                    runpy.run_module(program, run_name="__main__", alter_sys=True)
+                else:
+                    exec(program, {})
+            except SystemExit as end:
+                code = end.code if isinstance(end.code, int) else 1
+        said = [each.read() for each in (out, err) if not each.seek(0)]
+    return subprocess.CompletedProcess(arguments, code, *said)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import multiprocessing
-from collections.abc import Callable
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
@@ -34,10 +40,47 @@ def alone(function: Callable[..., Found], *args: Any) -> Found:
     Raises:
         Exception: what the function raises.
     """
-    multiprocessing.set_forkserver_preload(list(IMPORTED))
-    context = multiprocessing.get_context("forkserver")
-    with ProcessPoolExecutor(1, context) as process:
+    with ProcessPoolExecutor(1, _server()) as process:
         return process.submit(_begun, function, *args).result()
+
+
+@contextlib.contextmanager
+def aegis(args: Sequence[str], cwd: Path, said: Path) -> Iterator[BaseProcess]:
+    """`aegis ARGS`, started in a folder as by a terminal, in a group of its own; it ends at last.
+
+    Args:
+        said: file that its stdout and its stderr go to; it is made.
+    """
+    said.touch()
+    given = (_command, list(args), str(cwd), str(said))
+    process = _server().Process(target=_begun, args=given)  # type: ignore[attr-defined]
+    process.start()
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
+
+
+def _command(args: Sequence[str], cwd: str, said: str) -> None:
+    from aegis_cli.cli.app import main
+
+    os.setsid()
+    # What a shell's background job or nohup ignores would be ignored here, too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    written = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(written, sys.stdout.fileno())
+    os.dup2(written, sys.stderr.fileno())
+    os.chdir(cwd)
+    sys.argv = ["aegis", *args]
+    main()
+
+
+def _server() -> multiprocessing.context.BaseContext:
+    """What forks processes of the one that has everything imported."""
+    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    return multiprocessing.get_context("forkserver")
 
 
 def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
@@ -47,7 +90,7 @@ def start(function: Callable[..., object], args: tuple[Any, ...], count: int) ->
         ProcessExitedException, ProcessRaisedException: one of them has failed; the others are
             ended.
     """
-    multiprocessing.set_forkserver_preload(list(IMPORTED))
+    _server()
     start_processes(partial(_begun, function), args, nprocs=count, start_method="forkserver")
 
 
@@ -62,6 +105,5 @@ def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worker processes that start at once, where a test looks at what they find alone."""
     from aegis_cli.studies import cells  # which the fast tests have no need of
 
-    multiprocessing.set_forkserver_preload(list(IMPORTED))
     for module in (processes, cells):
-        monkeypatch.setattr(module, "SPAWN", multiprocessing.get_context("forkserver"))
+        monkeypatch.setattr(module, "SPAWN", _server())

@@ -144,9 +144,14 @@ def edition(name: str) -> list[str]:
 @pytest.fixture
 def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let stages find the encoder `tiny` and the streams above by name."""
-    monkeypatch.setattr(images.backbones, "load_dual", load, raising=False)
-    monkeypatch.setattr(images.streams, "load", load_stream, raising=False)
-    monkeypatch.setattr(images.streams, "edition", edition)
+    offer(monkeypatch)
+
+
+def offer(patch: pytest.MonkeyPatch) -> None:
+    """What `tiny_streams` does, as long as the patches last."""
+    patch.setattr(images.backbones, "load_dual", load, raising=False)
+    patch.setattr(images.streams, "load", load_stream, raising=False)
+    patch.setattr(images.streams, "edition", edition)
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:

@@ -33,5 +33,25 @@ def employ(path: Path) -> None:
         pool.submit(keep_while_at_work, path).result()
 
 
+def peaks() -> tuple[int, int, int, int]:
+    """A size in bytes, and what the process has had at most.
+
+    With so much more, from when that was given back, and with half of it once more.
+    """
+    import torch  # which the other processes have no need of
+
+    from aegis_cli.common import memory
+
+    cpu, size = torch.device("cpu"), 400_000_000
+    ballast = bytearray(size)
+    before = memory.peak(cpu)
+    del ballast
+    base = memory.restart_peak(cpu)
+    ballast = bytearray(size // 2)
+    after = memory.peak(cpu)
+    assert ballast
+    return size, before, base, after
+
+
 if __name__ == "__main__":
     {"hold": hold, "employ": employ}[sys.argv[1]](Path(sys.argv[2]))

@@ -7,9 +7,8 @@ import json
 import re
 import signal
 import socket
-import subprocess
-import sys
 import threading
+import time
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from samples.command import ROOT, refused
+from samples import processes
+from samples.command import refused
 from samples.serving import TEXT, Client, deployed, observation, served
 from samples.training import make_policy
 from websockets.exceptions import ConnectionClosed
@@ -332,27 +332,27 @@ def test_the_decay_that_was_asked_for_is_the_policys(
         assert f"with {told}" in refused(aegis("serve", "run", *words))
 
 
-def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path) -> None:
-    command = [sys.executable, "-m", "aegis_cli", "serve", naive_run, "--port", "0", "--json"]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True) as process:
-        lines = []
-        while not lines or lines[-1] != "}\n":
-            lines.append(process.stdout.readline())
-            assert lines[-1], process.stderr.read()
-        said = json.loads("".join(lines))
+def test_it_listens_at_loopback_and_ends_at_a_signal(naive_run: Path, tmp_path: Path) -> None:
+    told = tmp_path / "told.txt"
+    command = ["serve", str(naive_run), "--port", "0", "--json"]
+    with processes.aegis(command, tmp_path, told) as process:
+        while "\n}\n" not in told.read_text():
+            assert process.exitcode is None, told.read_text()
+            time.sleep(0.02)
+        loading, _, report = told.read_text().partition("\n")
+        said = json.loads(report)
+        assert loading == f"loading '{naive_run}'"
         assert said["url"].startswith("ws://127.0.0.1:") and asked(said["health"]) == "OK\n"
         with Client(said["url"]) as client:
             assert client.metadata == said["metadata"]
-            process.send_signal(signal.SIGTERM)
+            process.terminate()
             with pytest.raises(ConnectionClosed):
                 client.socket.recv()
-        assert process.wait(20) == 128 + signal.SIGTERM
-        assert process.stdout.read() == ""
-        loading, *visit, said = process.stderr.read().splitlines()
-        assert loading == f"loading '{naive_run}'"
-        assert said == "ended by SIGTERM; the server is closed"
-        assert [line.split(" ", 1)[1] for line in visit] == [
-            "has connected",
-            "has gone after 0 chunks",
-        ]
+        process.join(20)
+        assert process.exitcode == 128 + signal.SIGTERM
+    *visit, ended = told.read_text().partition("\n}\n")[2].splitlines()
+    assert ended == "ended by SIGTERM; the server is closed"
+    assert [line.split(" ", 1)[1] for line in visit] == [
+        "has connected",
+        "has gone after 0 chunks",
+    ]

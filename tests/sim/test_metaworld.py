@@ -37,10 +37,10 @@ def start(name: str, i: int = 0) -> TaskEnv:
 
 
 def finish(env: TaskEnv) -> tuple[Step, int]:
-    """The expert's last step, and how many it took."""
+    """The expert's last step, and how many it took; nobody looks."""
     count = 0
     while True:
-        step = env.step(env.expert_action())
+        step = env.step(env.expert_action(), look=False)
         count += 1
         if step.done:
             return step, count
@@ -110,7 +110,7 @@ def test_an_episode_ends_at_the_limit() -> None:
     env = start("metaworld/door-open")
     count, step = 0, None
     while step is None or not step.done:
-        step = env.step(np.zeros(4))
+        step = env.step(np.zeros(4), look=False)
         count += 1
     assert count == env.spec.max_steps <= 500 and not step.success
 
@@ -141,18 +141,27 @@ def test_random_actions_do_not_succeed() -> None:
     rng = np.random.default_rng(0)
     for turn in range(4):
         env = start(SET, turn)
-        assert not any(env.step(rng.uniform(-1, 1, 4)).success for _ in range(60))
+        steps = (env.step(rng.uniform(-1, 1, 4), look=False) for _ in range(60))
+        assert not any(step.success for step in steps)
 
 
 # --- demonstrations -------------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, record.DemosReport]:
+    """Demonstrations of the set, by one process; read only."""
+    path = tmp_path_factory.mktemp("set") / "demos.safetensors"
+    return path, record.run(SET, 5, 0, path, workers=1)
+
+
 @pytest.mark.usefixtures("quick_workers")
-def test_demonstrations_of_a_set_are_the_same_by_any_number_of_processes(tmp_path: Path) -> None:
-    paths = [tmp_path / f"{workers}.safetensors" for workers in (1, 2)]
-    reports = [record.run(SET, 5, 0, path, workers=i + 1) for i, path in enumerate(paths)]
-    assert reports[0].sha256 == reports[1].sha256
-    artifact = artifacts.load(paths[0], "demos")
+def test_demonstrations_of_a_set_are_the_same_by_any_number_of_processes(
+    recorded: tuple[Path, record.DemosReport], tmp_path: Path
+) -> None:
+    path, report = recorded
+    assert record.run(SET, 5, 0, tmp_path / "two", workers=2).sha256 == report.sha256
+    artifact = artifacts.load(path, "demos")
     tensors, meta = artifact.tensors, artifact.header.meta
     assert meta["task"] == SET and meta["tasks"] == list(sim.members(SET))
     assert sorted(tensors["task"].tolist()) == [0, 0, 1, 2, 3]
@@ -160,7 +169,7 @@ def test_demonstrations_of_a_set_are_the_same_by_any_number_of_processes(tmp_pat
     for task, instruction in zip(tensors["task"], tensors["instruction"], strict=True):
         said = table.sentences(meta["tasks"][task])
         assert meta["instructions"][instruction] in said
-    assert [count.episodes for count in reports[0].tasks.values()] == [2, 1, 1, 1]
+    assert [count.episodes for count in report.tasks.values()] == [2, 1, 1, 1]
     assert tensors["proprio"].shape[1] == 4 and tensors["actions"].abs().max() <= 1
 
 
@@ -196,7 +205,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_from_demonstrations_to_a_rollout_by_task(aegis, place: Path, request) -> None:
-    code, out, _ = aegis("demos", SET, "--episodes", 6, "--out", "d.safetensors")
+    code, out, _ = aegis("demos", SET, "--episodes", 4, "--out", "d.safetensors")
     assert code == 0 and "metaworld/button-press" in out and "Failed" in out
     command = ("train", "small.yaml", "--demos", "d.safetensors", "--out", "run")
     assert aegis(*command)[0] == 0
@@ -215,13 +224,10 @@ def test_from_demonstrations_to_a_rollout_by_task(aegis, place: Path, request) -
     assert code == 0 and "metaworld/button-press" in out and "Success %" in out
 
 
-def test_a_recipe_from_demonstrations_to_its_table(aegis, place: Path, short: None) -> None:
-    recording._env.cache_clear()
-    path = place / "d.safetensors"
-    table_spec = dataclasses.replace(table._TASK, max_steps=500)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(table, "_TASK", table_spec)
-        record.run(SET, 4, 0, path, workers=1)
+def test_a_recipe_from_demonstrations_to_its_table(
+    aegis, recorded: tuple[Path, record.DemosReport], place: Path, short: None
+) -> None:
+    path, _ = recorded
     code, out, _ = aegis("run", "small.yaml", "--set", f"demos.path={path}", "--out", "runs")
     assert code == 0 and "Success seen %" in out
     row = json.loads((place / "runs/small/table.json").read_text())["rows"][0]

@@ -203,7 +203,7 @@ def test_threads_do_not_change_the_expert() -> None:
         env.reset(episode_rng(0, EVALUATION, 0), ())
         for _ in range(7):
             actions.append(env.expert_action())
-            env.step(actions[-1])
+            env.step(actions[-1], look=False)
         acted.append(np.stack(actions))
     np.testing.assert_array_equal(*acted)
     assert acted[0].std() > 0
@@ -229,7 +229,7 @@ def test_returns_hold_no_guide(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     env = start(NAME)
     env.physics.data.qpos[:], env.physics.data.qvel[:] = np.pi, 0
-    assert [env.step(np.zeros(1)).reward for _ in range(5)] == [0.0] * 5
+    assert [env.step(np.zeros(1), look=False).reward for _ in range(5)] == [0.0] * 5
 
 
 def test_the_planner_does_better_than_chance(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,7 +243,7 @@ def test_the_planner_does_better_than_chance(monkeypatch: pytest.MonkeyPatch) ->
         total = 0.0
         for i in range(4):
             env.reset(episode_rng(0, EVALUATION, i), ())
-            total += sum(env.step(act()).reward for _ in range(75))
+            total += sum(env.step(act(), look=False).reward for _ in range(75))
         return total
 
     assert played(env.expert_action) > 3 * played(lambda: rng.uniform(-1, 1, 2)) + 50
@@ -517,7 +517,7 @@ def test_a_rollout_sums_what_the_environment_gives(
     sums = []
     for i in range(5):
         env = start(name, i)
-        sums.append(sum(env.step(np.full(1, 0.25)).reward for _ in range(20)))
+        sums.append(sum(env.step(np.full(1, 0.25), look=False).reward for _ in range(20)))
     assert (
         min(sums) > 10
         and report.mean_return == pytest.approx(np.mean(sums))

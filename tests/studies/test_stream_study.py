@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from samples import stream_studies as samples
 from samples.stream_studies import PAIRS, SHARED, VARIANTS, raw, study, write
-from samples.streams import STREAMS, recipe
+from samples.streams import STREAMS, offer, recipe
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -35,6 +35,7 @@ pytestmark = pytest.mark.usefixtures("tiny_streams")
 
 Aegis = Callable[..., tuple[int, str, str]]
 TUNED = ["tuning/igsp/0.1", "tuning/igsp/10"]
+TUNED_ALONE: dict[str, Any] = {"pairs": None, "seeds": [0], "variants": {"igsp": VARIANTS["igsp"]}}
 PLACES = ("small", "pair", "contrary")
 COMPARED = [
     f"{place}/{name}/{seed}"
@@ -237,11 +238,19 @@ def test_a_study_through_the_command_line_interrupted_and_not(
     assert max(map(len, out.splitlines())) <= 160
 
 
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What a study of `TUNED_ALONE` that was never interrupted says."""
+    folder = tmp_path_factory.mktemp("tuned")
+    with pytest.MonkeyPatch.context() as patch:
+        offer(patch)
+        return timeless(stage.run(study(folder, **TUNED_ALONE), folder).to_json())
+
+
 def test_a_tuning_run_finished_as_inspect_advises_is_of_validation_parts(
-    aegis: Aegis, tmp_path: Path
+    aegis: Aegis, tuned: Any, tmp_path: Path
 ) -> None:
-    asked = study(tmp_path, seeds=[0], pairs=None)
-    wanted = stage.run(asked, tmp_path / "whole")
+    asked = study(tmp_path, **TUNED_ALONE)
 
     def stop(event: Progress) -> None:
         if event.stage == "tuning/igsp/10/task 3 three":
@@ -258,7 +267,7 @@ def test_a_tuning_run_finished_as_inspect_advises_is_of_validation_parts(
     code, out, err = aegis(*advised.split())
     assert code == 0 and "On validation parts" in out, err
     assert aegis("probe", run)[0] == 0
-    assert timeless(stage.run(asked, tmp_path / "cut").to_json()) == timeless(wanted.to_json())
+    assert timeless(stage.run(asked, tmp_path / "cut").to_json()) == tuned
 
 
 def _on_validation(points: list[dict[str, Any]], folder: Path) -> None:
@@ -382,7 +391,7 @@ def test_a_run_that_was_begun_with_other_settings_is_begun_anew(tmp_path: Path) 
 
 @pytest.mark.parametrize("changed", ["encoder", "split"])
 def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(
-    changed: str, tmp_path: Path
+    changed: str, tuned: Any, tmp_path: Path
 ) -> None:
     """The cell has the same key, and its recipe another name.
 
@@ -393,8 +402,7 @@ def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(
         if event.stage == "tuning/igsp/10/task 2 two":
             raise Stop
 
-    asked: dict[str, Any] = {"pairs": None, "seeds": [0]}
-    wanted = timeless(stage.run(study(tmp_path, **asked), tmp_path / "whole").to_json())
+    asked = dict(TUNED_ALONE)
     with pytest.raises(Stop):
         stage.run(study(tmp_path, **asked), tmp_path / "cut", stop)
     begun = tmp_path / "cut" / "small" / "tuning" / "igsp" / "10" / "recipe.yaml"
@@ -403,7 +411,7 @@ def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(
         asked["shared"] = {**SHARED, "encoder": str(tmp_path / "moved")}
     else:
         begun.write_text(begun.read_text().replace("split: validation\n", ""))
-    assert timeless(stage.run(study(tmp_path, **asked), tmp_path / "cut").to_json()) == wanted
+    assert timeless(stage.run(study(tmp_path, **asked), tmp_path / "cut").to_json()) == tuned
 
 
 def test_a_run_that_no_study_began_is_left_alone(tmp_path: Path) -> None:
