@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Generator
 
 import torch
@@ -63,7 +64,9 @@ def pick() -> torch.device:
     Raises:
         AegisError: one was chosen that is not there.
     """
-    torch.backends.cudnn.allow_tf32 = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PyTorch 2.9 calls the setting an old one, 2.13 does not
+        torch.backends.cudnn.allow_tf32 = False
     name = os.environ.get(VARIABLE) or AUTO
     if name == AUTO:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

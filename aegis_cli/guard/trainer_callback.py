@@ -28,13 +28,15 @@ def trainer_callback(
         image: as for `Guard.automatic`.
 
     Raises:
-        AegisError: transformers is not installed.
+        AegisError: transformers is not installed, or not beside a peft that it works with.
     """
     try:
         from transformers import TrainerCallback
     except ImportError as error:
         raise AegisError(
-            "guard.callback without transformers", "the extra 'hf'", "pip install 'aegis-vla[hf]'"
+            f"guard.callback without transformers ({error})",
+            "the extras 'hf' and 'loops'",
+            "pip install 'aegis-vla[hf,loops]'",
         ) from error
 
     class GuardCallback(TrainerCallback):

@@ -39,6 +39,15 @@ def test_a_gpu_is_taken_if_there_is_one_and_none_was_chosen(two_gpus: list[int])
         assert devices.pick() == torch.device("cuda") and devices.on_gpu()
 
 
+def test_choosing_one_warns_of_nothing() -> None:
+    torch.set_warn_always(True)  # else PyTorch warns once in a process
+    try:
+        devices.pick()
+    finally:
+        torch.set_warn_always(False)
+    assert not torch.backends.cudnn.allow_tf32
+
+
 @pytest.mark.parametrize("multiplies", [True, False])
 def test_auto_is_bf16_where_a_gpu_multiplies_in_it_and_does_not_emulate_it(
     multiplies: bool, monkeypatch: pytest.MonkeyPatch
@@ -98,9 +107,9 @@ def test_bf16_is_warned_of_where_a_processor_is_known_to_have_nothing_for_it(
     listed: dict[str, bool] | None, slow: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if listed is None:  # an older torch
-        monkeypatch.delattr(torch.cpu, "get_capabilities")
+        monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
     else:
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed)
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed, raising=False)
     said: list[Event] = []
     for device, precision in (("cpu", "float32"), ("cpu", "auto"), ("cuda", "bf16")):
         devices.warn_of_slow_bf16(torch.device(device), precision, said.append)

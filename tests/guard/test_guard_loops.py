@@ -5,6 +5,8 @@ Hugging Face's Trainer, accelerate and Lightning, each skipped where it is not i
 
 from __future__ import annotations
 
+import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -186,6 +188,18 @@ def test_a_trainer_of_another_model(guarded: Guarded, tmp_path: Path) -> None:
     _, guard = guarded("aegis")
     with pytest.raises(AegisError, match="a Trainer of a Robot that the guard does not know"):
         trainer(make(), tmp_path, [guard.callback(mask="mask")]).train()
+
+
+def test_a_callback_says_why_transformers_cannot_be_imported(
+    guarded: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As beside a peft that asks it for names of an older one."""
+    _, guard = guarded("aegis")
+    monkeypatch.setitem(sys.modules, "transformers", types.ModuleType("transformers"))
+    with pytest.raises(AegisError) as caught:
+        guard.callback()
+    said = str(caught.value)
+    assert "cannot import name 'TrainerCallback'" in said and "aegis-vla[hf,loops]" in said
 
 
 # --- accelerate -----------------------------------------------------------------------------------

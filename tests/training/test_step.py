@@ -251,9 +251,9 @@ def test_auto_is_bf16_where_a_processor_lists_amx(
 ) -> None:
     """ARM's list nothing of the kind, and an older torch has no list at all: float32."""
     if listed is None:
-        monkeypatch.delattr(torch.cpu, "get_capabilities")
+        monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
     else:
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed)
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: listed, raising=False)
     with devices.autocast(torch.device("cpu"), "auto"):
         product = torch.ones(2, 2) @ torch.ones(2, 2)
     assert product.dtype == (torch.bfloat16 if listed and listed["amx_bf16"] else torch.float32)

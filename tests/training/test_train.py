@@ -88,7 +88,8 @@ def test_a_training_and_its_dry_run_warn_of_bf16_that_the_processor_has_nothing_
     wanted = replace(recipe, train=replace(recipe.train, precision="bf16", steps=1))
     for has in (True, False):
         listed = {"amx_bf16": False, "avx512_bf16": has}
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda found=listed: found)
+        found = partial(dict, listed)
+        monkeypatch.setattr(torch.cpu, "get_capabilities", found, raising=False)
         for stage in (dry_run, train):
             said: list[Event] = []
             given = (wanted, "naive", demos_file, None, tmp_path / f"{stage.__name__} {has}")
