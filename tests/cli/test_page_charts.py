@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import pytest
 import torch
 
-from aegis_cli.cli.page import charts
+from aegis_cli.cli.page import charts, runs
 from aegis_cli.cli.page.charts import Series, Spot
+from aegis_cli.cli.page.cursor import At
 
 CASES = range(20)
 DIGIT = 6.7  # the width of a digit of 12 px, in the units of a drawing
@@ -115,3 +116,34 @@ def test_drawings_have_no_colours_of_their_own() -> None:
     """The style sheet has them, for light and dark."""
     chart = charts.frontier(spots(0), [], "success", "lost", "frontier")
     assert not re.search(r"#[0-9a-f]{3}|rgb|fill=|stroke=", str(chart))
+
+
+def watched(sets: str | list[str]) -> At:
+    """A run that was asked questions of these sets while it trained."""
+    names = [sets] if isinstance(sets, str) else sets
+    fields = ["vqa_drop_points", *(f"vqa_drop_points_{k}" for k in range(2, len(names) + 1))]
+    line = {"step": 3, "loss": 1.0} | dict.fromkeys(fields, 0.5)
+    return At({"label": "x", "metrics": [line], "recipe": {"probe": {"vqa": sets}}})
+
+
+@pytest.mark.parametrize(
+    ("sets", "titles"),
+    [
+        ("scenes", ["VQA drop, validation (points)"]),
+        (["scenes"], ["VQA drop, validation (points)"]),
+        (
+            ["scenes", "data/own.jsonl"],
+            [
+                "VQA drop on scenes, validation (points)",
+                "VQA drop on own.jsonl, validation (points)",
+            ],
+        ),
+    ],
+)
+def test_what_is_lost_of_each_question_set_is_drawn(
+    sets: str | list[str], titles: list[str]
+) -> None:
+    for others in ([], [watched("scenes")]):
+        page = runs.curves([*others, watched(sets)])
+        found = re.findall(r'aria-label="(VQA [^"]*)"', str(page))
+        assert found == titles, page

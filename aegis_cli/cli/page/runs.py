@@ -296,11 +296,12 @@ def _wrong(example: At) -> Markup:
 
 # --- learning -------------------------------------------------------------------------------------
 
+_VQA_DROP = "vqa_drop_points"  # of the first question set; the number of another one follows
 # A field of metrics.jsonl, its title, whether its axis is logarithmic, and a factor.
 _CURVES = (
     ("loss", "Training loss", True, 1.0),
     ("validation_loss", "Validation loss", False, 1.0),
-    ("vqa_drop_points", "VQA drop, validation (points)", False, 1.0),
+    (_VQA_DROP, "VQA drop, validation (points)", False, 1.0),
     ("rollout_success", "Success, validation (%)", False, 100.0),
     ("rollout_mean_return", "Mean return, validation", False, 1.0),
     ("action_error", "Error of held-out actions (1: of their mean)", False, 1.0),
@@ -313,7 +314,7 @@ _CURVES = (
 def curves(runs: Sequence[At]) -> Markup | None:
     """What metrics.jsonl logged, a chart for each figure that some run has."""
     drawn = []
-    for name, title, log, scale in _CURVES:
+    for name, title, log, scale in _curves_of(runs):
         series = []
         for number, run in enumerate(runs):
             points = _points(run["metrics"].value, name, scale)
@@ -326,6 +327,20 @@ def curves(runs: Sequence[At]) -> Markup | None:
     names = [(str(run["label"]), number) for number, run in enumerate(runs)]
     legend = charts.legend(names) if len(runs) > 1 else None
     return section("Learning", legend, element("div", *drawn, class_="charts"))
+
+
+def _curves_of(runs: Sequence[At]) -> Iterator[tuple[str, str, bool, float]]:
+    """`_CURVES`, with one of the VQA drop for each set of questions that a run is asked."""
+    given = [run["recipe"]["probe"]["vqa"].value for run in runs]
+    sets = max((names for names in given if isinstance(names, list)), key=len, default=[])
+    for curve in _CURVES:
+        if curve[0] != _VQA_DROP or len(sets) < 2:
+            yield curve
+            continue
+        for number, name in enumerate(sets, start=1):
+            field = _VQA_DROP if number == 1 else f"{_VQA_DROP}_{number}"
+            short = name.rpartition("/")[2]  # of a path
+            yield field, f"VQA drop on {short}, validation (points)", False, 1.0
 
 
 def _points(lines: Sequence[dict[str, Any]], name: str, scale: float) -> list[tuple[float, float]]:
