@@ -84,9 +84,9 @@ def last(run: Path) -> Path:
 
 @pytest.mark.parametrize("method", MERGES)
 def test_a_merged_run_is_a_run_for_every_command(
-    method: str, aegis: Aegis, merged: Merged, merge_place: Place
+    method: str, aegis: Aegis, merged: Merged, merge_place: Place, tmp_path: Path
 ) -> None:
-    out = merged(method)
+    out = shutil.copytree(merged(method), tmp_path / "merged", symlinks=True)
     code, shown, _ = aegis("inspect", out, "--json")
     said = json.loads(shown)
     assert code == 0 and said["kind"] == "run"
