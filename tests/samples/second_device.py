@@ -210,8 +210,9 @@ def _reads(func: Any, args: Any, kwargs: Any) -> bool:
 
 def note_wait() -> None:
     """Count a wait within a step, by the place in Aegis, unless a model's own code waits."""
-    # The frames alone, from the innermost on: `extract_stack` would read their lines, too.
-    callers = [frame.f_code for frame, _ in traceback.walk_stack(None)]
+    # The frames alone, from the innermost on: `extract_stack` would read their lines, too. Where
+    # to begin is told, since how many frames `walk_stack(None)` skips depends on Python's version.
+    callers = [frame.f_code for frame, _ in traceback.walk_stack(sys._getframe())]
     if not any(code.co_filename.endswith("training/step.py") for code in callers):
         return
     of_interest = ("/aegis_cli/", "/transformers/")
