@@ -114,28 +114,38 @@ def test_the_figures_are_those_of_the_streams_alone(
     report, folder, _ = finished
     assert report.finished == report.cells == 4 and report.tasks == list(TASKS)
     cells = files.load_json(folder / "cells.json")
+    runner = RobotStreamRunner(tmp_path / "keys", ignore)
+    for result in report.results:
+        alone = []
+        for seed in (3, 4):
+            recipe = load_training(folder / "stream" / result.variant / str(seed) / "recipe.yaml")
+            assert isinstance(recipe, RobotStreamRecipe) and recipe.seed == seed
+            one = train.run(recipe, tmp_path / result.variant / str(seed))
+            recorded = dataclasses.replace(
+                recipe, demos=dataclasses.replace(recipe.demos, paths=None)
+            )
+            cell = cells[runner.key(Cell("any", recorded))]
+            assert cell["success"] == [list(row) for row in one.success]
+            assert cell["vqa"] == [each.accuracy for each in one.vqa]
+            assert cell["cross_entropy"] == [each.cross_entropy for each in one.vqa]
+            alone.append(one)
     told = [cell["cross_entropy"] for cell in cells.values()]
     assert len({tuple(one) for one in told}) == 4  # each asks other questions, or learns otherwise
-    runner = RobotStreamRunner(tmp_path / "keys", ignore)
-    result = report.results[-1]  # which has a key of its own
-    alone = []
-    for seed in (3, 4):
-        recipe = load_training(folder / "stream" / result.variant / str(seed) / "recipe.yaml")
-        assert isinstance(recipe, RobotStreamRecipe) and recipe.seed == seed
-        one = train.run(recipe, tmp_path / str(seed))
-        recorded = dataclasses.replace(recipe, demos=dataclasses.replace(recipe.demos, paths=None))
-        cell = cells[runner.key(Cell("any", recorded))]
-        assert cell["success"] == [list(row) for row in one.success]
-        assert cell["vqa"] == [each.accuracy for each in one.vqa]
-        assert cell["cross_entropy"] == [each.cross_entropy for each in one.vqa]
-        alone.append(one)
-    assert result.last.mean == statistics.fmean(one.scores.last for one in alone)
-    lost = statistics.fmean(one.vqa[-1].drop_points for one in alone)
-    assert result.drop_points.mean == pytest.approx(lost, abs=1e-9)
-    assert result.after[-1].drop_points.mean == pytest.approx(lost, abs=1e-9)
-    first = [one.success[1][0] for one in alone]
-    assert result.after[1].success[0].mean == statistics.fmean(first)
     for result in report.results:
+        alone = [
+            train.run(
+                load_training(folder / "stream" / result.variant / str(seed) / "recipe.yaml"),
+                tmp_path / result.variant / str(seed),
+                resume=True,
+            )
+            for seed in (3, 4)
+        ]
+        assert result.last.mean == statistics.fmean(one.scores.last for one in alone)
+        lost = statistics.fmean(one.vqa[-1].drop_points for one in alone)
+        assert result.drop_points.mean == pytest.approx(lost, abs=1e-9)
+        assert result.after[-1].drop_points.mean == pytest.approx(lost, abs=1e-9)
+        first = [one.success[1][0] for one in alone]
+        assert result.after[1].success[0].mean == statistics.fmean(first)
         assert [after.task for after in result.after] == list(TASKS)
         assert [len(after.success) for after in result.after] == [1, 2]
 
