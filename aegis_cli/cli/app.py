@@ -6,7 +6,6 @@ stages.py says which stage that is, exits.py with which code a command ends.
 from __future__ import annotations
 
 import faulthandler
-import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -77,7 +76,7 @@ from aegis_cli.cli.options import (
     share_or_one,
     strengths,
 )
-from aegis_cli.common import commands, files, interrupts, launch
+from aegis_cli.common import commands, files, garbage, interrupts, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.version import __version__
 from aegis_cli.data.selection import Paths, Selection
@@ -1562,6 +1561,4 @@ def main() -> None:
     except OSError as error:  # of a shell's completion, which begins no command
         sys.exit(ended_by(error))
     finally:
-        # Else Python looks through all that torch and a model consist of, again and again, before
-        # it lets the process end: seconds, and many of them on a busy machine.
-        gc.freeze()
+        garbage.leave_at_end()

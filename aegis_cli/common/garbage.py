@@ -1,8 +1,9 @@
-"""Modules that are not looked through for garbage."""
+"""What is not looked through for garbage: modules, and all there is when a process ends."""
 
 from __future__ import annotations
 
 import gc
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -22,3 +23,16 @@ def left_out() -> Generator[None]:
         gc.freeze()
         if collects:
             gc.enable()
+
+
+def leave_at_end() -> None:
+    """Let Python end without looking through all that torch and a model consist of.
+
+    Else it does so again and again: seconds, and many of them on a busy machine. Where triton is
+    there, which PyTorch's builds for GPUs bring, it has to. Since version 3.9 triton's bindings
+    write dozens of lines about whatever is left of them.
+    """
+    if "triton" in sys.modules:
+        gc.unfreeze()
+    else:
+        gc.freeze()

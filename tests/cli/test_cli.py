@@ -622,10 +622,16 @@ app.main()
     assert "elsewhere" not in done.stderr
 
 
-def test_a_process_ends_without_looking_through_all_that_it_has_made():
-    code = """
+@pytest.mark.parametrize("triton", [False, True])
+def test_a_process_ends_without_looking_through_all_that_it_has_made(triton: bool):
+    """But for that of triton, whose bindings write about whatever is left of them."""
+    code = f"""
 import gc
+import sys
 from aegis_cli.cli import app
+
+if {triton}:
+    sys.modules["triton"] = sys
 
 frozen = gc.get_freeze_count()  # Python 3.12 has frozen hundreds of its own
 
@@ -637,7 +643,8 @@ app.main()
 print(gc.get_freeze_count() - frozen)
 """
     done = python(code)
-    assert int(done.stdout) > 10_000, done.stderr
+    frozen = int(done.stdout)
+    assert frozen <= 0 if triton else frozen > 10_000, done.stderr
 
 
 def test_control_characters_of_metadata_are_shown_and_not_sent(aegis, tmp_path: Path):
