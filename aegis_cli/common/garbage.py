@@ -29,8 +29,8 @@ def leave_at_end() -> None:
     """Let Python end without looking through all that torch and a model consist of.
 
     Else it does so again and again: seconds, and many of them on a busy machine. Where triton is
-    there, which PyTorch's builds for GPUs bring, it has to. Since version 3.9 triton's bindings
-    write dozens of lines about whatever is left of them.
+    there, which PyTorch's builds for GPUs bring, it has to: the bindings of triton 3.9 write dozens
+    of lines about whatever is left of them.
     """
     if "triton" in sys.modules:
         gc.unfreeze()

@@ -143,10 +143,11 @@ def test_a_validation_is_left_at_a_signal_and_made_again_by_the_resumed_run(
     assert_same_run(out, tmp_path / "whole")
 
 
-@pytest.mark.parametrize("at", [3, 6])
+@pytest.mark.parametrize("at", [3, 4, 6])
 def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
     at: int, start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also where the run that goes on is killed once it has written the step's line."""
     one = replace(recipe, train=replace(SETTINGS, validate_every=at))
     start("naive", tmp_path / "whole", recipe=one)
 
@@ -157,6 +158,9 @@ def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
         patched.setattr(train, "validation_loss", failing)
         start("naive", tmp_path / "cut", recipe=one)
     assert checkpoint.last(tmp_path / "cut").resolve().name == f"{at:06d}"
+    with pytest.raises(KeyboardInterrupt):
+        killed = stop_at(at, KeyboardInterrupt())
+        start("naive", tmp_path / "cut", recipe=one, resume=True, on_event=killed)
     start("naive", tmp_path / "cut", recipe=one, resume=True)
     assert_same_run(tmp_path / "cut", tmp_path / "whole")
 
