@@ -15,7 +15,15 @@ from typing import Any
 import pytest
 import torch
 from samples.small_run import flipped
-from samples.training_runs import SETTINGS, STEPS, Start, assert_same_run, contents, stop_at
+from samples.training_runs import (
+    SETTINGS,
+    STEPS,
+    Start,
+    assert_same_run,
+    contents,
+    metrics,
+    stop_at,
+)
 from torch import Tensor
 
 from aegis_cli.common import artifacts, interrupts, locks
@@ -148,7 +156,7 @@ def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
     at: int, start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where the run that goes on is killed once it has written the step's line."""
-    one = replace(recipe, train=replace(SETTINGS, validate_every=at))
+    one = replace(recipe, train=replace(SETTINGS, validate_every=at, validate_actions=4))
     start("naive", tmp_path / "whole", recipe=one)
 
     def failing(*_: Any) -> float:
@@ -158,8 +166,13 @@ def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
         patched.setattr(train, "validation_loss", failing)
         start("naive", tmp_path / "cut", recipe=one)
     assert checkpoint.last(tmp_path / "cut").resolve().name == f"{at:06d}"
+
+    def killed(event: Event) -> None:
+        is_there = isinstance(event, Progress) and (event.stage, event.done) == ("train", at)
+        if is_there and metrics(tmp_path / "cut")[-1]["step"] == at:
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        killed = stop_at(at, KeyboardInterrupt())
         start("naive", tmp_path / "cut", recipe=one, resume=True, on_event=killed)
     start("naive", tmp_path / "cut", recipe=one, resume=True)
     assert_same_run(tmp_path / "cut", tmp_path / "whole")
