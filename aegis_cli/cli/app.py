@@ -86,6 +86,7 @@ from aegis_cli.recipes import (
     LEARNERS,
     MERGES,
     METHODS,
+    RECORDED,
     TASK,
     Anchor,
     Recipe,
@@ -127,7 +128,7 @@ def aegis(
 
 @app.command(short_help="Record demonstrations of a simulated task.")
 def demos(
-    task: Annotated[str, Argument(metavar="TASK", help=f"Task: {TASK.expected}.")],
+    task: Annotated[str, Argument(metavar="TASK", help=f"Task: {RECORDED}.")],
     out: Annotated[
         Path,
         Option(
@@ -1022,6 +1023,7 @@ def rollout(
     \b
     Example: aegis rollout runs/x --episodes 50 --colors held-out --video out.mp4
     Example: aegis rollout runs/x --delay 2
+    Example: aegis rollout runs/x --task libero/all --episodes 2000
     """
     if guided and delay is None:
         expected = "a delay, in which the chunk goes on that the next one continues"

@@ -265,7 +265,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     source = questions(recipe, on_event)  # a bad set shows before anything is recorded
     gl.check()
     for task in recipe.tasks:
-        sim.check(task)
+        sim.check_recordable(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
     _check_freeze(recipe, backbone, on_event)
     for task in recipe.tasks:

@@ -378,18 +378,28 @@ def count_episodes(path: Path) -> int:
 
 
 def playable_task(
-    path: Path, camera: str | tuple[str, ...] | None, rename: Renaming = ()
+    path: Path, camera: str | tuple[str, ...] | None, named: str, rename: Renaming = ()
 ) -> str | None:
     """The simulated task that a policy of these demonstrations can act in.
 
     It is None where another robot was recorded, or by cameras that the task does not have.
+
+    Args:
+        named: the task that a recipe names. Data sets of LIBERO's do not say that they are.
     """
     path = locate(path)
     if not path.is_dir():
         return artifacts.load(path, "demos").header.meta["task"]
     found = dataset.load(path, rename)
-    seen_by = {layout.short(found.called(own)) for own in found.cameras(camera)}
-    return sim.playable(found.info.task, seen_by)
+    task = found.info.task
+    if task is None and sim.of_datasets(named) is not None:
+        task = named
+    known = () if task is None else sim.cameras(task)
+    seen_by = set()
+    for own in found.cameras(camera):
+        before, now = layout.short(own), layout.short(found.called(own))
+        seen_by.add(before if before in known else now)
+    return sim.playable(task, seen_by)
 
 
 def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:

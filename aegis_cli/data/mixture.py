@@ -153,10 +153,10 @@ def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
 
 
 def playable_task(
-    paths: Paths, camera: str | tuple[str, ...] | None, rename: Renaming = ()
+    paths: Paths, camera: str | tuple[str, ...] | None, named: str, rename: Renaming = ()
 ) -> str | None:
     """The simulated task that a policy of these can act in, as `demonstrations` knows it of one."""
-    tasks = (demonstrations.playable_task(path, camera, rename) for path in each(paths))
+    tasks = (demonstrations.playable_task(path, camera, named, rename) for path in each(paths))
     return next((task for task in tasks if task is not None), None)
 
 

@@ -222,7 +222,7 @@ def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
 def _check(
     task: str, episodes: int, noise: float, workers: int | None, drop_below: float | None
 ) -> None:
-    sim.check(task)
+    sim.check_recordable(task)
     if drop_below is not None and not sim.is_suite(task):
         expected = "a suite task, whose episodes have a return"
         raise AegisError(

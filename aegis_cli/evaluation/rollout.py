@@ -128,10 +128,10 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     if asked is not None:
         sim.check(asked)
     if trained is not None:
-        if asked not in (None, trained):
+        if asked is not None and asked != trained and not _alike(trained, asked):
             found = f"task '{asked}' for a policy trained on '{trained}'"
             raise AegisError(found, "the task it was trained on", f"--task {trained}")
-        return trained
+        return asked or trained
     if asked is None:
         found = "a policy trained on a dataset of no simulated task"
         raise AegisError(
@@ -147,10 +147,16 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     return asked
 
 
+def _alike(trained: str, asked: str) -> bool:
+    """Whether both are LIBERO's, whose robot is one, and whose data sets have several suites."""
+    return None not in (sim.of_datasets(trained), sim.of_datasets(asked))
+
+
 def _check_rate(rate: float, task: str, on_event: OnEvent) -> None:
     """Warn of a task whose steps have another length than those of a policy's training."""
-    own = sim.make(task).spec.control_hz
-    if not math.isclose(own, rate, rel_tol=1e-3):
+    spec = sim.make(task).spec
+    own = spec.control_hz
+    if not any(math.isclose(known, rate, rel_tol=1e-3) for known in (own, spec.said_hz or own)):
         text = (
             f"'{task}' has {own:g} steps a second, and the policy was trained on {rate:g}: its "
             "actions are meant for steps of another length"

@@ -29,7 +29,6 @@ from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episo
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default, and the only choice for a task without colours
-_LOCKSTEP = 64  # episodes that share a forward pass
 
 
 @dataclass(frozen=True)
@@ -177,8 +176,9 @@ def play(
     finished: list[_PlayedEpisode] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
     clips = 0 if video_out is None else media.CLIPS
-    for first in range(0, episodes, _LOCKSTEP):
-        numbers = range(first, min(episodes, first + _LOCKSTEP))
+    at_once = sim.lockstep(task)  # episodes that share a forward pass
+    for first in range(0, episodes, at_once):
+        numbers = range(first, min(episodes, first + at_once))
         # The first episodes are filmed.
         group = [_begin(acting, seed, stream, i, colors, i < clips) for i in numbers]
         for _ in _play(acting, group, pace, first, seed):
@@ -206,7 +206,7 @@ def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int
 
     The first one also pays for what is done once.
     """
-    numbers = range(min(episodes, _LOCKSTEP))
+    numbers = range(min(episodes, sim.lockstep(acting.task)))
     group = [_begin(acting, seed, stream, i, colors, filmed=False) for i in numbers]
     before, taken, seconds, started = 0, 0, 0.0, time.perf_counter()
     for _ in itertools.islice(_play(acting, group, _Pace(acting.replan), 0, seed), 2):
@@ -283,7 +283,8 @@ def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
 def _begin(
     acting: Acting, seed: int, stream: int, number: int, colors: str, filmed: bool
 ) -> _PlayedEpisode:
-    env = sim.make(acting.task, number=number, seen_by=acting.cameras)
+    published = (seed, stream) == (EVALUATION_SEED, EVALUATION)
+    env = sim.make(acting.task, number=number, seen_by=acting.cameras, published=published)
     observation = env.reset(episode_rng(seed, stream, number), TARGET_COLORS[colors])
     moments = [media.Moment(observation.image, "start")] if filmed else None
     averaged = None if acting.ensemble is None else TemporalEnsemble(acting.ensemble)

@@ -28,6 +28,7 @@ from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
+from aegis_cli.sim import libero_table
 from aegis_cli.training import checkpoint, freezing
 from aegis_cli.training.card import model, without_folders, without_places
 
@@ -177,10 +178,11 @@ def _merged(merge: Mapping[str, Any] | None) -> str:
 def _looks_by(meta: PolicyMeta, task: str | None) -> Sequence[str]:
     """The cameras of its simulated task that a checkpoint's policy looks by, by the task's names.
 
-    They are empty for the task's own, where there is none, and where the policy has several.
+    They are empty for the task's own, where there is none, and where the policy has several, but
+    for LIBERO's tasks, by several of whose cameras LeRobot can look.
     """
     several = len(meta.get("cameras", ())) > 1
-    if task is None or several:
+    if task is None or (several and sim.of_datasets(task) is None):
         return ()
     return checkpoint.cameras_of(meta, task)
 
@@ -196,7 +198,8 @@ def _use(
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
     act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
     plugins = ["lerobot_policy_aegis"]
-    if task:  # a robot of somebody's own needs no simulation
+    # A robot of somebody's own needs no simulation, and LeRobot has LIBERO's itself.
+    if task is not None and sim.of_datasets(task) is None:
         plugins.append("lerobot_env_aegis")
     return _USE[form].format(
         repo=repo,
@@ -229,6 +232,8 @@ def _lerobot_command(
             f"lerobot-rollout --strategy.type=base --policy.path={repo} --robot.type=ROBOT "
             "--task=INSTRUCTION"
         )
+    if sim.of_datasets(task) is not None:
+        return _libero_command(repo, task, cameras, looks_by)
     if len(cameras) > 1:
         return f"# lerobot-eval cannot: our tasks have one camera there, the policy {len(cameras)}"
     command = f"lerobot-eval --policy.path={repo} --env.type=aegis --env.task={task}"
@@ -238,6 +243,20 @@ def _lerobot_command(
         names = {lerobot_folder.picture_key(looks_by[0]): lerobot_folder.picture_key(named[0])}
         return f"{command} --env.camera={looks_by[0]} --rename_map={shlex.quote(json.dumps(names))}"
     return command if named == [own] else f"{command} --env.camera={shlex.quote(named[0])}"
+
+
+def _libero_command(repo: str, task: str, cameras: Sequence[str], looks_by: Sequence[str]) -> str:
+    """LeRobot's command for its own environment of LIBERO, whose cameras are image and image2."""
+    places = [libero_table.place(member) for member in sim.members(task)]
+    suites = ",".join(dict.fromkeys(f"libero_{suite}" for suite, _ in places))
+    command = f"lerobot-eval --policy.path={repo} --env.type=libero --env.task={suites}"
+    if len(places) == 1:
+        command += f" --env.task_ids='[{places[0][1]}]'"
+    shown = {"agentview": "image", "robot0_eye_in_hand": "image2"}
+    asked = [shown[libero_table.CAMERAS[name]] for name in looks_by or sim.cameras(task)[:1]]
+    named = zip(map(lerobot_folder.picture_key, asked), cameras, strict=False)
+    renamed = {own: called for own, called in named if own != called}
+    return f"{command} --rename_map={shlex.quote(json.dumps(renamed))}" if renamed else command
 
 
 def _measured(run: Path, at: Path) -> InspectReport:

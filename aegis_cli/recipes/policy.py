@@ -81,13 +81,15 @@ NEEDS = {
 MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
 # what a merge leaves unread
 MERGE_UNREAD = {"linear": ("damping", "frames"), "kfac-shrink": ("frames",)}
-# what the names of dm_control's suite tasks and of MetaWorld's begin with; which there are, the
-# stages know
-SUITE, METAWORLD = "suite/", "metaworld/"
+# what the names of dm_control's suite tasks, of MetaWorld's and of LIBERO's begin with; which there
+# are, the stages know
+SUITE, METAWORLD, LIBERO = "suite/", "metaworld/", "libero/"
 
-_BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|{METAWORLD}[a-z0-9-]+")
+_BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|({METAWORLD}|{LIBERO})[a-z0-9-]+")
+_RECORDED = f"one of {', '.join(TASKS)}, {SUITE}DOMAIN-TASK"
+RECORDED = f"{_RECORDED}, or {METAWORLD}TASK"  # those that have an expert
 TASK = Check(
-    f"one of {', '.join(TASKS)}, {SUITE}DOMAIN-TASK, or {METAWORLD}TASK",
+    f"{_RECORDED}, {METAWORLD}TASK, or {LIBERO}SUITE",
     lambda v: v in TASKS or bool(_BENCHMARK_TASK.fullmatch(v)),
     TASKS,
 )

@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 from importlib import import_module
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.sim import metaworld_table
-from aegis_cli.sim.contract import METAWORLD, SUITE, TOP, TaskEnv
+from aegis_cli.sim import libero_table, metaworld_table
+from aegis_cli.sim.contract import LIBERO, METAWORLD, SUITE, TOP, TaskEnv, TaskSpec
 
 # The class of each task by its name; every class follows `contract.TaskEnv`.
 TASKS: dict[str, str] = {
@@ -27,9 +27,32 @@ def has_colors(name: str) -> bool:
     return name in TASKS
 
 
+def of_datasets(name: str) -> TaskSpec | None:
+    """The facts of a task that is learned from data sets alone; None of one that has an expert.
+
+    LIBERO's demonstrations are people's, and its data sets do not say that they are of it: a recipe
+    does.
+
+    Raises:
+        AegisError: a task that LIBERO does not have.
+    """
+    if not name.startswith(LIBERO):
+        return None
+    if name not in libero_table.names():
+        raise _unknown(name, libero_table.names())
+    return libero_table.spec(name)
+
+
+def lockstep(name: str) -> int:
+    """How many of the task's episodes are played at once; a simulator of LIBERO's is large."""
+    return 10 if name.startswith(LIBERO) else 64
+
+
 def members(name: str) -> tuple[str, ...]:
     """The tasks of a set; of a task itself alone."""
-    return metaworld_table.members(name) if name.startswith(METAWORLD) else (name,)
+    if name.startswith(METAWORLD):
+        return metaworld_table.members(name)
+    return libero_table.members(name) if name.startswith(LIBERO) else (name,)
 
 
 def member(name: str, number: int) -> str:
@@ -40,7 +63,9 @@ def member(name: str, number: int) -> str:
 
 def cameras(name: str) -> tuple[str, ...]:
     """The cameras that a task can be seen by; the first takes the pictures if none is asked for."""
-    return metaworld_table.CAMERAS if name.startswith(METAWORLD) else (TOP,)
+    if name.startswith(METAWORLD):
+        return metaworld_table.CAMERAS
+    return tuple(libero_table.CAMERAS) if name.startswith(LIBERO) else (TOP,)
 
 
 def playable(task: str | None, seen_by: Collection[str]) -> str | None:
@@ -58,25 +83,48 @@ def check(name: str) -> None:
     if name in metaworld_table.names():
         import_module("aegis_cli.sim.metaworld")  # raises where MetaWorld is not installed
         return
+    if name in libero_table.names():
+        import_module("aegis_cli.sim.libero")  # raises where LIBERO is not installed
+        return
     suite = import_module("aegis_cli.sim.suite").names()
     if name in suite:
         return
-    known = (*TASKS, *metaworld_table.names(), *suite)
-    expected = (
-        f"one of {', '.join(TASKS)}, a task of dm_control's suite, such as "
-        "suite/cartpole-swingup, or of MetaWorld, such as metaworld/button-press"
-    )
+    raise _unknown(name, (*TASKS, *metaworld_table.names(), *libero_table.names(), *suite))
+
+
+def check_recordable(name: str) -> None:
+    """Raise AegisError unless `name` is a task that can be made, with an expert to record."""
+    if of_datasets(name) is not None:
+        raise AegisError(
+            f"task '{name}' to be recorded",
+            "a task with an expert: LIBERO's demonstrations are people's",
+            "take a LeRobot dataset of them, such as HuggingFaceVLA/libero: aegis train --demos, "
+            "or demos.path in the recipe",
+        )
+    check(name)
+
+
+def _unknown(name: str, known: tuple[str, ...]) -> AegisError:
     # The name of a whole collection is no typing error for one of its tasks.
-    examples = {SUITE: "suite/cartpole-swingup", METAWORLD: "metaworld/button-press"}
+    examples = {
+        SUITE: "suite/cartpole-swingup",
+        METAWORLD: "metaworld/button-press",
+        LIBERO: "libero/spatial",
+    }
+    expected = (
+        f"one of {', '.join(TASKS)}, a task of dm_control's suite, such as {examples[SUITE]}, of "
+        f"MetaWorld, such as {examples[METAWORLD]}, or of LIBERO, such as {examples[LIBERO]}"
+    )
     example = examples.get(name.rstrip("/") + "/")
     if example is not None:
-        raise AegisError(f"task '{name}'", expected, f"name the task too, e.g. {example}")
-    raise AegisError(f"task '{name}'", expected, f"use {_close(name, known)}")
+        return AegisError(f"task '{name}'", expected, f"name the task too, e.g. {example}")
+    return AegisError(f"task '{name}'", expected, f"use {_close(name, known)}")
 
 
 def _close(name: str, known: tuple[str, ...]) -> str:
     """Names that are meant, perhaps: `'reach'`, or several with commas."""
-    for guess in (name, SUITE + name, METAWORLD + name):  # a prefix may have been forgotten
+    # A prefix may have been forgotten, and LIBERO calls a suite libero_spatial.
+    for guess in (name, SUITE + name, METAWORLD + name, LIBERO + name, name.replace("_", "/")):
         close = difflib.get_close_matches(guess, known, n=3)
         if close:
             break
@@ -95,13 +143,21 @@ def check_cameras(name: str, seen_by: Sequence[str]) -> None:
         )
 
 
-def make(name: str, threads: int = 1, number: int = 0, seen_by: tuple[str, ...] = ()) -> TaskEnv:
-    """A new environment; all environments of a task share one rendering context.
+def make(
+    name: str,
+    threads: int = 1,
+    number: int = 0,
+    seen_by: tuple[str, ...] = (),
+    published: bool = False,
+) -> TaskEnv:
+    """A new environment; those of a task share one rendering context, but for LIBERO's.
 
     Args:
         threads: how many a suite task's planner simulates with.
         number: the episode's that it is for. The environments of a set differ by it.
         seen_by: cameras that take pictures, in their order; empty for the task's own.
+        published: whether episodes are those that a benchmark has published, if it has; else, and
+            in all other tasks, each is drawn anew.
 
     Raises:
         AegisError: an unknown name, a task whose package is missing, or a camera it does not have.
@@ -112,5 +168,7 @@ def make(name: str, threads: int = 1, number: int = 0, seen_by: tuple[str, ...] 
         return import_module("aegis_cli.sim.suite").SuiteTask(name, threads)
     if name.startswith(METAWORLD):
         return import_module("aegis_cli.sim.metaworld").MetaWorldTask(name, number, seen_by)
+    if name.startswith(LIBERO):
+        return import_module("aegis_cli.sim.libero").LiberoTask(name, number, seen_by, published)
     module, cls = TASKS[name].split(":")
     return getattr(import_module(module), cls)()

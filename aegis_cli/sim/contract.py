@@ -12,6 +12,7 @@ from aegis_cli.common.errors import AegisError
 
 SUITE = "suite/"  # what the names of dm_control's suite tasks begin with
 METAWORLD = "metaworld/"  # and those of MetaWorld's
+LIBERO = "libero/"  # and those of LIBERO's
 TOP = "top"  # the camera of our own tasks, and what we call the suite's
 # Streams keep the episodes of one seed apart: no evaluation scene is ever a demonstration's.
 DEMOS, EVALUATION, VALIDATION = 0, 1, 2
@@ -35,6 +36,7 @@ class TaskSpec:
             or the benchmark's own verdict. `return` is the sum of its rewards, each at most 1; such
             a task has no colours, and its episodes neither succeed nor fail.
         camera: name of the camera that takes the pictures, where no other is asked for.
+        said_hz: a rate that data sets of the task's steps have instead of its own; None for none.
     """
 
     name: str
@@ -45,20 +47,23 @@ class TaskSpec:
     templates: tuple[str, ...]
     measure: Literal["success", "return"] = "success"
     camera: str = TOP
+    said_hz: float | None = None
 
 
 @dataclass(frozen=True)
 class Observation:
     """What a policy may see; nothing but images and words tells where to go.
 
+    Pictures are 64 pixels wide and high, those of LIBERO 256.
+
     Attributes:
         more: pictures of further cameras that were asked for, in their order.
     """
 
-    image: np.ndarray  # [64, 64, 3] uint8; in our own tasks, x points to the right and y up
+    image: np.ndarray  # [H, W, 3] uint8; in our own tasks, x points to the right and y up
     proprio: np.ndarray  # [P] float32; in our own tasks, positions alone
     instruction: str
-    more: tuple[np.ndarray, ...] = ()  # each [64, 64, 3] uint8
+    more: tuple[np.ndarray, ...] = ()  # each [H, W, 3] uint8
 
 
 @dataclass(frozen=True)

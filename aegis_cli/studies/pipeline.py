@@ -84,6 +84,8 @@ def check(recipe: Recipe) -> None:
     track.check(recipe)
     gl.check()
     sim.check(recipe.task)
+    if recipe.demos.path is None:
+        sim.check_recordable(recipe.task)
 
 
 def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:

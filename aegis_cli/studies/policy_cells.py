@@ -18,7 +18,6 @@ from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress, Warned
 from aegis_cli.data import mixture
-from aegis_cli.data.lerobot import layout
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -97,6 +96,8 @@ class PolicyStudy:
         """
         for recipe in trials:
             track.check(recipe)
+            if recipe.demos.path is None:
+                sim.check_recordable(recipe.task)
         tuning = self.recipe.tuning
         for task in (*self.places, *([tuning.task] if tuning else [])):
             sim.check(task)
@@ -245,10 +246,10 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
 
 
 def _check_playable(trials: Sequence[Recipe]) -> None:
-    named = ((r.demos.path, r.demos.selection) for r in trials if r.demos.path is not None)
-    for path, chosen in dict.fromkeys(named):
+    read = ((r.demos.path, r.demos.selection, r.task) for r in trials if r.demos.path is not None)
+    for path, chosen, named in dict.fromkeys(read):
         given = mixture.at(path)
-        if mixture.playable_task(given, chosen.camera, chosen.rename) is None:
+        if mixture.playable_task(given, chosen.camera, named, chosen.rename) is None:
             raise AegisError(
                 f"'tuning' with demonstrations in {mixture.said(given)}, whose policies cannot be "
                 "rolled out here",
@@ -848,8 +849,7 @@ def _sha256(run: Path) -> list[str]:
 
 def _playable(meta: PolicyMeta, recipe: Recipe) -> tuple[str, ...]:
     """The colours that a policy is rolled out on, or the one word for a task without colours."""
-    seen_by = {layout.short(name) for name in meta.get("cameras", ())}
-    task = sim.playable(meta["task"], seen_by)
+    task = sim.playable(meta["task"], checkpoint.seen_by(meta, meta["task"]))
     return () if task is None else _colors(task, recipe)
 
 
@@ -858,7 +858,7 @@ def playable_colors(recipe: Recipe) -> tuple[str, ...]:
     task: str | None = recipe.task
     if recipe.demos.path is not None:
         given, chosen = mixture.at(recipe.demos.path), recipe.demos.selection
-        task = mixture.playable_task(given, chosen.camera, chosen.rename)
+        task = mixture.playable_task(given, chosen.camera, recipe.task, chosen.rename)
     return () if task is None else _colors(task, recipe)
 
 

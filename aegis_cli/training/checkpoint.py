@@ -49,6 +49,9 @@ BACKBONE = "backbone"
 PARTS = (BACKBONE, EXPERT, STATE.parts[0])  # of a checkpoint's folder
 _REUSED = "anchor_gradient."
 _AVERAGE = "average."
+_OTHER_CAMERAS = (
+    "roll it out on its own robot, or train on one of them with --set demos.camera=NAME"
+)
 _BUFFER = "buffer."  # of a running average that training passes write, as BatchNorm's
 
 
@@ -468,14 +471,11 @@ def sizes_of(meta: PolicyMeta) -> tuple[tuple[int, int], ...]:
 def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     """The cameras of a simulated task that a policy looks by; empty for the task's own.
 
-    One that was renamed for the policy is known by the name that it had before.
-
     Raises:
         AegisError: it was trained on others.
     """
     named = meta.get("cameras", ())
-    before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
-    found = tuple(before.get(layout.short(name), layout.short(name)) for name in named)
+    found = seen_by(meta, task)
     known = () if task is None else sim.cameras(task)  # the first is the task's own
     if len(found) == 1 and found[0] not in known[1:]:
         return ()  # whatever the only camera is called
@@ -484,9 +484,24 @@ def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
         raise AegisError(
             f"a policy trained on {len(named)} cameras: {', '.join(named)}",
             expected if task is None else f"cameras of '{task}': {', '.join(known)}",
-            "roll it out on its own robot, or train on one of them with --set demos.camera=NAME",
+            _OTHER_CAMERAS
+            if task is None or sim.of_datasets(task) is None
+            else f"give them its names: --set 'demos.rename={{{found[0]}: {known[0]}}}'",
         )
     return found
+
+
+def seen_by(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
+    """The names of a policy's cameras, in short, as a simulated task has them where it does.
+
+    One that was renamed for the policy is known by the name that it had before, or by the new one
+    where the task has none of the old.
+    """
+    before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
+    known = () if task is None else sim.cameras(task)
+    now = [layout.short(name) for name in meta.get("cameras", ())]
+    olds = [before.get(name, name) for name in now]
+    return tuple(old if old in known else new for old, new in zip(olds, now, strict=True))
 
 
 def restore(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
-from aegis_cli import recipes
+from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices, launch
 from aegis_cli.common.errors import AegisError
@@ -142,16 +143,47 @@ def load_demonstrations(
         cache=recipe.demos.cache,
         check_text=backbone.check_prompt,
     )
-    if found.task not in (None, recipe.task):
+    if found.task is None:
+        found = _of_named_task(found, recipe)
+    elif found.task != recipe.task:
+        recorded = sim.of_datasets(recipe.task) is None
         raise AegisError(
             f"demonstrations of '{found.task}' for a recipe of '{recipe.task}'",
             "one and the same task",
-            f"--set task={found.task}, or record with: aegis demos {recipe.task}",
+            f"--set task={found.task}"
+            + (f", or record with: aegis demos {recipe.task}" if recorded else ""),
         )
     mixture.drawn(found, recipe.demos.weights)
     # A word that the backbone does not know is found here, and ends no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
+
+
+def _of_named_task(
+    found: demonstrations.Demonstrations, recipe: Recipe
+) -> demonstrations.Demonstrations:
+    """Demonstrations of LIBERO's where the recipe names them so, for they do not say it themselves.
+
+    Raises:
+        AegisError: demonstrations of another robot than the task's, or by other cameras.
+    """
+    named = recipe.task
+    spec = sim.of_datasets(named)
+    if spec is None:
+        return found
+    own = (found.tensors["proprio"].shape[1], found.tensors["actions"].shape[1])
+    expected = (len(spec.proprio_names), len(spec.action_names))
+    if own != expected:
+        raise AegisError(
+            f"demonstrations with {own[0]} positions and {own[1]} actions for task: {named}",
+            f"{expected[0]} positions ({', '.join(spec.proprio_names)}) and {expected[1]} actions "
+            f"({', '.join(spec.action_names)})",
+            "delete task from the recipe if they are another robot's, or choose their columns by "
+            "demos.state and demos.action",
+        )
+    meta = {"cameras": found.cameras, **recipes.selected(recipe)}
+    checkpoint.cameras_of(cast(PolicyMeta, meta), named)
+    return dataclasses.replace(found, task=named)
 
 
 def check_named(recipe: Recipe, on_event: OnEvent) -> None:

@@ -68,7 +68,7 @@ def envs(monkeypatch: pytest.MonkeyPatch) -> list[Seen]:
     made: list[Seen] = []
     make = sim.make
 
-    def seen(name: str, number: int = 0, seen_by: tuple[str, ...] = ()) -> Seen:
+    def seen(name: str, **_: Any) -> Seen:
         made.append(Seen(make(name)))
         return made[-1]
 
@@ -365,7 +365,7 @@ def test_a_delay_is_not_for_a_temporal_ensemble(run_folder: Path) -> None:
 def test_progress_and_more_episodes_than_one_group(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(acting, "_LOCKSTEP", 2)
+    monkeypatch.setattr(sim, "lockstep", lambda _: 2)
     puppet(expert)
     events: list = []
     report = rollout.run(Path("any"), None, 5, "held-out", on_event=events.append)

@@ -9,6 +9,7 @@ import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import pytest
 import torch
@@ -19,11 +20,12 @@ from samples.reports import open_loop
 from samples.reports import rollout as rollout_figures
 from samples.small_run import recipe as small
 
-from aegis_cli import inspection, recipes
+from aegis_cli import inspection, recipes, sim
 from aegis_cli.common import files
 from aegis_cli.evaluation import probe, results, rollout
 from aegis_cli.evaluation.results import Played, PlayedResult, Result
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.publishing import card, export, push
 from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.training import checkpoint, train
@@ -412,6 +414,18 @@ def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
         ),
         ("metaworld/mt4", ("corner", "gripperPOV"), "# lerobot-eval cannot: .* the policy 2"),
         (
+            "libero/object",
+            ("observation.images.image", "observation.images.image2"),
+            "lerobot-eval {} --env.type=libero --env.task=libero_object",
+        ),
+        (
+            "libero/90-12",
+            ("observation.images.agentview", "observation.images.wrist_image"),
+            "lerobot-eval {} --env.type=libero --env.task=libero_90 --env.task_ids='\\[12\\]' "
+            """--rename_map='{{"observation.images.image": "observation.images.agentview", """
+            """"observation.images.image2": "observation.images.wrist_image"}}'""",
+        ),
+        (
             None,
             ("observation.image",),
             "lerobot-rollout --strategy.type=base {} --robot.type=ROBOT --task=INSTRUCTION",
@@ -423,10 +437,12 @@ def test_a_card_for_lerobot_has_a_command_that_can_run(
 ) -> None:
     """`lerobot-eval` stops without an environment, and ours have one camera."""
     recipe = recipes.load(run_folder / "recipe.yaml")
-    said = card._use(card.LEROBOT, "somebody/x", recipe, task, cameras)
+    looks_by = () if task is None else card._looks_by(cast(PolicyMeta, {"cameras": cameras}), task)
+    said = card._use(card.LEROBOT, "somebody/x", recipe, task, cameras, looks_by)
     line = said.split("```sh\n")[1].splitlines()[0]
     assert re.fullmatch(command.format("--policy.path=somebody/x"), line)
-    assert ("lerobot_env_aegis" in said) == (task is not None)
+    ours = task is not None and sim.of_datasets(task) is None
+    assert ("lerobot_env_aegis" in said) == ours
 
 
 def test_a_dry_run_needs_no_token_and_sends_nothing(

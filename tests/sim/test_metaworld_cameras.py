@@ -87,8 +87,8 @@ def test_a_dataset_has_each_cameras_frames(dataset: Path, tmp_path: Path) -> Non
     usual = demonstrations.load(tmp_path / "usual", 0.5, 0)
     assert torch.equal(found.frames[1], usual.frames[0])
     assert torch.equal(found.tensors["actions"], usual.tensors["actions"])
-    assert demonstrations.playable_task(dataset, BOTH) == TASK
-    assert demonstrations.playable_task(dataset, "gripperPOV") == TASK
+    assert demonstrations.playable_task(dataset, BOTH, TASK) == TASK
+    assert demonstrations.playable_task(dataset, "gripperPOV", TASK) == TASK
 
 
 def test_a_policy_of_two_cameras_is_rolled_out_by_both(

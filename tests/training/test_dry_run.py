@@ -64,6 +64,8 @@ def test_the_shipped_recipes_run_on_small_stand_ins(
         *shipped(name, hf_folder(family)),
         "--set",
         "demos.camera=observation.images.top",
+        "--set",
+        "task=reach",
         "--demos",
         dataset,
     ]

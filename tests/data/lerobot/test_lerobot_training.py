@@ -617,7 +617,7 @@ def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
 ) -> None:
     """Before any work; one camera of a simulated task can be rolled out."""
     folder = save(tmp_path / "d", episodes(4, BOTH))
-    assert demonstrations.playable_task(folder, "wrist") is None
+    assert demonstrations.playable_task(folder, "wrist", "reach") is None
     shared = {
         **study_samples.raw(tiny_folder)["shared"],
         "demos": {"path": str(folder), "camera": "wrist"},
@@ -626,8 +626,8 @@ def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
     err = refused(aegis("run", path, "--out", tmp_path / "runs"))
     assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()
     edit_info(folder, lambda info: info.update(robot_type="aegis/reach"))
-    assert demonstrations.playable_task(folder, "wrist") == "reach"
-    assert demonstrations.playable_task(folder, BOTH) is None
+    assert demonstrations.playable_task(folder, "wrist", "reach") == "reach"
+    assert demonstrations.playable_task(folder, BOTH, "reach") is None
 
 
 def test_a_policy_of_no_simulated_task_plays_one_that_fits(

@@ -48,6 +48,12 @@ class AegisEnvConfig(EnvConfig):
                 "a task with coloured targets",
                 "leave out --env.colors",
             )
+        if sim.of_datasets(self.task) is not None:
+            raise AegisError(
+                f"task '{self.task}' for --env.type=aegis",
+                "a task that LeRobot does not have itself",
+                "--env.type=libero --env.task=libero_" + self.task.partition("/")[2],
+            )
         spec = sim.make(self.task).spec
         self.fps = round(spec.control_hz)
         self.camera = self.camera or spec.camera

@@ -1,0 +1,248 @@
+"""`libero/<suite>`: LIBERO's tasks as they come, for policies of its recorded demonstrations.
+
+LIBERO has no expert to record: its demonstrations are people's, and come as data sets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Generator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.gl import choose_backend
+from aegis_cli.sim import libero_table as table
+from aegis_cli.sim.contract import Observation, Step, checked
+
+SIZE = 256  # pixels per side of a picture, as in the data sets
+_SETTLING = 10  # steps of rest before an episode begins, in which objects fall onto the table
+_REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # no movement, and an open gripper
+_NOTHING = np.zeros((SIZE, SIZE, 3), np.uint8)
+
+
+@contextlib.contextmanager
+def _quietly() -> Generator[None]:
+    """Hush what LIBERO and its simulator say, and take the folders that LIBERO proposes.
+
+    At its first import it asks on the terminal where its own data sets are to lie, of which none is
+    needed here, and keeps the answer in `~/.libero`.
+    """
+    stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
+    # What other code has disabled stays so.
+    disabled = logging.root.manager.disable
+    logging.disable(max(disabled, logging.WARNING))
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        sys.stdin = stdin
+        logging.disable(disabled)
+
+
+choose_backend()  # before the simulator's import, which takes what it finds
+try:
+    with _quietly():
+        from libero.libero import benchmark, get_assets_path, get_libero_path
+        from libero.libero.envs import OffScreenRenderEnv
+        from robosuite.utils.observables import sensor
+        from robosuite.utils.transform_utils import quat2axisangle
+except ImportError as error:
+    raise AegisError(
+        f"LIBERO cannot be imported ({error})",
+        "LIBERO, as Hugging Face keeps it (hf-libero), for a task of its",
+        "pip install 'aegis-vla[libero]'",
+    ) from error
+
+
+class LiberoTask:
+    """A `contract.TaskEnv` without target colours or expert: one of LIBERO's tasks.
+
+    An episode ends with LIBERO's own success. Proprioception is the hand's position, its rotation
+    as axis times angle, and the fingers' places. Pictures are turned by 180 degrees, as those of
+    the data sets are.
+
+    Args:
+        number: the episode's. The tasks of a suite take turns by it.
+        seen_by: names of `table.CAMERAS` that take pictures; empty for the usual one.
+        published: whether the episode begins in one of the 50 states that LIBERO has published for
+            each task, by its number; else objects are placed anew.
+    """
+
+    target_color = None
+
+    def __init__(
+        self, name: str, number: int = 0, seen_by: Sequence[str] = (), published: bool = False
+    ) -> None:
+        tasks = table.members(name)
+        turn, self._round = number % len(tasks), number // len(tasks)
+        self._suite, self._number = table.place(tasks[turn])
+        self._most = table.steps(tasks[turn])
+        self.spec = table.spec(name, tuple(_instruction(*table.place(task)) for task in tasks))
+        self._instruction = _instruction(self._suite, self._number)
+        self._seen_by = tuple(seen_by) or (self.spec.camera,)
+        self._cameras = tuple(dict.fromkeys(table.CAMERAS[name] for name in self._seen_by))
+        self._published = published
+        self._looks = threading.Event()
+        # It is made when an episode begins and closed with its last step: it holds half a gigabyte.
+        self._env: Any = None
+        self._closing: weakref.finalize | None = None
+
+    def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
+        """See `contract.TaskEnv`; there is nothing to colour."""
+        self._close()
+        with _global_numbers_kept(), _quietly():
+            self._env = _environment(self._suite, self._number, self._cameras)
+            self._closing = weakref.finalize(self, _close, self._env)
+            self._closing.atexit = False  # OpenGL may be gone by then
+            # Even a published state says nothing of what the table stands on.
+            np.random.seed(int(rng.integers(2**31)))
+            self._env.reset()
+            if self._published:
+                states = _states(self._suite, self._number)  # [50, numbers of a state]
+                self._env.set_init_state(states[self._round % len(states)])
+            self._draw_when_looked_at()
+        for left in reversed(range(_SETTLING)):
+            self._step(np.array(_REST), look=left == 0)
+        self._steps = 0
+        return self._observe()
+
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
+        """See `contract.TaskEnv`. After the last step, the simulator is closed."""
+        success = self._step(checked(action, len(self.spec.action_names)), look)
+        self._steps += 1
+        done = success or self._steps >= self._most
+        if done:
+            self._close()
+        return Step(self._observe() if look else None, success, None, done)
+
+    def _step(self, control: np.ndarray, look: bool) -> bool:
+        """Whether the task is done after one more step."""
+        if look:
+            self._looks.set()
+        else:
+            self._looks.clear()
+        _make_current(self._env)
+        self._state, _, success, _ = self._env.step(control)
+        return bool(success)
+
+    def _draw_when_looked_at(self) -> None:
+        """Let the simulator draw those pictures alone that a policy sees.
+
+        It would draw one of each camera at every step, in the midst of it. A picture at the step's
+        end would be another one than those that a policy has learned from.
+        """
+        simulator, looks = self._env.env, self._looks
+        for camera in self._cameras:
+            name = f"{camera}_image"
+            drawn = simulator._observables[name]._sensor
+
+            @sensor(modality="image")
+            def seen(known: Any, drawn: Callable[[Any], np.ndarray] = drawn) -> np.ndarray:
+                return drawn(known) if looks.is_set() else _NOTHING
+
+            simulator.modify_observable(name, "sensor", seen)
+
+    def expert_action(self) -> np.ndarray:
+        """LIBERO has none.
+
+        Raises:
+            AegisError: always.
+        """
+        raise AegisError(
+            f"'{self.spec.name}' to be demonstrated",
+            "a task with an expert: LIBERO's demonstrations are people's",
+            "train on a LeRobot dataset of them",
+        )
+
+    def distance(self) -> None:
+        """None, because tasks are about objects, and not about where the hand is."""
+
+    def target_circle(self) -> None:
+        """A picture rings no target."""
+
+    def _observe(self) -> Observation:
+        state = self._state
+        pictures = (state[f"{table.CAMERAS[name]}_image"] for name in self._seen_by)
+        first, *more = (np.ascontiguousarray(picture[::-1, ::-1]) for picture in pictures)
+        turned = quat2axisangle(state["robot0_eef_quat"].copy())  # of (x, y, z, w)
+        proprio = np.concatenate([state["robot0_eef_pos"], turned, state["robot0_gripper_qpos"]])
+        return Observation(first, proprio.astype(np.float32), self._instruction, tuple(more))
+
+    def _close(self) -> None:
+        if self._closing is not None:
+            self._closing()
+            self._env, self._closing = None, None
+
+
+def _make_current(env: Any) -> None:
+    """Let OpenGL speak of this simulator's pictures, and not of those that another has drawn."""
+    env.sim._render_context_offscreen.gl_ctx.make_current()
+
+
+def _close(env: Any) -> None:
+    _make_current(env)  # or another's textures would be freed, and its pictures turn black
+    env.close()
+
+
+@contextlib.contextmanager
+def _global_numbers_kept() -> Generator[None]:
+    """Put NumPy's global generator, which LIBERO draws from, back to where it was."""
+    before = np.random.get_state()
+    try:
+        yield
+    finally:
+        np.random.set_state(before)
+
+
+def _environment(suite: str, number: int, cameras: Sequence[str]) -> Any:
+    task = _benchmark(suite).get_task(number)
+    folder = Path(get_libero_path("bddl_files")) / task.problem_folder
+    return OffScreenRenderEnv(
+        bddl_file_name=str(folder / task.bddl_file),
+        camera_names=list(cameras),
+        camera_heights=SIZE,
+        camera_widths=SIZE,
+    )
+
+
+@cache
+def _benchmark(suite: str) -> Any:
+    _check_assets()
+    with _quietly():
+        return benchmark.get_benchmark(f"libero_{suite}")()
+
+
+def _instruction(suite: str, number: int) -> str:
+    return _benchmark(suite).get_task(number).language
+
+
+@cache
+def _states(suite: str, number: int) -> np.ndarray:
+    """The published states [50, S] of a task's simulator at an episode's begin."""
+    task = _benchmark(suite).get_task(number)
+    folder = Path(get_libero_path("init_states")) / task.problem_folder
+    # The files are part of LIBERO's own package, and hold NumPy's arrays, which need pickle.
+    return np.asarray(torch.load(folder / task.init_states_file, weights_only=False))
+
+
+def _check_assets() -> None:
+    """Raise AegisError unless LIBERO's meshes are there, or can be had from the hub."""
+    with contextlib.redirect_stdout(io.StringIO()):  # the hub's own progress is on stderr
+        folder = get_assets_path()
+    if not os.path.isdir(folder):
+        raise AegisError(
+            f"no folder '{folder}'",
+            "LIBERO's meshes and textures, which it could not fetch from the Hugging Face hub",
+            "run this once with a network, or put the folder 'assets' of LIBERO's repository there",
+        )

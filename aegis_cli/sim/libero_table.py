@@ -1,0 +1,75 @@
+"""Names, suites and facts of LIBERO's tasks (arXiv 2306.03310); needs neither LIBERO nor MuJoCo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from aegis_cli.sim.contract import LIBERO, TaskSpec
+
+# How many tasks each suite has, and how many steps one has for an episode: a few more than the
+# longest demonstration takes, as LeRobot and openpi have them.
+SUITES: dict[str, tuple[int, int]] = {
+    "spatial": (10, 280),
+    "object": (10, 280),
+    "goal": (10, 300),
+    "10": (10, 520),
+    "90": (90, 400),
+}
+ALL = "all"  # the four suites of ten, which are what papers report
+_REPORTED = ("spatial", "object", "goal", "10")
+
+# The simulator's cameras by the names that data sets give to their pictures: LeRobot's, openpi's
+# and LIBERO's own.
+CAMERAS = {
+    "image": "agentview",
+    "image2": "robot0_eye_in_hand",
+    "wrist_image": "robot0_eye_in_hand",
+    "agentview": "agentview",
+    "robot0_eye_in_hand": "robot0_eye_in_hand",
+}
+
+_TASK = TaskSpec(
+    name="",
+    action_names=("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper"),
+    proprio_names=("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "finger1_m", "finger2_m"),
+    max_steps=0,
+    control_hz=20.0,
+    templates=(),
+    camera="image",
+    said_hz=10.0,  # what LeRobot's and openpi's copies of the demonstrations say
+)
+
+
+def names() -> tuple[str, ...]:
+    """Every set, suite and task, as `aegis` calls it."""
+    tasks = (task for suite in SUITES for task in members(LIBERO + suite))
+    return (*(LIBERO + name for name in (ALL, *SUITES)), *tasks)
+
+
+def members(name: str) -> tuple[str, ...]:
+    """The tasks of a suite, or of all four, in LIBERO's order; of a task itself alone."""
+    short = name.removeprefix(LIBERO)
+    if short == ALL:
+        return tuple(task for suite in _REPORTED for task in members(LIBERO + suite))
+    if short not in SUITES:
+        return (name,)
+    count, _ = SUITES[short]
+    return tuple(f"{name}-{number}" for number in range(count))
+
+
+def place(task: str) -> tuple[str, int]:
+    """The suite of a single task, and its number there."""
+    suite, _, number = task.removeprefix(LIBERO).partition("-")
+    return suite, int(number)
+
+
+def steps(task: str) -> int:
+    """How many steps an episode of a single task has."""
+    suite, _ = place(task)
+    return SUITES[suite][1]
+
+
+def spec(name: str, instructions: tuple[str, ...] = ()) -> TaskSpec:
+    """The facts of a task, a suite or a set, whose longest episodes count."""
+    longest = max(steps(task) for task in members(name))
+    return replace(_TASK, name=name, max_steps=longest, templates=instructions)

@@ -1,0 +1,22 @@
+"""Whether LIBERO's tasks can be made here: its package, and its meshes, which come from the hub."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+
+from aegis_cli.common.errors import AegisError
+
+
+def _missing() -> str:
+    """Why they cannot be made; empty if they can."""
+    try:
+        import_module("aegis_cli.sim.libero")._check_assets()
+    except AegisError as error:
+        return f"{error.found}; {error.fix}"
+    return ""
+
+
+MISSING = _missing()
+needs_libero = pytest.mark.skipif(bool(MISSING), reason=MISSING)

@@ -1,0 +1,131 @@
+"""LIBERO's tasks as its own users see them; needs LIBERO and its meshes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from samples.libero import needs_libero
+
+from aegis_cli import sim
+from aegis_cli.sim import libero_table as table
+from aegis_cli.sim.contract import EVALUATION, VALIDATION, Observation, TaskEnv, episode_rng
+
+pytestmark = needs_libero
+
+BOTH = ("image", "image2")
+
+
+def made(name: str, number: int = 0, **how: Any) -> Any:
+    return sim.make(name, number=number, seen_by=BOTH, **how)
+
+
+def begun(env: TaskEnv, number: int, stream: int = EVALUATION) -> Observation:
+    return env.reset(episode_rng(0, stream, number), ())
+
+
+def same(one: Observation, other: Observation) -> bool:
+    pictures = zip((one.image, *one.more), (other.image, *other.more), strict=True)
+    return np.array_equal(one.proprio, other.proprio) and all(
+        np.array_equal(left, right) for left, right in pictures
+    )
+
+
+def pushes(count: int) -> np.ndarray:
+    """[count, 7]"""
+    return np.random.default_rng(1).uniform(-1, 1, (count, 7))
+
+
+def test_every_suite_is_as_the_table_says() -> None:
+    from aegis_cli.sim.libero import _benchmark
+
+    for suite, (count, _) in table.SUITES.items():
+        env = sim.make(f"libero/{suite}")
+        said = env.spec.templates
+        assert len(said) == count == _benchmark(suite).n_tasks
+        assert all(text and text == text.strip() for text in said)
+
+
+def test_an_episode_follows_from_its_numbers_alone() -> None:
+    env, before = made("libero/goal", 2, published=True), np.random.get_state()[1].copy()
+    first = begun(env, 2)
+    assert same(first, begun(made("libero/goal", 2, published=True), 2))
+    assert np.array_equal(before, np.random.get_state()[1])  # others draw from it, too
+    assert first.image.shape == first.more[0].shape == (256, 256, 3)
+    assert first.proprio.shape == (8,) and first.proprio.dtype == np.float32
+
+
+def test_published_episodes_are_others_than_those_of_a_validation() -> None:
+    published = [begun(made("libero/object", n, published=True), n) for n in (0, 10)]
+    drawn = [begun(made("libero/object", n), n, VALIDATION) for n in (0, 10)]
+    seen = [o.image for o in (*published, *drawn)]
+    assert {o.instruction for o in (*published, *drawn)} == {published[0].instruction}
+    assert all(not np.array_equal(seen[i], seen[j]) for i in range(4) for j in range(i))
+
+
+def test_what_is_not_looked_at_changes_nothing() -> None:
+    looking, blind = made("libero/spatial", published=True), made("libero/spatial", published=True)
+    assert same(begun(looking, 0), begun(blind, 0))
+    for number, action in enumerate(pushes(6)):
+        seen, unseen = looking.step(action), blind.step(action, look=number == 5)
+    assert same(seen.observation, unseen.observation)
+
+
+def test_one_that_ends_leaves_anothers_pictures() -> None:
+    """Each has an OpenGL context, of which one is the current."""
+    alone, other, ends = (made("libero/spatial", n, published=True) for n in (1, 1, 0))
+    begun(alone, 1), begun(other, 1)
+    begun(ends, 0)
+    ends._close()
+    for action in pushes(3):
+        left, right = alone.step(action), other.step(action)
+    assert same(left.observation, right.observation) and left.observation.image.std() > 10
+
+
+def test_it_ends_after_its_suites_steps_and_closes_its_simulator() -> None:
+    env = made("libero/all", 9)
+    begun(env, 9)
+    steps, done = 0, False
+    while not done:
+        step = env.step(np.zeros(7), look=False)
+        steps, done = steps + 1, step.done
+    assert steps == 280 and step.success is False and env._env is None
+
+
+@pytest.mark.parametrize(("suite", "number"), [("object", 3), ("goal", 2), ("spatial", 1)])
+def test_it_is_the_environment_of_lerobot(suite: str, number: int) -> None:
+    """To the pixel, and in positions but for rounding, as its processor makes of them."""
+    envs = pytest.importorskip("lerobot.envs.libero")
+    processor = pytest.importorskip("lerobot.processor.env_processor").LiberoProcessorStep()
+    import torch
+    from libero.libero import benchmark
+
+    theirs = envs.LiberoEnv(
+        benchmark.get_benchmark(f"libero_{suite}")(),
+        number,
+        f"libero_{suite}",
+        obs_type="pixels_agent_pos",
+    )
+
+    def processed(seen: dict[str, Any]) -> Observation:
+        state = {
+            part: {name: torch.from_numpy(np.asarray(value))[None] for name, value in of.items()}
+            for part, of in seen["robot_state"].items()
+        }
+        found = {"observation.robot_state": state}
+        for name, picture in seen["pixels"].items():
+            found[f"observation.images.{name}"] = torch.from_numpy(picture).permute(2, 0, 1)[None]
+        done = processor.observation(found)
+        pictures = [done[f"observation.images.{n}"][0].permute(1, 2, 0).numpy() for n in BOTH]
+        return Observation(pictures[0], done["observation.state"][0].numpy(), "", (pictures[1],))
+
+    ours = made(f"libero/{suite}", number, published=True)
+    seed = int(episode_rng(0, EVALUATION, number).integers(2**31))
+    own, other = begun(ours, number), processed(theirs.reset(seed=seed)[0])
+    assert own.instruction == theirs.task_description
+    for action in pushes(8):
+        np.testing.assert_array_equal(own.image, other.image)
+        np.testing.assert_array_equal(own.more[0], other.more[0])
+        np.testing.assert_allclose(own.proprio, other.proprio, atol=1e-6)
+        own, other = ours.step(action).observation, processed(theirs.step(action)[0])
