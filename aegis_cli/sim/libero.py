@@ -11,6 +11,7 @@ import logging
 import os
 import sys
 import threading
+import warnings
 import weakref
 from collections.abc import Callable, Generator, Sequence
 from functools import cache
@@ -43,7 +44,11 @@ def _quietly() -> Generator[None]:
     disabled = logging.root.manager.disable
     logging.disable(max(disabled, logging.WARNING))
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.ExitStack() as hushed:
+            hushed.enter_context(contextlib.redirect_stdout(io.StringIO()))
+            hushed.enter_context(contextlib.redirect_stderr(io.StringIO()))
+            hushed.enter_context(warnings.catch_warnings())
+            warnings.simplefilter("ignore")
             yield
     finally:
         sys.stdin = stdin

@@ -129,3 +129,19 @@ def test_it_is_the_environment_of_lerobot(suite: str, number: int) -> None:
         np.testing.assert_array_equal(own.more[0], other.more[0])
         np.testing.assert_allclose(own.proprio, other.proprio, atol=1e-6)
         own, other = ours.step(action).observation, processed(theirs.step(action)[0])
+
+
+def test_it_ends_in_success_when_liberos_goal_is_reached() -> None:
+    """The soup is let fall into the basket."""
+    env = made("libero/object", published=True)
+    begun(env, 0)
+    assert not env.step(np.zeros(7), look=False).done
+    data = env._env.sim.data
+    place = np.concatenate([data.get_body_xpos("basket_1_main"), [1, 0, 0, 0]])
+    place[2] += 0.1
+    data.set_joint_qpos("alphabet_soup_1_joint0", place)
+    for _ in range(40):
+        step = env.step(np.zeros(7))
+        if step.done:
+            break
+    assert step.success is True and step.observation is not None and env._env is None
