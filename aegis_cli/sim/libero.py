@@ -5,6 +5,7 @@ LIBERO has no expert to record: its demonstrations are people's, and come as dat
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import logging
@@ -98,7 +99,7 @@ class LiberoTask:
         self._seen_by = tuple(seen_by) or (self.spec.camera,)
         self._cameras = tuple(dict.fromkeys(table.CAMERAS[name] for name in self._seen_by))
         self._published = published
-        self._looks = threading.Event()
+        self._looks = threading.Event()  # shared with the simulator, which must not hold `self`
         # It is made when an episode begins and closed with its last step: it holds half a gigabyte.
         self._env: Any = None
         self._closing: weakref.finalize | None = None
@@ -211,14 +212,18 @@ def _global_numbers_kept() -> Generator[None]:
 
 
 def _environment(suite: str, number: int, cameras: Sequence[str]) -> Any:
-    task = _benchmark(suite).get_task(number)
-    folder = Path(get_libero_path("bddl_files")) / task.problem_folder
-    return OffScreenRenderEnv(
-        bddl_file_name=str(folder / task.bddl_file),
+    described = _file(suite, number, "bddl_files", "bddl_file")
+    made = OffScreenRenderEnv(
+        bddl_file_name=str(described),
         camera_names=list(cameras),
         camera_heights=SIZE,
         camera_widths=SIZE,
     )
+    # When the process ends, its simulator would end EGL before other renderers are closed.
+    opengl = sys.modules.get("robosuite.renderers.context.egl_context")
+    if opengl is not None:
+        atexit.unregister(opengl.EGL.eglTerminate)
+    return made
 
 
 @cache
@@ -235,10 +240,27 @@ def _instruction(suite: str, number: int) -> str:
 @cache
 def _states(suite: str, number: int) -> np.ndarray:
     """The published states [50, S] of a task's simulator at an episode's begin."""
-    task = _benchmark(suite).get_task(number)
-    folder = Path(get_libero_path("init_states")) / task.problem_folder
+    path = _file(suite, number, "init_states", "init_states_file")
     # The files are part of LIBERO's own package, and hold NumPy's arrays, which need pickle.
-    return np.asarray(torch.load(folder / task.init_states_file, weights_only=False))
+    return np.asarray(torch.load(path, weights_only=False))
+
+
+def _file(suite: str, number: int, kind: str, name: str) -> Path:
+    """A file of a task's in LIBERO's folders of a kind, which its configuration names.
+
+    Raises:
+        AegisError: a configuration that another installation has written, which is there no more.
+    """
+    task = _benchmark(suite).get_task(number)
+    path = Path(get_libero_path(kind)) / task.problem_folder / getattr(task, name)
+    if not path.is_file():
+        folder = os.environ.get("LIBERO_CONFIG_PATH", "~/.libero")
+        raise AegisError(
+            f"no file '{path}'",
+            f"LIBERO's files where {folder}/config.yaml says that they are",
+            "delete that file: LIBERO writes it anew when it is next imported",
+        )
+    return path
 
 
 def _check_assets() -> None:

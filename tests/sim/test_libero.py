@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from samples.command import python
 from samples.libero import needs_libero
 
 from aegis_cli import sim
+from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import libero_table as table
 from aegis_cli.sim.contract import EVALUATION, VALIDATION, Observation, TaskEnv, episode_rng
 
@@ -81,6 +83,31 @@ def test_one_that_ends_leaves_anothers_pictures() -> None:
     for action in pushes(3):
         left, right = alone.step(action), other.step(action)
     assert same(left.observation, right.observation) and left.observation.image.std() > 10
+
+
+def test_a_process_that_draws_other_things_too_ends_quietly() -> None:
+    """Its simulator and Aegis's own scenes share OpenGL's display."""
+    program = (
+        "from aegis_cli import sim\n"
+        "from aegis_cli.data.vqa.scenes import renderer_of_thread\n"
+        "from aegis_cli.sim.contract import episode_rng\n"
+        "renderer_of_thread()\n"
+        "env = sim.make('libero/object')\n"
+        "env.reset(episode_rng(0, 1, 0), ())\n"
+        "env.step([0.0] * 7)\n"
+    )
+    done = python(program)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_folders_of_another_installation_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LIBERO keeps in the home folder where its files are, whichever environment it is in."""
+    from aegis_cli.sim import libero
+
+    monkeypatch.setattr(libero, "get_libero_path", lambda kind: f"/gone/{kind}")
+    with pytest.raises(AegisError, match="no file '/gone/bddl_files/libero_goal/") as caught:
+        begun(made("libero/goal"), 0)
+    assert "config.yaml" in caught.value.expected
 
 
 def test_it_ends_after_its_suites_steps_and_closes_its_simulator() -> None:
