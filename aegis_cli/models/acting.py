@@ -25,6 +25,7 @@ from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.models.policy import Policy
 from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
+from aegis_cli.sim.simulators import Simulators, Wanted
 
 EVALUATION_SEED = 0
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
@@ -177,28 +178,29 @@ def play(
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
     clips = 0 if video_out is None else media.CLIPS
     at_once = sim.lockstep(task)  # episodes that share a forward pass
-    for first in range(0, episodes, at_once):
-        numbers = range(first, min(episodes, first + at_once))
-        # The first episodes are filmed.
-        group = [_begin(acting, seed, stream, i, colors, i < clips) for i in numbers]
-        for _ in _play(acting, group, pace, first, seed):
-            longest = group[0].env.spec.max_steps
-            # An episode that ended early counts in full, so that the progress reaches its end.
-            in_group = sum(longest if e.done else e.steps for e in group)
-            done = first * longest + in_group
-            on_event(Progress(stage, done, episodes * longest, "steps"))
-        finished += group
-    seconds = time.perf_counter() - started
-    if video_out is not None:
-        media.save_video([_clip(e) for e in finished[:clips]], video_out)
-    return RolloutReport(
-        task=task,
-        episodes=episodes,
-        episodes_per_s=episodes / seconds,
-        video=None if video_out is None else str(video_out),
-        action_change=_action_change(finished),
-        **_measured(task, colors, finished),
-    )
+    with Simulators(sim.workers(task, episodes)) as simulators:
+        for first in range(0, episodes, at_once):
+            numbers = range(first, min(episodes, first + at_once))
+            # The first episodes are filmed.
+            group = _begun(acting, simulators, seed, stream, numbers, colors, clips)
+            for _ in _play(acting, simulators, group, pace, first, seed):
+                longest = group[0].env.spec.max_steps
+                # An episode that ended early counts in full, so that the progress reaches its end.
+                in_group = sum(longest if e.done else e.steps for e in group)
+                done = first * longest + in_group
+                on_event(Progress(stage, done, episodes * longest, "steps"))
+            finished += group
+        seconds = time.perf_counter() - started
+        if video_out is not None:
+            media.save_video([_clip(e) for e in finished[:clips]], video_out)
+        return RolloutReport(
+            task=task,
+            episodes=episodes,
+            episodes_per_s=episodes / seconds,
+            video=None if video_out is None else str(video_out),
+            action_change=_action_change(finished),
+            **_measured(task, colors, finished),
+        )
 
 
 def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int) -> float:
@@ -207,12 +209,14 @@ def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int
     The first one also pays for what is done once.
     """
     numbers = range(min(episodes, sim.lockstep(acting.task)))
-    group = [_begin(acting, seed, stream, i, colors, filmed=False) for i in numbers]
-    before, taken, seconds, started = 0, 0, 0.0, time.perf_counter()
-    for _ in itertools.islice(_play(acting, group, _Pace(acting.replan), 0, seed), 2):
-        now, steps = time.perf_counter(), sum(e.steps for e in group)
-        seconds, taken = now - started, steps - before
-        started, before = now, steps
+    with Simulators(sim.workers(acting.task, episodes)) as simulators:
+        group = _begun(acting, simulators, seed, stream, numbers, colors, filmed=0)
+        before, taken, seconds, started = 0, 0, 0.0, time.perf_counter()
+        playing = _play(acting, simulators, group, _Pace(acting.replan), 0, seed)
+        for _ in itertools.islice(playing, 2):
+            now, steps = time.perf_counter(), sum(e.steps for e in group)
+            seconds, taken = now - started, steps - before
+            started, before = now, steps
     return seconds * episodes * group[0].env.spec.max_steps / taken
 
 
@@ -280,11 +284,37 @@ def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
     return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
 
 
+def _begun(
+    acting: Acting,
+    simulators: Simulators,
+    seed: int,
+    stream: int,
+    numbers: Sequence[int],
+    colors: str,
+    filmed: int,
+) -> list[_PlayedEpisode]:
+    """The episodes of these numbers at their beginning, those below `filmed` for a video."""
+    begun: dict[int, _PlayedEpisode] = {}
+
+    def begin(number: int) -> None:
+        shown = number < filmed
+        begun[number] = _begin(acting, simulators, seed, stream, number, colors, shown)
+
+    simulators.each(begin, numbers)
+    return [begun[number] for number in numbers]
+
+
 def _begin(
-    acting: Acting, seed: int, stream: int, number: int, colors: str, filmed: bool
+    acting: Acting,
+    simulators: Simulators,
+    seed: int,
+    stream: int,
+    number: int,
+    colors: str,
+    filmed: bool,
 ) -> _PlayedEpisode:
     published = (seed, stream) == (EVALUATION_SEED, EVALUATION)
-    env = sim.make(acting.task, number=number, seen_by=acting.cameras, published=published)
+    env = simulators.make(Wanted(acting.task, number, acting.cameras, published))
     observation = env.reset(episode_rng(seed, stream, number), TARGET_COLORS[colors])
     moments = [media.Moment(observation.image, "start")] if filmed else None
     averaged = None if acting.ensemble is None else TemporalEnsemble(acting.ensemble)
@@ -292,7 +322,12 @@ def _begin(
 
 
 def _play(
-    acting: Acting, group: list[_PlayedEpisode], pace: _Pace, first: int, seed: int
+    acting: Acting,
+    simulators: Simulators,
+    group: list[_PlayedEpisode],
+    pace: _Pace,
+    first: int,
+    seed: int,
 ) -> Iterator[None]:
     """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
     # Seeded by the group, so that the noise does not depend on how the groups before it ended.
@@ -301,8 +336,10 @@ def _play(
         continued = _continued(active, pace)
         seen = [e.observation for e in active]
         chunks = _decide(acting, seen, generator, continued)  # [B, H, A]
-        for episode, chunk in zip(active, chunks, strict=True):
-            _execute(episode, _to_execute(episode, chunk, pace))
+        simulators.each(
+            lambda decided: _execute(decided[0], _to_execute(*decided, pace)),
+            list(zip(active, chunks, strict=True)),
+        )
         yield
 
 

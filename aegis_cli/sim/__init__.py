@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Collection, Sequence
 from importlib import import_module
 
+from aegis_cli.common import processes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import libero_table, metaworld_table
 from aegis_cli.sim.contract import LIBERO, METAWORLD, SUITE, TOP, TaskEnv, TaskSpec
@@ -46,6 +47,15 @@ def of_datasets(name: str) -> TaskSpec | None:
 def lockstep(name: str) -> int:
     """How many of the task's episodes are played at once; a simulator of LIBERO's is large."""
     return 10 if name.startswith(LIBERO) else 64
+
+
+def workers(name: str, episodes: int) -> int:
+    """How many processes simulate the task's episodes at once; 1: that which asks alone.
+
+    A step of LIBERO's takes tens of milliseconds of Python, and other tasks do not repay a process.
+    """
+    at_once = min(episodes, lockstep(name))
+    return processes.worker_count(at_once) if name.startswith(LIBERO) else 1
 
 
 def members(name: str) -> tuple[str, ...]:

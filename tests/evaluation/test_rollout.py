@@ -435,6 +435,18 @@ def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[S
     assert paths[:3] == paths[3:] and len(set(paths[0])) > 5  # the same steps, and it moves
 
 
+def test_several_processes_play_the_same_episodes(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bytes of the video."""
+    alone = rollout.run(run_folder, None, 3, "seen", tmp_path / "v.mp4")
+    film = (tmp_path / "v.mp4").read_bytes()
+    monkeypatch.setattr(sim, "workers", lambda *_: 2)
+    shared = rollout.run(run_folder, None, 3, "seen", tmp_path / "v.mp4")
+    assert timeless(alone) == timeless(shared)
+    assert (tmp_path / "v.mp4").read_bytes() == film
+
+
 @pytest.mark.parametrize(("rate", "warnings"), [(None, 0), (10.0, 0), (30.0, 1)])
 def test_steps_of_another_length_than_the_trainings_are_warned_of(
     rate: float | None, warnings: int, run_folder: Path
@@ -494,9 +506,10 @@ def test_another_seed_plays_other_episodes(aegis, run_folder: Path) -> None:
         begun: list[tuple[int, int]] = []
         begin = acting._begin
 
-        def noted(played: acting.Acting, seed: int, stream: int, number: int, *rest: Any) -> Any:
+        def noted(*given: Any) -> Any:
+            _, _, seed, _, number, *_ = given
             begun.append((seed, number))
-            return begin(played, seed, stream, number, *rest)
+            return begin(*given)
 
         patch.setattr(acting, "_begin", noted)
         assert aegis("rollout", run_folder, "--episodes", 2, "--seed", 7)[0] == 0

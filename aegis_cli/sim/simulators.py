@@ -1,0 +1,139 @@
+"""A task's environments in this process, or shared out among processes that simulate at once."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeVar
+
+import numpy as np
+
+from aegis_cli import sim
+from aegis_cli.common.processes import WorkerPool
+from aegis_cli.sim.contract import Observation, Step, TaskEnv, TaskSpec
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """An environment that is wanted: the arguments of `sim.make`."""
+
+    task: str
+    number: int
+    seen_by: tuple[str, ...] = ()
+    published: bool = False
+
+    def made(self) -> TaskEnv:
+        """A new one, in this process."""
+        return sim.make(
+            self.task, number=self.number, seen_by=self.seen_by, published=self.published
+        )
+
+
+class Simulators:
+    """What makes a task's environments, for the length of a `with` block.
+
+    An environment is the same in whichever process it is.
+
+    Args:
+        workers: processes that simulate; 1: this process alone.
+
+    Raises:
+        AegisError: at the end of the block, if a process died in it.
+    """
+
+    def __init__(self, workers: int) -> None:
+        fix = "there may be too little memory: set OMP_NUM_THREADS, or see ulimit -v"
+        # An environment stays in one process, so that each is a pool of its own.
+        several = range(workers) if workers > 1 else ()
+        self._pools = [WorkerPool(1, "a simulating process", fix) for _ in several]
+        self._turns = itertools.count()
+        self._threads = ThreadPoolExecutor(max(1, workers))
+        self._open = ExitStack()
+
+    def __enter__(self) -> Simulators:
+        self._open.enter_context(self._threads)
+        for pool in self._pools:
+            self._open.enter_context(pool)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._open.__exit__(kind, error, trace)
+
+    def make(self, wanted: Wanted) -> TaskEnv:
+        """A new environment; the processes take turns."""
+        turn = next(self._turns)
+        if not self._pools:
+            return wanted.made()
+        return _Elsewhere(self._pools[turn % len(self._pools)], turn, wanted)
+
+    def each(self, act: Callable[[Item], object], items: Iterable[Item]) -> None:
+        """Call `act` with each item: at once, where there are several processes."""
+        if not self._pools:
+            for item in items:
+                act(item)
+            return
+        for _ in self._threads.map(act, items):
+            pass
+
+
+class _Elsewhere:
+    """A `contract.TaskEnv` in another process, which knows it by a key."""
+
+    def __init__(self, pool: WorkerPool, key: int, wanted: Wanted) -> None:
+        self._pool, self._key = pool, key
+        self.spec: TaskSpec
+        self.spec = pool.submit(_make, key, wanted).result()
+        self.target_color: str | None = None
+
+    def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
+        seen, self.target_color = self._pool.submit(
+            _reset, self._key, rng, tuple(target_colors)
+        ).result()
+        return seen
+
+    def step(self, action: np.ndarray, look: bool = True) -> Step:
+        return self._call("step", action, look)
+
+    def expert_action(self) -> np.ndarray:
+        return self._call("expert_action")
+
+    def distance(self) -> float | None:
+        return self._call("distance")
+
+    def target_circle(self) -> tuple[float, float, float] | None:
+        return self._call("target_circle")
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._pool.submit(_call, self._key, name, *arguments).result()
+
+
+# --- in a process ---------------------------------------------------------------------------------
+
+_HERE: dict[int, TaskEnv] = {}
+
+
+def _make(key: int, wanted: Wanted) -> TaskSpec:
+    _HERE[key] = wanted.made()
+    return _HERE[key].spec
+
+
+def _reset(
+    key: int, rng: np.random.Generator, target_colors: Sequence[str]
+) -> tuple[Observation, str | None]:
+    seen = _HERE[key].reset(rng, target_colors)
+    return seen, _HERE[key].target_color
+
+
+def _call(key: int, name: str, *arguments: Any) -> Any:
+    return getattr(_HERE[key], name)(*arguments)

@@ -1,0 +1,68 @@
+"""Environments in processes of their own: the same ones, and what becomes of errors."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aegis_cli import sim
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.palette import SEEN
+from aegis_cli.sim.contract import EVALUATION, episode_rng
+from aegis_cli.sim.simulators import Simulators, Wanted
+
+
+def test_an_environment_is_the_same_in_another_process() -> None:
+    def shown(env: Any) -> list[Any]:
+        seen = env.reset(episode_rng(3, EVALUATION, 1), SEEN)
+        found = [env.spec, env.target_color, env.target_circle(), seen.image, seen.proprio]
+        for look in (False, True):
+            action = env.expert_action()
+            step = env.step(action, look)
+            found += [action, step.done, step.success, env.distance()]
+        return [*found, step.observation.image, step.observation.instruction]
+
+    here = shown(sim.make("point"))
+    with Simulators(2) as simulators:
+        envs = [simulators.make(Wanted("point", number)) for number in range(3)]
+        processes = {env._pool.submit(os.getpid).result() for env in envs}
+        assert len(processes) == 2 and os.getpid() not in processes
+        for env in envs:
+            for own, other in zip(here, shown(env), strict=True):
+                np.testing.assert_equal(other, own)
+    assert not multiprocessing.active_children()
+
+
+def test_of_one_process_it_is_this_one() -> None:
+    with Simulators(1) as simulators:
+        made = simulators.make(Wanted("point", 0))
+        assert type(made) is type(sim.make("point"))
+        done: list[int] = []
+        simulators.each(done.append, range(5))
+    assert done == [0, 1, 2, 3, 4]
+
+
+def test_an_error_there_is_an_error_here() -> None:
+    with Simulators(2) as simulators:
+        env = simulators.make(Wanted("point", 0))
+        env.reset(episode_rng(3, EVALUATION, 1), SEEN)
+        for number in range(2):  # the process goes on
+
+            def act(_: int) -> None:
+                env.step(np.array([np.nan, 0.0]))
+
+            with pytest.raises(AegisError, match="2 finite numbers"):
+                simulators.each(act, range(number + 1))
+
+
+def test_a_process_that_dies_is_named() -> None:
+    with pytest.raises(AegisError, match="a simulating process died"), Simulators(2) as simulators:
+        envs = [simulators.make(Wanted("point", number)) for number in range(2)]
+        os.kill(envs[1]._pool.submit(os.getpid).result(), signal.SIGKILL)
+        simulators.each(lambda env: env.reset(episode_rng(3, EVALUATION, 1), SEEN), envs)
+    assert not multiprocessing.active_children()
