@@ -109,6 +109,7 @@ class RolloutFigures:
     outcomes: str | None = None
     wrong_target: Number | None = None
     final_distance_m: Number | None = None
+    suites: dict[str, PartFigures] | None = None
     tasks: dict[str, PartFigures] | None = None
     target_colors: dict[str, PartFigures] | None = None
     instructions: dict[str, PartFigures] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,9 +46,9 @@ class RolloutReport:
     """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
 
     The distance is the mean at the episodes' ends; only a task with coloured targets has one.
-    `tasks` has the success in each task of a set. Where the episodes differ in them,
-    `target_colors` has that by the target's colour, and `instructions` that by the instruction, in
-    which `{color}` stands for the colour.
+    `tasks` has the success in each task of a set, and `suites` in each suite of several. Where the
+    episodes differ in them, `target_colors` has that by the target's colour, and `instructions`
+    that by the instruction, in which `{color}` stands for the colour.
 
     `outcomes` has one character per episode, 1 for a success and 0 otherwise.
 
@@ -66,6 +66,7 @@ class RolloutReport:
     outcomes: str | None = None
     wrong_target: float | None = None
     final_distance_m: float | None = None
+    suites: dict[str, PartSuccess] | None = None
     tasks: dict[str, PartSuccess] | None = None
     target_colors: dict[str, PartSuccess] | None = None
     instructions: dict[str, PartSuccess] | None = None
@@ -243,9 +244,22 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
         # its turn.
         turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
         found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
+        found["suites"] = _by_suite(task, turns)
     found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
     found["instructions"] = _apart(finished, _instruction)
     return found
+
+
+def _by_suite(
+    task: str, turns: Mapping[str, Sequence[_PlayedEpisode]]
+) -> dict[str, PartSuccess] | None:
+    """The success in each suite of a set, of the episodes by their tasks; None for one suite."""
+    found = {}
+    for suite in sim.suites(task):
+        played = [episode for name in sim.members(suite) for episode in turns[name]]
+        if played:
+            found[suite] = _success(played)
+    return found or None
 
 
 def _distance(episode: _PlayedEpisode) -> float:

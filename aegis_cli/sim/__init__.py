@@ -65,6 +65,11 @@ def members(name: str) -> tuple[str, ...]:
     return libero_table.members(name) if name.startswith(LIBERO) else (name,)
 
 
+def suites(name: str) -> tuple[str, ...]:
+    """The suites that a set of several is of, as LIBERO's four are; empty for any other."""
+    return libero_table.suites(name) if name.startswith(LIBERO) else ()
+
+
 def member(name: str, number: int) -> str:
     """The task of the episode of that number: a set's tasks take turns."""
     tasks = members(name)

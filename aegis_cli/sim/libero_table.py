@@ -57,6 +57,11 @@ def members(name: str) -> tuple[str, ...]:
     return tuple(f"{name}-{number}" for number in range(count))
 
 
+def suites(name: str) -> tuple[str, ...]:
+    """The suites of the set of all four; empty for one of them, or a task."""
+    return tuple(LIBERO + suite for suite in _REPORTED) if name == LIBERO + ALL else ()
+
+
 def place(task: str) -> tuple[str, int]:
     """The suite of a single task, and its number there."""
     suite, _, number = task.removeprefix(LIBERO).partition("-")

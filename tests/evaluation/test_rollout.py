@@ -185,6 +185,21 @@ def test_successes_are_told_by_colour_and_by_instruction(
     assert sum(found.episodes for found in report.instructions.values()) == 24
 
 
+def test_successes_are_told_by_suite(
+    puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a set as large as LIBERO's four suites: every third episode is of the second suite."""
+    members = {"point": ("a", "b", "c"), "one": ("a", "c"), "two": ("b",)}
+    monkeypatch.setattr(sim, "members", members.__getitem__)
+    monkeypatch.setattr(sim, "suites", lambda _: ("one", "two"))
+    puppet(expert)
+    report = rollout.run(Path("any"), None, 7, "seen")
+    assert {name: found.episodes for name, found in report.suites.items()} == {"one": 5, "two": 2}
+    won = [char == "1" for char in report.outcomes]
+    assert report.suites["two"].success == np.mean([won[1], won[4]])
+    assert report.suites["one"].success == np.mean([won[i] for i in (0, 2, 3, 5, 6)])
+
+
 def test_episodes_that_are_all_of_one_kind_are_not_told_apart(
     puppet: Callable[..., Puppet],
 ) -> None:

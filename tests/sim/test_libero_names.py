@@ -32,6 +32,8 @@ def test_every_suite_has_its_tasks_by_their_numbers() -> None:
 def test_all_is_the_four_suites_that_papers_report() -> None:
     of_suites = [task for suite in SUITES[:-1] for task in sim.members(f"libero/{suite}")]
     assert list(sim.members("libero/all")) == of_suites and len(of_suites) == 40
+    assert [suite.removeprefix("libero/") for suite in sim.suites("libero/all")] == [*SUITES[:-1]]
+    assert not any(map(sim.suites, ("libero/goal", "libero/10-3", "metaworld/mt10", "reach")))
     assert table.spec("libero/all").max_steps == 520  # an episode of the longest
     assert [sim.member("libero/all", n) for n in (0, 39, 40)] == [
         "libero/spatial-0",

@@ -183,10 +183,12 @@ def measured(report: Any) -> RenderableType:
     """
     found = {name: value for name, value in _scalars(report).items() if value is not None}
     # What has a table below is taken out of the lines above.
-    tasks = found.pop("tasks", None)
+    suites, tasks = found.pop("suites", None), found.pop("tasks", None)
     colors = found.pop("target_colors", None)
     instructions = _worst_first(found.pop("instructions", {}))
     tables: list[RenderableType] = []
+    if suites:
+        tables.append(_by_part("Suite", suites))
     if tasks:
         tables.append(_by_part("Task", tasks))
     if colors:
