@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import multiprocessing
 from collections.abc import Collection, Sequence
 from importlib import import_module
 
@@ -53,9 +54,11 @@ def workers(name: str, episodes: int) -> int:
     """How many processes simulate the task's episodes at once; 1: that which asks alone.
 
     A step of LIBERO's takes tens of milliseconds of Python, and other tasks do not repay a process.
+    One of a study's processes simulates alone, since the others take the other cores.
     """
-    at_once = min(episodes, lockstep(name))
-    return processes.worker_count(at_once) if name.startswith(LIBERO) else 1
+    if not name.startswith(LIBERO) or multiprocessing.parent_process() is not None:
+        return 1
+    return processes.worker_count(min(episodes, lockstep(name)))
 
 
 def members(name: str) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import pytest
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import SEEN
+from aegis_cli.common.processes import WorkerPool
 from aegis_cli.sim.contract import EVALUATION, episode_rng
 from aegis_cli.sim.simulators import Simulators, Wanted
 
@@ -45,6 +46,18 @@ def test_of_one_process_it_is_this_one() -> None:
         done: list[int] = []
         simulators.each(done.append, range(5))
     assert done == [0, 1, 2, 3, 4]
+
+
+def test_libero_alone_repays_processes_and_those_of_a_study_start_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 16)
+    assert [sim.workers("libero/object", episodes) for episodes in (1, 4, 500)] == [1, 4, 10]
+    assert {sim.workers(name, 500) for name in ("reach", "metaworld/mt4")} == {1}
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert sim.workers("libero/object", 500) == 2
+    with WorkerPool(1, "a process", "") as pool:
+        assert pool.submit(sim.workers, "libero/object", 500).result() == 1
 
 
 def test_an_error_there_is_an_error_here() -> None:
