@@ -45,7 +45,7 @@ from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import Demos, RobotStreamRecipe
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
-from aegis_cli.training import assemble, checkpoint, freezing, train
+from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
 from aegis_cli.training.up_to_date import Made, StageRecords
 
@@ -265,7 +265,10 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     source = questions(recipe, on_event)  # a bad set shows before anything is recorded
     gl.check()
     for task in recipe.tasks:
-        sim.check_recordable(task)
+        if recipe.demos.paths is None:
+            sim.check_recordable(task)
+        else:
+            sim.check(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
     _check_freeze(recipe, backbone, on_event)
     for task in recipe.tasks:
@@ -516,9 +519,12 @@ def _demos(
         path,
         recipe.train.validation_share,
         recipe.seed,
+        recipe.demos.selection,
         image_size=backbone.image_size,
         on_event=on_event,
     )
+    if found.task is None:
+        found = loading.of_named_task(found, task)
     if found.task != task:
         of = f"'{found.task}'" if found.task else "no simulated task"
         raise AegisError(

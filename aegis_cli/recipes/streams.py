@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aegis_cli.data.selection import ACTION, STATE, Selection
 from aegis_cli.data.streams.names import STREAMS
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
@@ -167,6 +168,30 @@ class RobotDemos:
         doc="Demonstrations to use instead of recording: one file or folder per task, in the "
         "order of `tasks`.",
     )
+    camera: str | tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        default=None,
+        later=True,
+        doc="Camera of LeRobot datasets that have several; a list gives the policy one image of "
+        "each.",
+    )
+    state: str | tuple[str, ...] = key(
+        NOT_EMPTY,
+        default=STATE,
+        later=True,
+        doc="Feature of LeRobot datasets that has the robot's positions; a list joins several.",
+    )
+    action: str | tuple[str, ...] = key(
+        NOT_EMPTY,
+        default=ACTION,
+        later=True,
+        doc="Feature of LeRobot datasets that has the actions; a list joins several.",
+    )
+
+    @property
+    def selection(self) -> Selection:
+        """What is learned from the demonstrations in `paths`."""
+        return Selection(self.camera, state=self.state, action=self.action)
 
 
 @section

@@ -13,6 +13,7 @@ from aegis_cli.common.events import OnEvent
 from aegis_cli.continual import robots
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.data import demonstrations
+from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.models import backbones
 from aegis_cli.recipes import (
@@ -116,7 +117,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         self._records = StageRecords(folder, on_event)
         self._fingerprints: dict[str, str] = {}
         self._sources: dict[Probe, robots.Questions] = {}
-        self._digests: dict[str, str] = {}
+        self._digests: dict[tuple[str, Selection], str] = {}
 
     def begin_anew(self) -> None:
         """Let everything be recorded and learned again."""
@@ -132,7 +133,8 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         # To load a backbone takes long, and many cells begin with the same one.
         if recipe.backbone not in self._fingerprints:
             self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
-        given = [self._digest(path) for path in recipe.demos.paths or ()]
+        chosen = recipe.demos.selection
+        given = [self._digest(path, chosen) for path in recipe.demos.paths or ()]
         state = self.questions(recipe.probe).state
         return cell_key(cell, self._fingerprints[recipe.backbone], given, state)
 
@@ -155,11 +157,12 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         made = [robots.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
         return tuple(str(one.path) for one in made)
 
-    def _digest(self, path: str) -> str:
+    def _digest(self, path: str, chosen: Selection) -> str:
         """What changes when given demonstrations do."""
-        if path not in self._digests:
-            self._digests[path] = demonstrations.digest(demonstrations.at(path))
-        return self._digests[path]
+        if (path, chosen) not in self._digests:
+            found = demonstrations.digest(demonstrations.at(path), chosen)
+            self._digests[path, chosen] = found
+        return self._digests[path, chosen]
 
     def learned(self, cell: Cell[RobotStreamRecipe]) -> RobotStreamRecipe:
         """The recipe that is learned, on validation episodes if the cell is of the tuning."""

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 import torch
@@ -144,7 +145,7 @@ def load_demonstrations(
         check_text=backbone.check_prompt,
     )
     if found.task is None:
-        found = _of_named_task(found, recipe)
+        found = of_named_task(found, recipe.task, recipes.selected(recipe).get("rename", {}))
     elif found.task != recipe.task:
         recorded = sim.of_datasets(recipe.task) is None
         raise AegisError(
@@ -159,15 +160,20 @@ def load_demonstrations(
     return found
 
 
-def _of_named_task(
-    found: demonstrations.Demonstrations, recipe: Recipe
+def of_named_task(
+    found: demonstrations.Demonstrations,
+    named: str,
+    rename: Mapping[str, str] = MappingProxyType({}),
 ) -> demonstrations.Demonstrations:
-    """Demonstrations of LIBERO's where the recipe names them so, for they do not say it themselves.
+    """Demonstrations of LIBERO's where a recipe names them so, for they do not say it themselves.
+
+    Args:
+        named: the recipe's task.
+        rename: what cameras have been called anew, by their names in the data set.
 
     Raises:
         AegisError: demonstrations of another robot than the task's, or by other cameras.
     """
-    named = recipe.task
     spec = sim.of_datasets(named)
     if spec is None:
         return found
@@ -181,7 +187,7 @@ def _of_named_task(
             "delete task from the recipe if they are another robot's, or choose their columns by "
             "demos.state and demos.action",
         )
-    meta = {"cameras": found.cameras, **recipes.selected(recipe)}
+    meta = {"cameras": found.cameras, "rename": rename}
     checkpoint.cameras_of(cast(PolicyMeta, meta), named)
     return dataclasses.replace(found, task=named)
 

@@ -13,12 +13,14 @@ from samples.lerobot import READABLE, episodes, frame_cache, save  # noqa: F401
 from samples.training_runs import Start
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import ignore
+from aegis_cli.continual import robots
 from aegis_cli.data import demonstrations
-from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import rollout
+from aegis_cli.models import backbones
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
-from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.recipes import Demos, Recipe, RobotDemos, RobotStreamRecipe
 from aegis_cli.sim import libero_table as table
 from aegis_cli.training import checkpoint, loading
 
@@ -85,9 +87,9 @@ def test_cameras_of_other_names_are_refused_until_they_are_renamed(
     both = ("front", "hand")
 
     def load(**demos: Any) -> demonstrations.Demonstrations:
-        return loading._of_named_task(
-            demonstrations.load(folder, 0.3, 0, Selection(**demos)), of(recipe, **demos)
-        )
+        selected = of(recipe, **demos).demos.selection
+        found = demonstrations.load(folder, 0.3, 0, selected)
+        return loading.of_named_task(found, "libero/object", demos.get("rename", {}))
 
     with pytest.raises(AegisError, match="2 cameras: ") as caught:
         load(camera=both)
@@ -105,6 +107,32 @@ def test_a_camera_that_is_renamed_away_is_still_the_tasks(tmp_path: Path) -> Non
     assert demonstrations.playable_task(folder, seen_by, "libero/10", rename) == "libero/10"
     meta = cast(PolicyMeta, {"cameras": seen_by, "rename": rename})
     assert checkpoint.cameras_of(meta, "libero/10") == ("image", "image2")
+
+
+def test_a_stream_learns_suite_after_suite(tiny_folder: Path, tmp_path: Path) -> None:
+    """Each task has a data set, of which the recipe chooses camera and features."""
+    paths = tuple(str(libero(tmp_path / name, ("image", "image2"))) for name in ("a", "b"))
+    recipe = RobotStreamRecipe(
+        name="x",
+        tasks=("libero/object", "libero/goal"),
+        backbone=str(tiny_folder),
+        demos=RobotDemos(paths=paths, camera="image"),
+    )
+    backbone = backbones.load(str(tiny_folder))
+
+    def loaded(number: int, **changes: Any) -> demonstrations.Demonstrations:
+        changed = dataclasses.replace(recipe, **changes)
+        return robots._demos(changed, number, backbone, tmp_path / "run", ignore)
+
+    for number, task in enumerate(recipe.tasks):
+        found = loaded(number)
+        assert (found.task, found.cameras) == (task, ("observation.images.image",))
+    with pytest.raises(AegisError, match="has 2 cameras"):
+        loaded(0, demos=RobotDemos(paths=paths))
+    with pytest.raises(AegisError, match="demonstrations of no simulated task"):
+        loaded(0, tasks=("point", "reach"))
+    with pytest.raises(AegisError, match="7 positions and 7 actions for task: libero/object"):
+        loaded(0, demos=dataclasses.replace(recipe.demos, state="action"))
 
 
 def test_a_policy_of_one_suite_acts_in_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
