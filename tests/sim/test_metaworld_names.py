@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from samples.command import python, refused
-from samples.metaworld import MISSING
 
 from aegis_cli import recipes, sim
 from aegis_cli.common.errors import AegisError
@@ -129,17 +128,23 @@ def test_an_unknown_name_leads_to_a_close_one(name: str, says: str) -> None:
     assert f"'{name}'" in caught.value.found and says in caught.value.fix
 
 
-@pytest.mark.skipif(not MISSING, reason="MetaWorld is installed")
+@pytest.fixture
+def without_metaworld(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine that has none, also where it is installed and imported."""
+    monkeypatch.delitem(sys.modules, "aegis_cli.sim.metaworld", raising=False)
+    monkeypatch.setitem(sys.modules, "metaworld", None)
+    monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)
+
+
+@pytest.mark.usefixtures("without_metaworld")
 def test_without_the_package_the_command_that_installs_it_is_named(aegis, tmp_path: Path) -> None:
     message = refused(aegis("demos", "metaworld/button-press", "--out", tmp_path / "d.safetensors"))
     assert "pip install 'aegis-vla[metaworld]'" in message
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_package_is_an_error_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "aegis_cli.sim.metaworld", raising=False)
-    monkeypatch.setitem(sys.modules, "metaworld", None)
-    monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)
+@pytest.mark.usefixtures("without_metaworld")
+def test_a_missing_package_is_an_error_that_says_so() -> None:
     with pytest.raises(AegisError) as caught:
         sim.check("metaworld/mt4")
     assert caught.value.fix == "pip install 'aegis-vla[metaworld]'"
