@@ -15,9 +15,10 @@ from aegis_cli.core import ensemble as temporal
 from aegis_cli.evaluation import results
 from aegis_cli.models.acting import DEFAULT, EVALUATION_SEED, Acting, RolloutReport, play
 from aegis_cli.models.policy import Policy
-from aegis_cli.sim.contract import EVALUATION
+from aegis_cli.sim.contract import EVALUATION, TaskSpec
 from aegis_cli.training import checkpoint
 
+_LIBERO = "libero/spatial"
 Load = Callable[[Path, str | None], Acting]
 
 
@@ -132,19 +133,29 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
             found = f"task '{asked}' for a policy trained on '{trained}'"
             raise AegisError(found, "the task it was trained on", f"--task {trained}")
         return asked or trained
+    shape = policy.expert.shape
+    own = (shape.proprio, shape.actions)
     if asked is None:
-        found = "a policy trained on a dataset of no simulated task"
+        libero = sim.of_datasets(_LIBERO)
+        assert libero is not None
+        likely = _LIBERO if own == _sizes(libero) else next(iter(sim.TASKS))
         raise AegisError(
-            found, "a task whose positions and actions it knows", f"--task {next(iter(sim.TASKS))}"
+            "a policy trained on a dataset of no simulated task",
+            "a task whose positions and actions it knows",
+            f"--task {likely}",
         )
-    spec, shape = sim.make(asked).spec, policy.expert.shape
-    sizes, own = (len(spec.proprio_names), len(spec.action_names)), (shape.proprio, shape.actions)
+    sizes = _sizes(sim.make(asked).spec)
     if sizes != own:
         found = f"a policy of {own[0]} positions and {own[1]} actions for task '{asked}'"
         raise AegisError(
             found, f"{sizes[0]} and {sizes[1]}, as the task has", "roll it out on its own robot"
         )
     return asked
+
+
+def _sizes(spec: TaskSpec) -> tuple[int, int]:
+    """How many positions and actions a task has."""
+    return len(spec.proprio_names), len(spec.action_names)
 
 
 def _alike(trained: str, asked: str) -> bool:

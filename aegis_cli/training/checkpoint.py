@@ -480,13 +480,14 @@ def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     if len(found) == 1 and found[0] not in known[1:]:
         return ()  # whatever the only camera is called
     if not set(found) <= {*known}:
-        expected = "cameras of a simulated task"
+        expected, fix = "cameras of a simulated task", _OTHER_CAMERAS
+        if task is not None:
+            expected = f"cameras of '{task}': {', '.join(known)}"
+            if sim.of_datasets(task) is not None:
+                renamed = f"--set 'demos.rename={{{found[0]}: {known[0]}}}'"
+                fix = f"give them its names in training: {renamed}"
         raise AegisError(
-            f"a policy trained on {len(named)} cameras: {', '.join(named)}",
-            expected if task is None else f"cameras of '{task}': {', '.join(known)}",
-            _OTHER_CAMERAS
-            if task is None or sim.of_datasets(task) is None
-            else f"give them its names: --set 'demos.rename={{{found[0]}: {known[0]}}}'",
+            f"a policy trained on {len(named)} cameras: {', '.join(named)}", expected, fix
         )
     return found
 

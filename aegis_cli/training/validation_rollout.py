@@ -126,7 +126,8 @@ def chosen(
             f"rollout.while_training: {count} with demonstrations of no simulated task",
             "demonstrations of a task in which the policy can act",
             "delete rollout.while_training; --set train.validate_actions=500 shows how far the "
-            "policy's actions are from held-out ones",
+            "policy's actions are from held-out ones; or name the suite as the recipe's task, if "
+            "they are LIBERO's",
         )
     cameras = checkpoint.cameras_of(meta, task)
     if ranks.first:  # the others never act

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from samples.libero import needs_libero
 from samples.metaworld import needs_metaworld
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import COLORS, HELD_OUT, RGB, SEEN
-from aegis_cli.sim import TASKS, has_colors, make
+from aegis_cli.sim import TASKS, has_colors, make, of_datasets
 from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION, Step, TaskEnv, episode_rng
 
 VOCABULARY = set("move go point touch reach find push drive bring put".split())
@@ -27,6 +28,7 @@ METAWORLD_TASKS = (
     ("metaworld/drawer-open", 0),
     ("metaworld/mt4", 2),
 )
+LIBERO_TASKS = (("libero/goal", 2),)
 
 
 @dataclass(frozen=True)
@@ -50,17 +52,25 @@ def env(request: pytest.FixtureRequest) -> TaskEnv:
     params=[
         *(Made(name) for name in (*sorted(TASKS), *SUITE_TASKS)),
         *(pytest.param(Made(*task), marks=needs_metaworld) for task in METAWORLD_TASKS),
+        *(pytest.param(Made(*task), marks=needs_libero) for task in LIBERO_TASKS),
     ],
     ids=lambda made: f"{made.name}-{made.number}" if made.number else made.name,
 )
 def made(request: pytest.FixtureRequest) -> Made:
-    """Our own tasks, and some of the suite's and of MetaWorld's."""
+    """Our own tasks, and some of the suite's, of MetaWorld's and of LIBERO's."""
     return request.param
 
 
 @pytest.fixture
 def any_env(made: Made) -> TaskEnv:
     return made.another()
+
+
+def an_action(env: TaskEnv) -> np.ndarray:
+    """The expert's; of a task that has none, always the same push."""
+    if of_datasets(env.spec.name) is None:
+        return env.expert_action()
+    return np.linspace(-1, 1, len(env.spec.action_names), dtype=np.float32)
 
 
 def start(env: TaskEnv, i: int = 0, colors: tuple[str, ...] = COLORS):
@@ -104,15 +114,14 @@ def test_unknown_task_names_the_close_one() -> None:
 def test_shapes_are_the_specs(any_env: TaskEnv) -> None:
     env, spec = any_env, any_env.spec
     seen = start(env)
-    step = env.step(env.expert_action())
+    step = env.step(an_action(env))
+    side = 64 if of_datasets(spec.name) is None else 256
     for observation in (seen, step.observation):
-        assert observation.image.shape == (64, 64, 3) and observation.image.dtype == np.uint8
+        assert observation.image.shape == (side, side, 3) and observation.image.dtype == np.uint8
         assert observation.proprio.shape == (len(spec.proprio_names),)
         assert observation.proprio.dtype == np.float32
-    assert (
-        env.expert_action().shape == (len(spec.action_names),)
-        and env.expert_action().dtype == np.float32
-    )
+    action = an_action(env)
+    assert action.shape == (len(spec.action_names),) and action.dtype == np.float32
     assert len(set(spec.action_names)) == len(spec.action_names) and len(
         set(spec.proprio_names)
     ) == len(spec.proprio_names)
@@ -158,23 +167,23 @@ def test_same_seed_same_episode(any_env: TaskEnv, made: Made) -> None:
         assert a.instruction == b.instruction
         np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_array_equal(a.proprio, b.proprio)
-        action = env.expert_action()
+        action = an_action(env)
         a, b = env.step(action).observation, other.step(action).observation
 
 
 def test_a_used_environment_starts_like_a_new_one(any_env: TaskEnv) -> None:
     env = any_env
-    fresh, first = start(env, 5), env.expert_action()
+    fresh, first = start(env, 5), an_action(env)
     start(env, 6)
-    env.step(env.expert_action())
+    env.step(an_action(env))
     if env.spec.measure == "success":
-        finish(env, env.expert_action)
+        finish(env, lambda: an_action(env))
     else:
         finish(env, lambda: np.ones(len(env.spec.action_names)))
     again = start(env, 5)
     np.testing.assert_array_equal(fresh.image, again.image)
     np.testing.assert_array_equal(fresh.proprio, again.proprio)
-    np.testing.assert_array_equal(first, env.expert_action())
+    np.testing.assert_array_equal(first, an_action(env))
 
 
 def test_streams_and_numbers_give_other_episodes(any_env: TaskEnv) -> None:

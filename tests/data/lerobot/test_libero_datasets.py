@@ -93,7 +93,9 @@ def test_cameras_of_other_names_are_refused_until_they_are_renamed(
 
     with pytest.raises(AegisError, match="2 cameras: ") as caught:
         load(camera=both)
-    assert caught.value.fix == "give them its names: --set 'demos.rename={front: image}'"
+    assert (
+        caught.value.fix == "give them its names in training: --set 'demos.rename={front: image}'"
+    )
     renamed = {"front": "image", "hand": "wrist_image"}
     assert load(camera=("image", "wrist_image"), rename=renamed).task == "libero/object"
     assert load(camera="front").task == "libero/object"  # whatever the only camera is called
@@ -144,6 +146,17 @@ def test_a_policy_of_one_suite_acts_in_the_others(monkeypatch: pytest.MonkeyPatc
     for trained, asked in (("libero/object", "reach"), ("metaworld/mt4", "libero/object")):
         with pytest.raises(AegisError, match=f"'{asked}' for a policy trained on '{trained}'"):
             rollout._task(policy, trained, asked)
+
+
+@pytest.mark.parametrize(("sizes", "task"), [((8, 7), "libero/spatial"), ((6, 2), "reach")])
+def test_one_that_knows_no_task_is_told_of_one_that_may_fit(
+    sizes: tuple[int, int], task: str
+) -> None:
+    shape = SimpleNamespace(proprio=sizes[0], actions=sizes[1])
+    policy = cast(Policy, SimpleNamespace(expert=SimpleNamespace(shape=shape)))
+    with pytest.raises(AegisError, match="dataset of no simulated task") as caught:
+        rollout._task(policy, None, None)
+    assert caught.value.fix == f"--task {task}"
 
 
 @pytest.mark.parametrize(("rate", "warned"), [(10.0, False), (20.0, False), (30.0, True)])
