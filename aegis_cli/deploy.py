@@ -450,8 +450,10 @@ def load_policy(
         found = robots.load_policy(folder, task)
         policy = found.policy.to(device)
         policy.acts_in = acts_in
+        # A single picture needs no name.
+        cameras = found.cameras if len(found.cameras) > 1 else ()
         return DeployedPolicy(
-            policy, found.task, (), found.replan, seed, found.sizes, ensemble=ensemble
+            policy, found.task, cameras, found.replan, seed, found.sizes, ensemble=ensemble
         )
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):

@@ -117,11 +117,13 @@ class WorkerPool:
 
     def _stop(self) -> None:
         """End the workers, and let the executor's thread notice it."""
-        own = set(multiprocessing.active_children()) - self._older  # not those of another pool
+        # Not those of another pool, unless it was opened with this one.
+        own = set(multiprocessing.active_children()) - self._older
         for process in own:
             process.terminate()
+        deadline = time.monotonic() + _GRACE_S  # for all of them together
         for process in own:
-            process.join(_GRACE_S)
+            process.join(max(0.0, deadline - time.monotonic()))
             process.kill()
         # A worker may have died while it wrote a result. The executor's thread waits for the rest
         # of it as long as somebody could write it, and this process could.

@@ -530,7 +530,9 @@ def _demos(
         raise AegisError(
             f"demonstrations of {of} in '{path}' for the task '{task}'",
             "one and the same task",
-            f"record with: aegis demos {task}",
+            f"record with: aegis demos {task}"
+            if sim.of_datasets(task) is None
+            else "correct tasks, or demos.paths",
         )
     # An unknown word must end no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)

@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episo
 from aegis_cli.sim.simulators import Simulators, Wanted
 
 EVALUATION_SEED = 0
+_NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default, and the only choice for a task without colours
 
@@ -106,6 +107,11 @@ class _PlayedEpisode:
     def done(self) -> bool:
         return self.last is not None and self.last.done
 
+    def forget_pictures(self) -> None:
+        """Let go of the last ones, which nobody looks at when the episode is over."""
+        self.observation = replace(self.observation, image=_NO_PICTURE, more=())
+        self.last = replace(self.end, observation=None)
+
     @property
     def end(self) -> Step:
         """The last step of an episode that has been played."""
@@ -179,7 +185,7 @@ def play(
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
     clips = 0 if video_out is None else media.CLIPS
     at_once = sim.lockstep(task)  # episodes that share a forward pass
-    with Simulators(sim.workers(task, episodes)) as simulators:
+    with _simulators(acting, episodes) as simulators:
         for first in range(0, episodes, at_once):
             numbers = range(first, min(episodes, first + at_once))
             # The first episodes are filmed.
@@ -190,6 +196,8 @@ def play(
                 in_group = sum(longest if e.done else e.steps for e in group)
                 done = first * longest + in_group
                 on_event(Progress(stage, done, episodes * longest, "steps"))
+            for episode in group:
+                episode.forget_pictures()
             finished += group
         seconds = time.perf_counter() - started
         if video_out is not None:
@@ -204,21 +212,35 @@ def play(
         )
 
 
+def _simulators(acting: Acting, episodes: int) -> Simulators:
+    """What makes the task's environments, in this process or in several.
+
+    Raises:
+        AegisError: a task that cannot be made, before any process starts.
+    """
+    workers = sim.workers(acting.task, episodes)
+    if workers > 1:  # what a benchmark writes or fetches when it is first used, it does once
+        sim.make(acting.task, seen_by=acting.cameras)
+    return Simulators(workers, sim.lockstep(acting.task))
+
+
 def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int) -> float:
     """About how many seconds `play` takes if no episode ends early, by its second chunk.
 
     The first one also pays for what is done once.
     """
     numbers = range(min(episodes, sim.lockstep(acting.task)))
-    with Simulators(sim.workers(acting.task, episodes)) as simulators:
+    placing = time.perf_counter()
+    with _simulators(acting, episodes) as simulators:
         group = _begun(acting, simulators, seed, stream, numbers, colors, filmed=0)
         before, taken, seconds, started = 0, 0, 0.0, time.perf_counter()
+        begun_s = (started - placing) * math.ceil(episodes / len(group))
         playing = _play(acting, simulators, group, _Pace(acting.replan), 0, seed)
         for _ in itertools.islice(playing, 2):
             now, steps = time.perf_counter(), sum(e.steps for e in group)
             seconds, taken = now - started, steps - before
             started, before = now, steps
-    return seconds * episodes * group[0].env.spec.max_steps / taken
+    return begun_s + seconds * episodes * group[0].env.spec.max_steps / taken
 
 
 def _action_change(finished: Sequence[_PlayedEpisode]) -> float | None:

@@ -180,6 +180,8 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
         everything = dataclasses.asdict(recipe)
         own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
         part = {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
+        if chosen := selected(recipe):
+            part["demos"] = chosen
         return part | {"rollout": recorded(recipe.rollout)}
     if isinstance(recipe, StreamRecipe):
         shared = ["stream", "order", "encoder", "seed", "train", "inference"]
@@ -197,7 +199,7 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     return part | {recipe.train.method: {} if own is None else recorded(own)}
 
 
-def selected(recipe: Recipe) -> dict[str, Any]:
+def selected(recipe: Recipe | RobotStreamRecipe) -> dict[str, Any]:
     """What is learned of the demonstrations' frames, as far as it is not at its default."""
     changes = changed(recipe.demos)
     own = ("only", "state", "action", "rename")

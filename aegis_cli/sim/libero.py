@@ -5,18 +5,17 @@ LIBERO has no expert to record: its demonstrations are people's, and come as dat
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import io
 import logging
 import os
 import sys
-import threading
 import warnings
 import weakref
 from collections.abc import Callable, Generator, Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from aegis_cli.sim.contract import Observation, Step, checked
 SIZE = 256  # pixels per side of a picture, as in the data sets
 _SETTLING = 10  # steps of rest before an episode begins, in which objects fall onto the table
 _REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # no movement, and an open gripper
+_TRIES = 20  # to place a scene's objects
 _NOTHING = np.zeros((SIZE, SIZE, 3), np.uint8)
 
 
@@ -56,14 +56,28 @@ def _quietly() -> Generator[None]:
         logging.disable(disabled)
 
 
+@contextlib.contextmanager
+def _all_devices_seen() -> Generator[None]:
+    """Leave CUDA_VISIBLE_DEVICES out: the simulator compares MUJOCO_EGL_DEVICE_ID with it."""
+    visible = os.environ.pop("CUDA_VISIBLE_DEVICES", None)
+    try:
+        yield
+    finally:
+        if visible is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = visible
+
+
 choose_backend()  # before the simulator's import, which takes what it finds
+import mujoco  # noqa: E402
+
 try:
-    with _quietly():
+    with _quietly(), _all_devices_seen():
         from libero.libero import benchmark, get_assets_path, get_libero_path
         from libero.libero.envs import OffScreenRenderEnv
+        from robosuite.utils.errors import RandomizationError
         from robosuite.utils.observables import sensor
         from robosuite.utils.transform_utils import quat2axisangle
-except ImportError as error:
+except (ImportError, OSError) as error:  # it writes a file into the home folder
     raise AegisError(
         f"LIBERO cannot be imported ({error})",
         "LIBERO, as Hugging Face keeps it (hf-libero), for a task of its",
@@ -99,21 +113,27 @@ class LiberoTask:
         self._seen_by = tuple(seen_by) or (self.spec.camera,)
         self._cameras = tuple(dict.fromkeys(table.CAMERAS[name] for name in self._seen_by))
         self._published = published
-        self._looks = threading.Event()  # shared with the simulator, which must not hold `self`
+        # Whether somebody looks at a step; the simulator knows it, and must not hold `self`.
+        self._looks = SimpleNamespace(wanted=True)
         # It is made when an episode begins and closed with its last step: it holds half a gigabyte.
         self._env: Any = None
+        self._state: Any = None
         self._closing: weakref.finalize | None = None
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
         """See `contract.TaskEnv`; there is nothing to colour."""
         self._close()
+        seed = int(rng.integers(2**31))
         with _global_numbers_kept(), _quietly():
-            self._env = _environment(self._suite, self._number, self._cameras)
-            self._closing = weakref.finalize(self, _close, self._env)
+            np.random.seed(seed)
+            made = _placed(lambda: _environment(self._suite, self._number, self._cameras))
+            self._env = made
+            self._closing = weakref.finalize(self, _close, made)
             self._closing.atexit = False  # OpenGL may be gone by then
             # Even a published state says nothing of what the table stands on.
-            np.random.seed(int(rng.integers(2**31)))
-            self._env.reset()
+            np.random.seed(seed)
+            # LIBERO's own `reset` would go on for ever, whatever error or signal ends it.
+            _placed(made.env.reset)
             if self._published:
                 states = _states(self._suite, self._number)  # [50, numbers of a state]
                 self._env.set_init_state(states[self._round % len(states)])
@@ -128,16 +148,14 @@ class LiberoTask:
         success = self._step(checked(action, len(self.spec.action_names)), look)
         self._steps += 1
         done = success or self._steps >= self._most
+        step = Step(self._observe() if look else None, success, None, done)
         if done:
             self._close()
-        return Step(self._observe() if look else None, success, None, done)
+        return step
 
     def _step(self, control: np.ndarray, look: bool) -> bool:
         """Whether the task is done after one more step."""
-        if look:
-            self._looks.set()
-        else:
-            self._looks.clear()
+        self._looks.wanted = look
         _make_current(self._env)
         self._state, _, success, _ = self._env.step(control)
         return bool(success)
@@ -145,8 +163,8 @@ class LiberoTask:
     def _draw_when_looked_at(self) -> None:
         """Let the simulator draw those pictures alone that a policy sees.
 
-        It would draw one of each camera at every step, in the midst of it. A picture at the step's
-        end would be another one than those that a policy has learned from.
+        It would draw one of each camera at every step, at a moment of its own within the step. A
+        picture at the step's end would be another one than those that a policy has learned from.
         """
         simulator, looks = self._env.env, self._looks
         for camera in self._cameras:
@@ -155,7 +173,7 @@ class LiberoTask:
 
             @sensor(modality="image")
             def seen(known: Any, drawn: Callable[[Any], np.ndarray] = drawn) -> np.ndarray:
-                return drawn(known) if looks.is_set() else _NOTHING
+                return drawn(known) if looks.wanted else _NOTHING
 
             simulator.modify_observable(name, "sensor", seen)
 
@@ -188,7 +206,7 @@ class LiberoTask:
     def _close(self) -> None:
         if self._closing is not None:
             self._closing()
-            self._env, self._closing = None, None
+            self._env, self._closing, self._state = None, None, None
 
 
 def _make_current(env: Any) -> None:
@@ -213,17 +231,42 @@ def _global_numbers_kept() -> Generator[None]:
 
 def _environment(suite: str, number: int, cameras: Sequence[str]) -> Any:
     described = _file(suite, number, "bddl_files", "bddl_file")
-    made = OffScreenRenderEnv(
+    _share_display()
+    return OffScreenRenderEnv(
         bddl_file_name=str(described),
         camera_names=list(cameras),
         camera_heights=SIZE,
         camera_widths=SIZE,
     )
-    # When the process ends, its simulator would end EGL before other renderers are closed.
-    opengl = sys.modules.get("robosuite.renderers.context.egl_context")
-    if opengl is not None:
-        atexit.unregister(opengl.EGL.eglTerminate)
-    return made
+
+
+def _share_display() -> None:
+    """Let LIBERO's simulator draw on the display of MuJoCo's own pictures.
+
+    Its own choice follows CUDA_VISIBLE_DEVICES, which may be empty or hold names, and it would end
+    the display before other renderers are closed.
+    """
+    theirs: Any = sys.modules.get("robosuite.renderers.context.egl_context")
+    if theirs is not None and theirs.EGL_DISPLAY is None:
+        context = mujoco.GLContext(8, 8)  # which opens the display, if nobody has yet
+        context.free()
+        theirs.EGL_DISPLAY = sys.modules["mujoco.egl"].EGL_DISPLAY
+
+
+def _placed(draw: Callable[[], Any]) -> Any:
+    """What LIBERO makes when it has found places for all objects, which it draws.
+
+    Raises:
+        AegisError: it has found none several times.
+    """
+    for _ in range(_TRIES):
+        with contextlib.suppress(RandomizationError):
+            return draw()
+    raise AegisError(
+        f"no places for a scene's objects in {_TRIES} tries of LIBERO's",
+        "places that do not overlap",
+        "use another --seed",
+    )
 
 
 @cache

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from aegis_cli.sim.contract import LIBERO, TaskSpec
 
-# How many tasks each suite has, and how many steps one has for an episode: a few more than the
-# longest demonstration takes, as LeRobot and openpi have them.
+# How many tasks each suite has, and how many steps one has for an episode: LeRobot's limits, which
+# the longest demonstration keeps. openpi ends those of `spatial` at 220.
 SUITES: dict[str, tuple[int, int]] = {
     "spatial": (10, 280),
     "object": (10, 280),
@@ -25,7 +25,9 @@ CAMERAS = {
     "image2": "robot0_eye_in_hand",
     "wrist_image": "robot0_eye_in_hand",
     "agentview": "agentview",
+    "agentview_rgb": "agentview",
     "robot0_eye_in_hand": "robot0_eye_in_hand",
+    "eye_in_hand_rgb": "robot0_eye_in_hand",
 }
 
 _TASK = TaskSpec(

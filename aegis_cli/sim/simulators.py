@@ -42,18 +42,21 @@ class Simulators:
 
     Args:
         workers: processes that simulate; 1: this process alone.
+        at_once: environments that act at the same time.
 
     Raises:
         AegisError: at the end of the block, if a process died in it.
     """
 
-    def __init__(self, workers: int) -> None:
-        fix = "there may be too little memory: set OMP_NUM_THREADS, or see ulimit -v"
+    def __init__(self, workers: int, at_once: int) -> None:
+        fix = "there may be too little memory for it: see free -h, and ulimit -v"
         # An environment stays in one process, so that each is a pool of its own.
         several = range(workers) if workers > 1 else ()
         self._pools = [WorkerPool(1, "a simulating process", fix) for _ in several]
         self._turns = itertools.count()
-        self._threads = ThreadPoolExecutor(max(1, workers))
+        # A thread for each environment, which mostly waits for its process: no process stands idle
+        # as long as one of its environments has something to do.
+        self._threads = ThreadPoolExecutor(at_once)
         self._open = ExitStack()
 
     def __enter__(self) -> Simulators:

@@ -83,9 +83,9 @@ def check(recipe: Recipe) -> None:
     recipes.check_run(recipe)
     track.check(recipe)
     gl.check()
-    sim.check(recipe.task)
     if recipe.demos.path is None:
         sim.check_recordable(recipe.task)
+    sim.check(recipe.task)
 
 
 def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:

@@ -96,10 +96,11 @@ class PolicyStudy:
         """
         for recipe in trials:
             track.check(recipe)
-            if recipe.demos.path is None:
-                sim.check_recordable(recipe.task)
         tuning = self.recipe.tuning
+        recorded = any(recipe.demos.path is None for recipe in trials)
         for task in (*self.places, *([tuning.task] if tuning else [])):
+            if recorded:
+                sim.check_recordable(task)
             sim.check(task)
         if tuning is not None:
             _check_playable(trials)
@@ -256,7 +257,7 @@ def _check_playable(trials: Sequence[Recipe]) -> None:
                 "demonstrations of a simulated task seen by one camera, since values are chosen "
                 "by success",
                 "delete 'tuning' and put the values under 'set', or tune on demonstrations of a "
-                "simulated task",
+                "simulated task; if they are LIBERO's, name its suite as tuning.task",
             )
 
 

@@ -56,7 +56,10 @@ class RobotStreamStudy:
 
     def check(self, trials: Sequence[RobotStreamRecipe]) -> None:
         """Raise AegisError for a task that is not there, before any work."""
+        recorded = any(trial.demos.paths is None for trial in trials)
         for task in self.recipe.tasks:
+            if recorded:
+                sim.check_recordable(task)
             sim.check(task)
 
     def prepare(
@@ -225,6 +228,8 @@ def cell_key(
     }
     if demos_sha256:
         shaping["demos"] = list(demos_sha256)  # in place of how they would be recorded
+        if chosen := recipes.selected(recipe):  # the digests say nothing of the choice
+            shaping["selected"] = chosen
     if vqa_state:  # scenes come from no file, and add no key
         shaping["vqa"] = dict(vqa_state)
     return digest(shaping)

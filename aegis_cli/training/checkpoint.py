@@ -484,8 +484,14 @@ def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
         if task is not None:
             expected = f"cameras of '{task}': {', '.join(known)}"
             if sim.of_datasets(task) is not None:
-                renamed = f"--set 'demos.rename={{{found[0]}: {known[0]}}}'"
-                fix = f"give them its names in training: {renamed}"
+                unused = (name for name in ("image", "image2") if name not in found)
+                unknown = [name for name in found if name not in known]
+                pairs = zip(unknown, unused, strict=False)
+                renamed = ", ".join(f"{old}: {new}" for old, new in pairs)
+                fix = (
+                    f"give them its names in training: --set 'demos.rename={{{renamed}}}', or "
+                    "choose those that have them by demos.camera"
+                )
         raise AegisError(
             f"a policy trained on {len(named)} cameras: {', '.join(named)}", expected, fix
         )

@@ -13,6 +13,7 @@ from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import libero_table as table
 from aegis_cli.sim.contract import EVALUATION, VALIDATION, Observation, TaskEnv, episode_rng
+from aegis_cli.sim.simulators import Simulators, Wanted
 
 pytestmark = needs_libero
 
@@ -42,6 +43,8 @@ def pushes(count: int) -> np.ndarray:
 def test_every_suite_is_as_the_table_says() -> None:
     from aegis_cli.sim.libero import _benchmark
 
+    lerobot = pytest.importorskip("lerobot.envs.libero").TASK_SUITE_MAX_STEPS
+    assert {f"libero_{suite}": most for suite, (_, most) in table.SUITES.items()} == lerobot
     for suite, (count, _) in table.SUITES.items():
         env = sim.make(f"libero/{suite}")
         said = env.spec.templates
@@ -64,6 +67,83 @@ def test_published_episodes_are_others_than_those_of_a_validation() -> None:
     seen = [o.image for o in (*published, *drawn)]
     assert {o.instruction for o in (*published, *drawn)} == {published[0].instruction}
     assert all(not np.array_equal(seen[i], seen[j]) for i in range(4) for j in range(i))
+
+
+def test_published_episodes_begin_in_liberos_states() -> None:
+    """The tasks take turns, and each goes through its states in their order."""
+    from aegis_cli.sim.libero import _states
+
+    states, turns = _states("object", 3), {3: 0, 13: 1, 503: 0}
+    for number, state in turns.items():
+        env = made("libero/object", number, published=True)
+        begun(env, number)
+        now = env._env.sim.get_state().flatten()
+        # After ten steps of rest the objects have hardly moved; other states are decimetres apart.
+        far = np.abs(states - now)[:, 10:].max(1)
+        assert int(far.argmin()) == state, number
+
+
+def test_several_processes_simulate_the_same() -> None:
+    actions = pushes(3)
+
+    def seen(env: TaskEnv) -> list[Observation]:
+        return [begun(env, 1), *(env.step(action).observation for action in actions)]
+
+    here = seen(made("libero/goal", 1, published=True))
+    with Simulators(2, 10) as simulators:
+        wanted = Wanted("libero/goal", 1, BOTH, published=True)
+        envs = [simulators.make(wanted) for _ in range(3)]
+        found: dict[int, list[Observation]] = {}
+        simulators.each(lambda at: found.update({at: seen(envs[at])}), range(3))
+    # The processes have ended with open simulators.
+    for observations in found.values():
+        assert all(same(own, other) for own, other in zip(here, observations, strict=True))
+
+
+@pytest.mark.parametrize("visible", ["", "GPU-1234", "3"])
+def test_what_gpus_are_visible_to_pytorch_is_nothing_to_the_pictures(
+    visible: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    program = (
+        "from aegis_cli import sim\n"
+        "from aegis_cli.sim.contract import episode_rng\n"
+        "env = sim.make('libero/object')\n"
+        "print(env.reset(episode_rng(0, 1, 0), ()).image.std() > 10)\n"
+    )
+    done = python(program)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
+
+
+def test_a_signal_ends_the_placing_of_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LIBERO's own `reset` would begin again, whatever has ended it."""
+    from aegis_cli.sim import libero
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    env = made("libero/object")
+    domain = type(libero._environment("object", 0, ("agentview",)).env)
+    monkeypatch.setattr(domain, "_reset_internal", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        begun(env, 0)
+
+
+def test_places_that_are_not_found_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    from aegis_cli.sim import libero
+
+    tries: list[int] = []
+
+    def failing(*_: object) -> None:
+        tries.append(1)
+        raise libero.RandomizationError("no place")
+
+    env = made("libero/object")
+    domain = type(libero._environment("object", 0, ("agentview",)).env)
+    monkeypatch.setattr(domain, "reset", failing)
+    with pytest.raises(AegisError, match="no places for a scene's objects"):
+        begun(env, 0)
+    assert len(tries) == libero._TRIES
 
 
 def test_what_is_not_looked_at_changes_nothing() -> None:

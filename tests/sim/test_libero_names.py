@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -83,9 +84,19 @@ def test_it_cannot_be_recorded(aegis, tmp_path: Path) -> None:
     out = tmp_path / "d.safetensors"
     asked = "HuggingFaceVLA/libero"
     assert asked in refused(aegis("demos", "libero/object", "--out", out))
+    policy = {"kind": "policy", "name": "x", "methods": ["naive"], "task": "libero/object"}
+    stream = {"kind": "robot-stream", "name": "x", "tasks": ["reach", "libero/object"]}
+    study = {
+        "kind": "study",
+        "name": "x",
+        "tasks": ["reach", "libero/object"],
+        "seeds": [0],
+        "variants": {"naive": {"method": "naive"}},
+    }
     recipe = tmp_path / "r.yaml"
-    recipe.write_text("kind: policy\nname: x\ntask: libero/object\nmethods: [naive]\n")
-    assert "LIBERO" in refused(aegis("run", recipe, "--out", tmp_path / "runs"))
+    for command, keys in (("run", policy), ("run", study), ("train", stream)):
+        recipe.write_text(json.dumps(keys))
+        assert asked in refused(aegis(command, recipe, "--out", tmp_path / "runs"))
     assert [path.name for path in tmp_path.iterdir()] == ["r.yaml"]
 
 

@@ -12,6 +12,7 @@ import pytest
 from samples.lerobot import READABLE, episodes, frame_cache, save  # noqa: F401
 from samples.training_runs import Start
 
+from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.continual import robots
@@ -22,6 +23,8 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Demos, Recipe, RobotDemos, RobotStreamRecipe
 from aegis_cli.sim import libero_table as table
+from aegis_cli.studies.cells import Cell
+from aegis_cli.studies.robot_stream_cells import cell_key as robot_cell_key
 from aegis_cli.training import checkpoint, loading
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
@@ -93,9 +96,7 @@ def test_cameras_of_other_names_are_refused_until_they_are_renamed(
 
     with pytest.raises(AegisError, match="2 cameras: ") as caught:
         load(camera=both)
-    assert (
-        caught.value.fix == "give them its names in training: --set 'demos.rename={front: image}'"
-    )
+    assert "'demos.rename={front: image, hand: image2}'" in caught.value.fix
     renamed = {"front": "image", "hand": "wrist_image"}
     assert load(camera=("image", "wrist_image"), rename=renamed).task == "libero/object"
     assert load(camera="front").task == "libero/object"  # whatever the only camera is called
@@ -133,8 +134,21 @@ def test_a_stream_learns_suite_after_suite(tiny_folder: Path, tmp_path: Path) ->
         loaded(0, demos=RobotDemos(paths=paths))
     with pytest.raises(AegisError, match="demonstrations of no simulated task"):
         loaded(0, tasks=("point", "reach"))
+    other = dataclasses.replace(recipe.demos, state="action")
     with pytest.raises(AegisError, match="7 positions and 7 actions for task: libero/object"):
-        loaded(0, demos=dataclasses.replace(recipe.demos, state="action"))
+        loaded(0, demos=other)
+
+
+def test_what_a_stream_reads_of_its_data_tells_its_runs_and_cells_apart() -> None:
+    """The digest of the files says nothing of it. Runs from before there was the key go on."""
+    recipe = RobotStreamRecipe(
+        name="x", tasks=("libero/object",), backbone="b", demos=RobotDemos(paths=("a",))
+    )
+    chosen = dataclasses.replace(recipe, demos=RobotDemos(paths=("a",), action="other"))
+    assert "demos" not in recipes.training_part(recipe)
+    assert recipes.training_part(chosen)["demos"] == {"action": "other"}
+    keys = {robot_cell_key(Cell("x", made), "", ["digest"], {}) for made in (recipe, chosen)}
+    assert len(keys) == 2
 
 
 def test_a_policy_of_one_suite_acts_in_the_others(monkeypatch: pytest.MonkeyPatch) -> None:

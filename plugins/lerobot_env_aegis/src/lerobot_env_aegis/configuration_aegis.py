@@ -52,7 +52,7 @@ class AegisEnvConfig(EnvConfig):
             raise AegisError(
                 f"task '{self.task}' for --env.type=aegis",
                 "a task that LeRobot does not have itself",
-                "--env.type=libero --env.task=libero_" + self.task.partition("/")[2],
+                "--env.type=libero, whose --env.task is a suite such as libero_spatial",
             )
         spec = sim.make(self.task).spec
         self.fps = round(spec.control_hz)
