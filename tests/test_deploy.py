@@ -17,7 +17,7 @@ import torch
 from samples.small_run import recipe
 from samples.training import images, make_policy
 
-from aegis_cli import load_policy, sim
+from aegis_cli import deploy, load_policy, sim
 from aegis_cli.common import devices
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
@@ -25,6 +25,7 @@ from aegis_cli.continual import robots
 from aegis_cli.continual.train import run as learn_stream
 from aegis_cli.deploy import DeployedPolicy
 from aegis_cli.evaluation import rollout
+from aegis_cli.models.acting import Acting
 from aegis_cli.publishing import card, export
 from aegis_cli.training import checkpoint, train
 
@@ -138,6 +139,22 @@ def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path
         own.predict_action_chunk(frame(), TEXT, positions.numpy()), expected.numpy()
     )
     assert own.task == task
+
+
+@pytest.mark.parametrize("cameras", [(), ("wrist",), ("image", "image2")])
+def test_of_a_stream_it_takes_a_picture_of_each_camera(
+    cameras: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A single one needs no name there, either."""
+    acting = Acting(make_policy().eval(), "libero/object", REPLAN, cameras)
+    monkeypatch.setattr(deploy, "is_robot_stream_run", lambda _: True)
+    monkeypatch.setattr(robots, "load_policy", lambda *_: acting)
+    found = load_policy(tmp_path, task="libero/object")
+    several = len(cameras) > 1
+    assert found.cameras == (cameras if several else ())
+    if several:
+        with pytest.raises(AegisError, match="one picture for a policy of 2 cameras"):
+            found.predict_action_chunk(frame(), TEXT, POSITIONS)
 
 
 def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_picture() -> None:

@@ -221,11 +221,11 @@ def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
 
 def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
     """The run's rollouts by their colours, the first of each; None where a task has no colours."""
-    # Those of another task, which LIBERO's policies can also play, have other episodes.
+    # The last of each wins: the first one in the run's own task. LIBERO's policies play others too.
     task = found.facts.get("task")
-    own = [result for result in found.rollouts if result.figures.get("task") == task]
-    # Backwards, so that the first of each wins.
-    return {result.figures.get("colors"): result for result in reversed(own or found.rollouts)}
+    backwards = reversed(found.rollouts)
+    in_order = sorted(backwards, key=lambda result: result.figures.get("task") == task)
+    return {result.figures.get("colors"): result for result in in_order}
 
 
 def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) -> bool:

@@ -462,6 +462,25 @@ def test_several_processes_play_the_same_episodes(
     assert (tmp_path / "v.mp4").read_bytes() == film
 
 
+def test_no_picture_of_an_episode_that_is_over_is_held(
+    puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thousands of episodes have large ones."""
+    puppet(rest, chunk=40)
+    held: list[Any] = []
+    measured = acting._measured
+
+    def noted(task: str, colors: str, finished: list[Any]) -> dict[str, Any]:
+        held.extend(finished)
+        return measured(task, colors, finished)
+
+    monkeypatch.setattr(acting, "_measured", noted)
+    rollout.run(Path("any"), None, 3, "seen")
+    assert [(e.observation.image.size, e.observation.more, e.end.observation) for e in held] == [
+        (0, (), None)
+    ] * 3
+
+
 @pytest.mark.parametrize(("rate", "warnings"), [(None, 0), (10.0, 0), (30.0, 1)])
 def test_steps_of_another_length_than_the_trainings_are_warned_of(
     rate: float | None, warnings: int, run_folder: Path

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from samples.command import refused
-from samples.reports import METHODS, open_loop, probe, write_job
+from samples.reports import METHODS, open_loop, probe, rollout, write_job
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
@@ -194,6 +194,15 @@ def test_success_in_other_episodes_is_shown_without_a_mark(
     assert compare.run([job]).same_episodes is same
     out = aegis("compare", "naive", "aegis")[1]
     assert "100.0" in out and ("*100.0" in out) is same
+
+
+def test_success_is_that_in_the_runs_own_task(job: Path) -> None:
+    """Whatever was played last: a policy of LIBERO's plays other suites too."""
+    before = compare.run([job]).rows[1].success_seen
+    other = rollout("seen", 1.0) | {"task": "point"}
+    settings = {"task": "point", "episodes": 4, "colors": "seen", "seed": 0, "replan": 4}
+    results.keep(job / "aegis", "rollout-point-seen", other, settings)
+    assert compare.run([job]).rows[1].success_seen == before != 1.0
 
 
 @pytest.mark.parametrize("questions", [40, 41])

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from samples.training import make_policy
 
 from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.palette import SEEN
 from aegis_cli.common.processes import WorkerPool
+from aegis_cli.models import acting
 from aegis_cli.sim.contract import EVALUATION, episode_rng
 from aegis_cli.sim.simulators import Simulators, Wanted
 
@@ -58,6 +60,19 @@ def test_libero_alone_repays_processes_and_those_of_a_study_start_none(
     assert sim.workers("libero/object", 500) == 2
     with WorkerPool(1, "a process", "") as pool:
         assert pool.submit(sim.workers, "libero/object", 500).result() == 1
+
+
+def test_a_task_that_cannot_be_made_starts_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sim, "workers", lambda *_: 4)
+
+    def missing(*_: Any, **__: Any) -> None:
+        raise AegisError("no package 'x'", "it", "install it")
+
+    monkeypatch.setattr(sim, "make", missing)
+    played = acting.Acting(make_policy(), "point", 4)
+    with pytest.raises(AegisError, match="no package 'x'"):
+        acting.play(played, 4, "seen")
+    assert not multiprocessing.active_children()
 
 
 def test_an_error_there_is_an_error_here() -> None:
