@@ -28,6 +28,7 @@ from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episo
 from aegis_cli.sim.simulators import Simulators, Wanted
 
 EVALUATION_SEED = 0
+PLACING = "rollout (placing)"  # the stage in which large simulators start
 _NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default, and the only choice for a task without colours
@@ -189,7 +190,7 @@ def play(
         for first in range(0, episodes, at_once):
             numbers = range(first, min(episodes, first + at_once))
             # The first episodes are filmed.
-            group = _begun(acting, simulators, seed, stream, numbers, colors, clips)
+            group = _begun(acting, simulators, seed, stream, numbers, colors, clips, on_event)
             for _ in _play(acting, simulators, group, pace, first, seed):
                 longest = group[0].env.spec.max_steps
                 # An episode that ended early counts in full, so that the progress reaches its end.
@@ -328,6 +329,7 @@ def _begun(
     numbers: Sequence[int],
     colors: str,
     filmed: int,
+    on_event: OnEvent = ignore,
 ) -> list[_PlayedEpisode]:
     """The episodes of these numbers at their beginning, those below `filmed` for a video."""
     begun: dict[int, _PlayedEpisode] = {}
@@ -336,7 +338,12 @@ def _begun(
         shown = number < filmed
         begun[number] = _begin(acting, simulators, seed, stream, number, colors, shown)
 
-    simulators.each(begin, numbers)
+    def told(done: int) -> None:
+        if sim.of_datasets(acting.task) is not None:  # elsewhere nobody has to wait
+            on_event(Progress(PLACING, done, len(numbers), "episodes"))
+
+    told(0)
+    simulators.each(begin, numbers, told)
     return [begun[number] for number in numbers]
 
 

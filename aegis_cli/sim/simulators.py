@@ -80,14 +80,20 @@ class Simulators:
             return wanted.made()
         return _Elsewhere(self._pools[turn % len(self._pools)], turn, wanted)
 
-    def each(self, act: Callable[[Item], object], items: Iterable[Item]) -> None:
-        """Call `act` with each item: at once, where there are several processes."""
-        if not self._pools:
-            for item in items:
-                act(item)
-            return
-        for _ in self._threads.map(act, items):
-            pass
+    def each(
+        self,
+        act: Callable[[Item], object],
+        items: Iterable[Item],
+        told: Callable[[int], object] = lambda _: None,
+    ) -> None:
+        """Call `act` with each item: at once, where there are several processes.
+
+        Args:
+            told: called in this thread with the number of items that are done, in their order.
+        """
+        results = self._threads.map(act, items) if self._pools else map(act, items)
+        for done, _ in enumerate(results, 1):
+            told(done)
 
 
 class _Elsewhere:

@@ -18,7 +18,7 @@ from aegis_cli.common import gl
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent
 from aegis_cli.common.ranks import Ranks
-from aegis_cli.models.acting import DEFAULT, Acting, RolloutReport, longest_s, play
+from aegis_cli.models.acting import DEFAULT, PLACING, Acting, RolloutReport, longest_s, play
 from aegis_cli.models.backbones.compiling import uncompiled
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
@@ -68,7 +68,8 @@ class ValidationEpisodes:
 
     def _played(self, on_event: OnEvent) -> RolloutReport:
         def named(event: Event) -> None:
-            on_event(dataclasses.replace(event, stage=_STAGE))
+            placing = event.stage == PLACING
+            on_event(event if placing else dataclasses.replace(event, stage=_STAGE))
 
         # Episodes end one by one, and each number that is left would be another shape to compile.
         with uncompiled(self.compiled):
