@@ -77,11 +77,17 @@ try:
         from robosuite.utils.errors import RandomizationError
         from robosuite.utils.observables import sensor
         from robosuite.utils.transform_utils import quat2axisangle
-except (ImportError, OSError) as error:  # it writes a file into the home folder
+except ImportError as error:
     raise AegisError(
         f"LIBERO cannot be imported ({error})",
         "LIBERO, as Hugging Face keeps it (hf-libero), for a task of its",
         "pip install 'aegis-vla[libero]'",
+    ) from error
+except OSError as error:
+    raise AegisError(
+        f"LIBERO cannot be imported ({error})",
+        "a folder that it can keep its configuration in, by itself ~/.libero",
+        "export LIBERO_CONFIG_PATH=FOLDER",
     ) from error
 
 

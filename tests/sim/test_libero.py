@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,19 @@ def test_what_gpus_are_visible_to_pytorch_is_nothing_to_the_pictures(
     )
     done = python(program)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
+
+
+def test_a_home_that_it_cannot_write_to_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    where = str(tmp_path / "file" / "libero")
+    program = (
+        f"import os; os.environ['LIBERO_CONFIG_PATH'] = {where!r}\n"
+        "from aegis_cli import sim\n"
+        "try:\n    sim.check('libero/object')\n"
+        "except sim.AegisError as error:\n    print(error.fix)\n"
+    )
+    done = python(program)
+    assert (done.stdout.strip(), done.stderr) == ("export LIBERO_CONFIG_PATH=FOLDER", "")
 
 
 def test_a_signal_ends_the_placing_of_objects(monkeypatch: pytest.MonkeyPatch) -> None:
