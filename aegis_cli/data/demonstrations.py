@@ -394,11 +394,10 @@ def playable_task(
     task = found.info.task
     if task is None and sim.of_datasets(named) is not None:
         task = named
-    known = () if task is None else sim.cameras(task)
-    seen_by = set()
-    for own in found.cameras(camera):
-        before, now = layout.short(own), layout.short(found.called(own))
-        seen_by.add(before if before in known else now)
+    seen_by = {
+        sim.camera(task, layout.short(own), layout.short(found.called(own)))
+        for own in found.cameras(camera)
+    }
     return sim.playable(task, seen_by)
 
 

@@ -15,6 +15,7 @@ from aegis_cli.core import ensemble as temporal
 from aegis_cli.evaluation import results
 from aegis_cli.models.acting import DEFAULT, EVALUATION_SEED, Acting, RolloutReport, play
 from aegis_cli.models.policy import Policy
+from aegis_cli.sim import libero_table
 from aegis_cli.sim.contract import EVALUATION, TaskSpec
 from aegis_cli.training import checkpoint
 
@@ -136,8 +137,7 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
     shape = policy.expert.shape
     own = (shape.proprio, shape.actions)
     if asked is None:
-        libero = sim.of_datasets(_LIBERO)
-        assert libero is not None
+        libero = libero_table.spec(_LIBERO)
         likely = _LIBERO if own == _sizes(libero) else next(iter(sim.TASKS))
         raise AegisError(
             "a policy trained on a dataset of no simulated task",

@@ -6,6 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.models.policy import Policy
 from aegis_cli.sim.contract import EVALUATION, Observation, Step, TaskEnv, episode_rng
-from aegis_cli.sim.simulators import Simulators, Wanted
+from aegis_cli.sim.simulators import Simulators, Wanted, opened
 
 EVALUATION_SEED = 0
 PLACING = "rollout (placing)"  # the stage in which large simulators start
@@ -213,7 +214,7 @@ def play(
         )
 
 
-def _simulators(acting: Acting, episodes: int) -> Simulators:
+def _simulators(acting: Acting, episodes: int) -> AbstractContextManager[Simulators]:
     """What makes the task's environments, in this process or in several.
 
     Raises:
@@ -222,7 +223,7 @@ def _simulators(acting: Acting, episodes: int) -> Simulators:
     workers = sim.workers(acting.task, episodes)
     if workers > 1:  # what a benchmark writes or fetches when it is first used, it does once
         sim.make(acting.task, seen_by=acting.cameras)
-    return Simulators(workers, sim.lockstep(acting.task))
+    return opened(workers, sim.lockstep(acting.task))
 
 
 def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int) -> float:

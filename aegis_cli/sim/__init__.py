@@ -86,6 +86,11 @@ def cameras(name: str) -> tuple[str, ...]:
     return tuple(libero_table.CAMERAS) if name.startswith(LIBERO) else (TOP,)
 
 
+def camera(task: str | None, before: str, now: str) -> str:
+    """What a task calls a policy's camera: the name before a renaming, where the task has it."""
+    return before if task is not None and before in cameras(task) else now
+
+
 def playable(task: str | None, seen_by: Collection[str]) -> str | None:
     """The task, if a policy of these cameras can act in it; None if none of ours shows as much."""
     # A single picture needs no name: the task's own camera takes its place.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -36,42 +35,18 @@ class Wanted:
 
 
 class Simulators:
-    """What makes a task's environments, for the length of a `with` block.
+    """What makes a task's environments; `opened` has it.
 
     An environment is the same in whichever process it is.
 
     Args:
-        workers: processes that simulate; 1: this process alone.
-        at_once: environments that act at the same time.
-
-    Raises:
-        AegisError: at the end of the block, if a process died in it.
+        pools: processes that simulate, one each; none: this process alone.
+        threads: of which each environment that acts has one.
     """
 
-    def __init__(self, workers: int, at_once: int) -> None:
-        fix = "there may be too little memory for it: see free -h, and ulimit -v"
-        # An environment stays in one process, so that each is a pool of its own.
-        several = range(workers) if workers > 1 else ()
-        self._pools = [WorkerPool(1, "a simulating process", fix) for _ in several]
+    def __init__(self, pools: Sequence[WorkerPool], threads: ThreadPoolExecutor) -> None:
+        self._pools, self._threads = pools, threads
         self._turns = itertools.count()
-        # A thread for each environment, which mostly waits for its process: no process stands idle
-        # as long as one of its environments has something to do.
-        self._threads = ThreadPoolExecutor(at_once)
-        self._open = ExitStack()
-
-    def __enter__(self) -> Simulators:
-        self._open.enter_context(self._threads)
-        for pool in self._pools:
-            self._open.enter_context(pool)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._open.__exit__(kind, error, trace)
 
     def make(self, wanted: Wanted) -> TaskEnv:
         """A new environment; the processes take turns."""
@@ -94,6 +69,29 @@ class Simulators:
         results = self._threads.map(act, items) if self._pools else map(act, items)
         for done, _ in enumerate(results, 1):
             told(done)
+
+
+@contextmanager
+def opened(workers: int, at_once: int) -> Generator[Simulators]:
+    """Simulators for the length of a `with` block.
+
+    Args:
+        workers: processes that simulate; 1: this process alone.
+        at_once: environments that act at the same time.
+
+    Raises:
+        AegisError: at the end of the block, if a process died in it.
+    """
+    fix = "there may be too little memory for it: see free -h, and ulimit -v"
+    # An environment stays in one process, so that each is a pool of its own.
+    several = range(workers) if workers > 1 else ()
+    pools = [WorkerPool(1, "a simulating process", fix) for _ in several]
+    # A thread for each environment, which mostly waits for its process: no process stands idle as
+    # long as one of its environments has something to do.
+    with ThreadPoolExecutor(at_once) as threads, ExitStack() as processes:
+        for pool in pools:
+            processes.enter_context(pool)
+        yield Simulators(pools, threads)
 
 
 class _Elsewhere:

@@ -505,10 +505,8 @@ def seen_by(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
     where the task has none of the old.
     """
     before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
-    known = () if task is None else sim.cameras(task)
     now = [layout.short(name) for name in meta.get("cameras", ())]
-    olds = [before.get(name, name) for name in now]
-    return tuple(old if old in known else new for old, new in zip(olds, now, strict=True))
+    return tuple(sim.camera(task, before.get(name, name), name) for name in now)
 
 
 def restore(

@@ -14,7 +14,7 @@ from aegis_cli import sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import libero_table as table
 from aegis_cli.sim.contract import EVALUATION, VALIDATION, Observation, TaskEnv, episode_rng
-from aegis_cli.sim.simulators import Simulators, Wanted
+from aegis_cli.sim.simulators import Wanted, opened
 
 pytestmark = needs_libero
 
@@ -91,7 +91,7 @@ def test_several_processes_simulate_the_same() -> None:
         return [begun(env, 1), *(env.step(action).observation for action in actions)]
 
     here = seen(made("libero/goal", 1, published=True))
-    with Simulators(2, 10) as simulators:
+    with opened(2, 10) as simulators:
         wanted = Wanted("libero/goal", 1, BOTH, published=True)
         envs = [simulators.make(wanted) for _ in range(3)]
         found: dict[int, list[Observation]] = {}

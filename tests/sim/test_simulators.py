@@ -17,7 +17,7 @@ from aegis_cli.common.palette import SEEN
 from aegis_cli.common.processes import WorkerPool
 from aegis_cli.models import acting
 from aegis_cli.sim.contract import EVALUATION, episode_rng
-from aegis_cli.sim.simulators import Simulators, Wanted
+from aegis_cli.sim.simulators import Wanted, opened
 
 
 def test_an_environment_is_the_same_in_another_process() -> None:
@@ -31,7 +31,7 @@ def test_an_environment_is_the_same_in_another_process() -> None:
         return [*found, step.observation.image, step.observation.instruction]
 
     here = shown(sim.make("point"))
-    with Simulators(2, 3) as simulators:
+    with opened(2, 3) as simulators:
         envs = [simulators.make(Wanted("point", number)) for number in range(3)]
         processes = {env._pool.submit(os.getpid).result() for env in envs}
         assert len(processes) == 2 and os.getpid() not in processes
@@ -42,7 +42,7 @@ def test_an_environment_is_the_same_in_another_process() -> None:
 
 
 def test_of_one_process_it_is_this_one() -> None:
-    with Simulators(1, 3) as simulators:
+    with opened(1, 3) as simulators:
         made = simulators.make(Wanted("point", 0))
         assert type(made) is type(sim.make("point"))
         done: list[int] = []
@@ -76,7 +76,7 @@ def test_a_task_that_cannot_be_made_starts_no_process(monkeypatch: pytest.Monkey
 
 
 def test_an_error_there_is_an_error_here() -> None:
-    with Simulators(2, 3) as simulators:
+    with opened(2, 3) as simulators:
         env = simulators.make(Wanted("point", 0))
         env.reset(episode_rng(3, EVALUATION, 1), SEEN)
         for number in range(2):  # the process goes on
@@ -91,7 +91,7 @@ def test_an_error_there_is_an_error_here() -> None:
 def test_a_process_that_dies_is_named() -> None:
     with (
         pytest.raises(AegisError, match="a simulating process died"),
-        Simulators(2, 3) as simulators,
+        opened(2, 3) as simulators,
     ):
         envs = [simulators.make(Wanted("point", number)) for number in range(2)]
         os.kill(envs[1]._pool.submit(os.getpid).result(), signal.SIGKILL)
