@@ -166,6 +166,7 @@ def test_what_is_not_looked_at_changes_nothing() -> None:
     for number, action in enumerate(pushes(6)):
         seen, unseen = looking.step(action), blind.step(action, look=number == 5)
     assert same(seen.observation, unseen.observation)
+    assert all(picture.std() > 10 for picture in (seen.observation.image, *seen.observation.more))
 
 
 def test_one_that_ends_leaves_anothers_pictures() -> None:
