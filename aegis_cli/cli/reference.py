@@ -22,6 +22,7 @@ from aegis_cli.common import files
 from aegis_cli.recipes import KINDS, name_of
 from aegis_cli.recipes.keys import (
     NOT_EMPTY,
+    NOT_EMPTY_EACH,
     Check,
     base_type,
     is_optional,
@@ -126,7 +127,7 @@ def _takes(hint: Any, check: Check | None) -> str:
     """A key's type and which values of it: `whole number, above 0, or null`."""
     words = _TYPES.get(hint) or _TYPES[base_type(hint)]
     # That a text is not empty goes without saying, and so does that one of some words is a text.
-    limits = [check.expected] if check and check is not NOT_EMPTY else []
+    limits = [check.expected] if check and check not in (NOT_EMPTY, NOT_EMPTY_EACH) else []
     known = [] if words == "text" and check and check.choices else [words]
     return ", ".join(known + limits + (["or null"] if is_optional(hint) else []))
 

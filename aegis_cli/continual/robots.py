@@ -30,9 +30,10 @@ from aegis_cli.continual.state import StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.core.routing import Routed
-from aegis_cli.data import demonstrations, spread
+from aegis_cli.data import demonstrations, mixture, renaming, spread, task_episodes
 from aegis_cli.data.batch import Normalizer, RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
 from aegis_cli.models import backbones, policy_meta
@@ -71,7 +72,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     Attributes:
         policies: one per task; they share backbone and action expert and have scales of their own.
-        views: how each task's policy looks: of a policy's meta, `cameras` and `pictures`.
+        views: how each task's policy looks: of a policy's meta, `cameras`, `pictures` and `rename`.
         still: what the recipe freezes of the backbone.
         demos: one per task; none in a run that only acts.
         question_files: digests of the files that the questions come from; none of scenes.
@@ -271,6 +272,8 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
             sim.check(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
     _check_freeze(recipe, backbone, on_event)
+    loading.check_cameras(backbone, recipe)
+    _check_given(recipe)
     for task in recipe.tasks:
         _check_words(backbone, task)
     # Only now, when all else has been found to fit: recording takes long.
@@ -281,6 +284,9 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
     views = [assemble.view(shown, backbone) for shown in demos]
+    if recipe.demos.rename is not None:
+        for view in views:
+            view["rename"] = recipe.demos.rename
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
     run.measure_with(source, on_event)
     return run
@@ -505,6 +511,22 @@ def _check_words(backbone: Backbone, task: str) -> None:
         backbone.prepare(picture, [template.format(color=COLORS[0])])
 
 
+def _check_given(recipe: RobotStreamRecipe) -> None:
+    """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
+
+    To decode the first task's frames can take hours.
+    """
+    if recipe.demos.paths is None:
+        return
+    sets = [demonstrations.at(name) for name in recipe.demos.named]
+    mixture.check_rename(sets, renaming.of(recipe.demos.rename))
+    for number in range(len(recipe.tasks)):
+        path, selection = given(recipe, number)
+        if selection.only is not None:
+            count = demonstrations.count_episodes(path)
+            demonstrations.learned_from(path, count, selection.only)
+
+
 def _demos(
     recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
 ) -> Demonstrations:
@@ -514,17 +536,19 @@ def _demos(
         AegisError: they cannot be read, are those of another task, or hold an unknown word.
     """
     task = recipe.tasks[number]
-    path = _demos_path(recipe, number, out, on_event)
+    path, selection = _source(recipe, number, out, on_event)
     found = demonstrations.load(
         path,
         recipe.train.validation_share,
         recipe.seed,
-        recipe.demos.selection,
+        selection,
         image_size=backbone.image_size,
         on_event=on_event,
+        cache=recipe.demos.cache,
+        check_text=backbone.check_prompt,
     )
     if found.task is None:
-        found = loading.of_named_task(found, task)
+        found = loading.of_named_task(found, task, recipe.demos.rename or {})
     if found.task != task:
         of = f"'{found.task}'" if found.task else "no simulated task"
         raise AegisError(
@@ -534,18 +558,41 @@ def _demos(
             if sim.of_datasets(task) is None
             else "correct tasks, or demos.paths",
         )
+    if sim.of_datasets(task) is not None:
+        task_episodes.check_own(found.texts, task, f"'{path}'")
     # An unknown word must end no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
 
 
-def _demos_path(recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent) -> Path:
-    """Where a task's demonstrations lie; they are recorded if the recipe names no file."""
+def _source(
+    recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent
+) -> tuple[Path, Selection]:
+    """Where a task's demonstrations lie, and what it learns of them.
+
+    They are recorded if the recipe names none.
+    """
     if recipe.demos.paths is not None:
-        return demonstrations.at(recipe.demos.paths[number])
+        return given(recipe, number)
     home = out.parent / "demos"
     make_folder(home)
-    return record(recipe, number, StageRecords(home, on_event)).path
+    made = record(recipe, number, StageRecords(home, on_event))
+    return made.path, recipe.demos.selection(only=None)
+
+
+def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
+    """The demonstrations that a recipe names for a task, and what it learns of them.
+
+    Raises:
+        AegisError: nothing is there, or it cannot be told which episodes are the task's.
+    """
+    demos, named = recipe.demos, recipe.demos.of_task(number)
+    path = demonstrations.at(named)
+    if demos.only is not None:
+        return path, demos.selection(demos.only[number])
+    of_each = [demos.of_task(i) for i in range(len(recipe.tasks))]
+    only = demonstrations.part_of(path, recipe.tasks[number], of_each.count(named) > 1)
+    return path, demos.selection(only)
 
 
 def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:

@@ -93,7 +93,7 @@ def _read(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
     """The model and the data that a stream is made from."""
     if isinstance(recipe, StreamRecipe):
         return (recipe.encoder, recipe.path)
-    return (recipe.backbone, *(recipe.demos.paths or ()))
+    return (recipe.backbone, *recipe.demos.named)
 
 
 def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> None:

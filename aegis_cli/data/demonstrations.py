@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
-from aegis_cli.data import relative, renaming
+from aegis_cli.data import relative, renaming, task_episodes
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, deviations
 from aegis_cli.data.fitted import FittedFrames
 from aegis_cli.data.joined_frames import JoinedFrames
@@ -355,16 +355,38 @@ def _episodes(found: dataset.Dataset, only: str | None) -> list[int] | None:
     """The numbers of the episodes that `demos.only` names; None where it chooses none."""
     if only is None:
         return None
-    return _chosen(found.folder, len(found.episodes), only, found.info.splits).tolist()
+    if task_episodes.is_task(only, found.info.splits):
+        return task_episodes.of_task(found, only)
+    return episodes_of.chosen(only, len(found.episodes), found.info.splits, found.folder)
+
+
+def part_of(path: Path, task: str, shared: bool) -> str | None:
+    """What `demos.only` has to be for a task to learn its own episodes alone; None: all are.
+
+    Only data sets of LIBERO's hold those of several tasks.
+
+    Args:
+        shared: whether other tasks learn from the demonstrations as well.
+
+    Raises:
+        AegisError: it cannot be told which are its own.
+    """
+    if sim.of_datasets(task) is None:
+        return None
+    here = locate(path)
+    is_choice = here.is_dir() and task_episodes.is_choice(dataset.load(here), task, shared)
+    return task if is_choice else None
 
 
 def is_one_of(path: Path, selection: Selection, sha256: Collection[str]) -> bool:
     """Whether these have one of the digests, of which `selection` was read."""
     here = locate(path)
     if here.is_dir() and selection.only is not None:
-        info = layout.read_info(here)
+        found = dataset.load(here, selection.rename)
         # Other data may have fewer episodes or no such split, which is no error here.
-        if not episodes_of.are_there(selection.only, info.episodes, info.splits):
+        try:
+            _episodes(found, selection.only)
+        except AegisError:
             return False
     return digest(path, selection) in sha256
 
@@ -406,8 +428,11 @@ def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
+    count = len(tensors["episode_starts"]) - 1
     # What has a field of its own below is popped: `tensors` keeps what has none.
-    episode_of, train, validation = _split(path, tensors["episode_starts"], split)
+    episode_of, train, validation = _split(
+        path, tensors["episode_starts"], split, learned_from(path, count, split[2])
+    )
     return Demonstrations(
         task=meta["task"],
         frames=(tensors.pop("frames"),),
@@ -441,8 +466,10 @@ def _load_folder(
     cameras = found.cameras(selection.camera)
     lengths = [episode.length for episode in found.episodes]
     starts = torch.tensor([0, *lengths]).cumsum(0)  # [E + 1]
-    episode_of, train, validation = _split(path, starts, split, found.info.splits)
-    source = _source(found, selection.only)
+    chosen = _episodes(found, selection.only)
+    episodes = np.arange(len(lengths)) if chosen is None else np.array(chosen, dtype=np.int64)
+    episode_of, train, validation = _split(path, starts, split, episodes)
+    source = sources.find(found, chosen)
     index = rows.read_index(source)
     proprio, proprio_names = _vectors(source, selection.state)
     actions, action_names = _vectors(source, selection.action)
@@ -497,12 +524,14 @@ def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, t
 
 
 def _split(
-    path: Path, starts: Tensor, split: Split, splits: Mapping[str, str] | None = None
+    path: Path, starts: Tensor, split: Split, episodes: np.ndarray
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The episode of each frame [N], and the frames to train and to validate on."""
+    """The episode of each frame [N], and the frames to train and to validate on.
+
+    Args:
+        episodes: numbers [*] int64 of those that are chosen.
+    """
     validation_share, seed, only = split
-    count = len(starts) - 1
-    episodes = _chosen(path, count, only, splits or {})
     needed = 1 if validation_share is None else 2  # one is held out
     if len(episodes) < needed:
         raise AegisError(
@@ -513,7 +542,7 @@ def _split(
         )
     # `held_out` counts the chosen episodes alone, so that each choice has some to validate on.
     validated = episodes[held_out(len(episodes), validation_share, seed)]
-    episode_of = torch.repeat_interleave(torch.arange(count), starts.diff())  # [N]
+    episode_of = torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff())  # [N]
     is_chosen = torch.isin(episode_of, torch.from_numpy(episodes))
     is_validation = torch.isin(episode_of, torch.from_numpy(validated))
     train, validation = is_chosen & ~is_validation, is_validation
@@ -530,17 +559,14 @@ def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
     Raises:
         AegisError: episodes that are not there.
     """
-    path = locate(path)
-    splits: Mapping[str, str] = {}  # a file of `aegis demos` has none
-    if only is not None and path.is_dir():
-        splits = layout.read_info(path).splits
-    return _chosen(path, count, only, splits)
-
-
-def _chosen(path: Path, count: int, only: str | None, splits: Mapping[str, str]) -> np.ndarray:
     if only is None:
         return np.arange(count)
-    return np.array(episodes_of.chosen(only, count, splits, path), dtype=np.int64)
+    path = locate(path)
+    if path.is_dir():
+        numbers = _episodes(dataset.load(path), only)
+    else:  # a file of `aegis demos` has no splits
+        numbers = episodes_of.chosen(only, count, {}, path)
+    return np.array(numbers, dtype=np.int64)
 
 
 def held_out(episodes: int, validation_share: float | None, seed: int) -> np.ndarray:

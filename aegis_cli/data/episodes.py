@@ -77,14 +77,6 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
     return sorted(set(numbers))
 
 
-def are_there(text: str, count: int, splits: Mapping[str, str]) -> bool:
-    """Whether `chosen` would find all episodes of that name."""
-    try:
-        return all(number < count for number in _named(text, splits))
-    except ValueError:
-        return False
-
-
 def _named(text: str, splits: Mapping[str, str]) -> list[int]:
     """The numbers that a list of them or a split's name stands for.
 

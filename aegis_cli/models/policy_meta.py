@@ -85,8 +85,6 @@ def _check_types(meta: PolicyMeta) -> None:
     for name in ("state", "action"):
         if not isinstance(meta.get(name, ""), str | list):
             raise ValueError(f"'{name}' is {meta[name]!r}")
-    if not isinstance(meta.get("rename", {}), dict):
-        raise ValueError(f"'rename' is {meta['rename']!r}")
     if meta["replan"] < 1:
         raise ValueError(f"'replan' is {meta['replan']}")
     ensemble = meta.get("ensemble", 0.0)
@@ -98,12 +96,14 @@ def _check_types(meta: PolicyMeta) -> None:
 
 
 def check_view(meta: PolicyMeta) -> None:
-    """Raise ValueError unless cameras and picture sizes, where there are any, are such."""
+    """Raise ValueError unless cameras, picture sizes and new names are such, if there are any."""
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
     for size in meta.get("pictures", []):
         if len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
             raise ValueError(f"'pictures' has the size {size!r}")
+    if not isinstance(meta.get("rename", {}), dict):
+        raise ValueError(f"'rename' is {meta['rename']!r}")
 
 
 def _check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:

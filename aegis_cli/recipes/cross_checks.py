@@ -18,7 +18,7 @@ from aegis_cli.recipes.policy import (
     Train,
 )
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
-from aegis_cli.recipes.streams import RobotStreamRecipe, StreamRecipe
+from aegis_cli.recipes.streams import RobotDemos, RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 _NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
@@ -157,14 +157,8 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    paths, plain = recipe.demos.paths, [task for task in recipe.tasks if task not in TASKS]
-    if paths is not None and len(paths) != len(recipe.tasks):
-        found = f"demos.paths: {len(paths)} with {len(recipe.tasks)} tasks"
-        yield Problem(
-            found,
-            "one a task, in their order",
-            "correct demos.paths, or delete it and let them be recorded",
-        )
+    yield from _demos_checks(recipe.demos, len(recipe.tasks))
+    plain = [task for task in recipe.tasks if task not in TASKS]
     if recipe.expert.start is not None:
         found = f"expert.start: {recipe.expert.start} with a stream"
         yield Problem(found, "a new expert, which learns all tasks", "delete expert.start")
@@ -189,6 +183,26 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     if plain and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
+
+
+def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:
+    """Whether there is one of each for each task, and demonstrations to choose of."""
+    if isinstance(demos.paths, tuple) and len(demos.paths) != tasks:
+        yield Problem(
+            f"demos.paths: {len(demos.paths)} with {tasks} tasks",
+            "one a task, in their order, or a text: a single one for all",
+            "correct demos.paths, or delete it and let them be recorded",
+        )
+    if demos.only is not None and len(demos.only) != tasks:
+        yield Problem(
+            f"demos.only: {len(demos.only)} with {tasks} tasks",
+            "one a task, in their order",
+            "correct demos.only, or delete it",
+        )
+    for name in ("only", "rename"):
+        if getattr(demos, name) is not None and demos.paths is None:
+            fix = f"set demos.paths to them, or delete demos.{name}"
+            yield Problem(f"demos.{name} without demos.paths", "demonstrations that are given", fix)
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:

@@ -110,6 +110,8 @@ def _problem(
 def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str) -> Problem:
     phrase = _PHRASES.get(hint) or _PHRASES[base_type(hint)]
     check = field.metadata.get("check")
+    if check and check.repeats:
+        phrase = phrase.replace("different ", "")
     limits = [] if check and check.choices and phrase == "text" else [phrase]
     limits += [check.expected] if check else []
     items = raw if isinstance(raw, list) else [raw]

@@ -67,6 +67,7 @@ DIVIDES = Check("1e-30 or more", lambda v: v >= 1e-30)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
 NOT_EMPTY = Check("not empty", lambda v: bool(v.strip()))
+NOT_EMPTY_EACH = Check("not empty", NOT_EMPTY.accepts, repeats=True)
 NAMES = Check(
     "texts that are not empty, each with another",
     lambda v: (

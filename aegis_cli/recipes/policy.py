@@ -158,8 +158,9 @@ class Demos:
         default=None,
         later=True,
         doc="Episodes of a single set in `path` to learn from and validate on; null: all. Numbers "
-        "from 0 and ranges such as '0-39,45', or the name of a split in a LeRobot dataset's "
-        "info.json.",
+        "from 0 and ranges such as '0-39,45', the name of a split in a LeRobot dataset's "
+        "info.json, or a task of LIBERO's, such as libero/spatial, for those with its "
+        "instructions.",
     )
     cache: bool = key(
         default=True,

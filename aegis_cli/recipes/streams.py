@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aegis_cli.data import renaming
 from aegis_cli.data.selection import ACTION, STATE, Selection
 from aegis_cli.data.streams.names import STREAMS
 from aegis_cli.recipes.keys import (
     BELOW_ONE,
     FOLDER_NAME,
     MADE,
+    NAMES,
     NOT_EMPTY,
+    NOT_EMPTY_EACH,
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
@@ -162,11 +165,19 @@ class RobotDemos:
         doc="Standard deviation of the noise on executed actions; 1 is their full range.",
     )
     seed: int = key(SEED, default=0, doc="Seed of the recording; equal seeds give equal bytes.")
-    paths: tuple[str, ...] | None = key(
-        NOT_EMPTY,
+    paths: str | tuple[str, ...] | None = key(
+        NOT_EMPTY_EACH,
         default=None,
-        doc="Demonstrations to use instead of recording: one file or folder per task, in the "
-        "order of `tasks`.",
+        doc="Demonstrations to use instead of recording: one file, folder or id on the hub per "
+        "task, in the order of `tasks`, or a single one for all of them.",
+    )
+    only: tuple[str, ...] | None = key(
+        NOT_EMPTY_EACH,
+        default=None,
+        later=True,
+        doc="Episodes that each task learns from and validates on, in the order of `tasks`, each "
+        "as `demos.only` of a policy names them. Null: a task of LIBERO takes those with its own "
+        "instructions, and any other task all.",
     )
     camera: str | tuple[str, ...] | None = key(
         NOT_EMPTY,
@@ -188,10 +199,35 @@ class RobotDemos:
         doc="Feature of LeRobot datasets that has the actions; a list joins several.",
     )
 
+    rename: dict[str, str] | None = key(
+        NAMES,
+        default=None,
+        later=True,
+        doc="Names of cameras, features or joints in the demonstrations, each with the policy's, "
+        "as in a policy's recipe. Each is renamed in every one of `paths` where it occurs.",
+    )
+    cache: bool = key(
+        default=True,
+        later=True,
+        doc="Decode all frames of a LeRobot dataset's videos before training, into a cache on the "
+        "disk. Without it each is decoded whenever a batch has it.",
+    )
+
     @property
-    def selection(self) -> Selection:
-        """What is learned from the demonstrations in `paths`."""
-        return Selection(self.camera, state=self.state, action=self.action)
+    def named(self) -> tuple[str, ...]:
+        """All that `paths` names, each once; () where demonstrations are recorded."""
+        paths = (self.paths,) if isinstance(self.paths, str) else self.paths or ()
+        return tuple(dict.fromkeys(paths))
+
+    def of_task(self, number: int) -> str:
+        """What `paths` names for the task of that number."""
+        assert self.paths is not None
+        return self.paths if isinstance(self.paths, str) else self.paths[number]
+
+    def selection(self, only: str | None) -> Selection:
+        """What a task learns from the demonstrations in `paths`, of which it takes `only`."""
+        rename = renaming.of(self.rename)
+        return Selection(self.camera, only, self.state, self.action, rename)
 
 
 @section

@@ -122,7 +122,7 @@ def check_recordable(name: str) -> None:
             f"task '{name}' to be recorded",
             "a task with an expert: LIBERO's demonstrations are people's",
             "take a LeRobot dataset of them, such as HuggingFaceVLA/libero: aegis train --demos, "
-            "or demos.path in the recipe",
+            "demos.path in the recipe, or demos.paths of a stream",
         )
     check(name)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 from aegis_cli.sim.contract import LIBERO, TaskSpec
+from aegis_cli.sim.libero_instructions import INSTRUCTIONS
 
 # How many tasks each suite has, and how many steps one has for an episode: LeRobot's limits, which
 # the longest demonstration keeps. openpi ends those of `spatial` at 220.
@@ -68,6 +70,26 @@ def place(task: str) -> tuple[str, int]:
     """The suite of a single task, and its number there."""
     suite, _, number = task.removeprefix(LIBERO).partition("-")
     return suite, int(number)
+
+
+def instructions(name: str) -> tuple[str, ...]:
+    """What a task tells its policy, or each task of a suite or a set."""
+    places = map(place, members(name))
+    return tuple(INSTRUCTIONS[suite][number] for suite, number in places)
+
+
+def told(instruction: str) -> tuple[str, ...]:
+    """The tasks that have this instruction, capitals aside; a few share one in other scenes."""
+    return _told().get(instruction.strip().lower(), ())
+
+
+@cache
+def _told() -> dict[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
+    for suite, texts in INSTRUCTIONS.items():
+        for number, text in enumerate(texts):
+            found[text] = (*found.get(text, ()), f"{LIBERO}{suite}-{number}")
+    return found
 
 
 def steps(task: str) -> int:

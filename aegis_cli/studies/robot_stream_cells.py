@@ -120,7 +120,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         self._records = StageRecords(folder, on_event)
         self._fingerprints: dict[str, str] = {}
         self._sources: dict[Probe, robots.Questions] = {}
-        self._digests: dict[tuple[str, Selection], str] = {}
+        self._digests: dict[tuple[Path, Selection], str] = {}
 
     def begin_anew(self) -> None:
         """Let everything be recorded and learned again."""
@@ -136,8 +136,10 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         # To load a backbone takes long, and many cells begin with the same one.
         if recipe.backbone not in self._fingerprints:
             self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
-        chosen = recipe.demos.selection
-        given = [self._digest(path, chosen) for path in recipe.demos.paths or ()]
+        given = list[str]()
+        if recipe.demos.paths is not None:
+            sources = (robots.given(recipe, i) for i in range(len(recipe.tasks)))
+            given = [self._digest(*source) for source in sources]
         state = self.questions(recipe.probe).state
         return cell_key(cell, self._fingerprints[recipe.backbone], given, state)
 
@@ -153,18 +155,17 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
             )
         return self._sources[settings]
 
-    def demonstrations(self, recipe: RobotStreamRecipe) -> tuple[str, ...]:
-        """Where the demonstrations of each task lie; they are recorded unless they are given."""
+    def demonstrations(self, recipe: RobotStreamRecipe) -> str | tuple[str, ...]:
+        """Where the tasks' demonstrations lie; they are recorded unless they are given."""
         if recipe.demos.paths is not None:
             return recipe.demos.paths
         made = [robots.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
         return tuple(str(one.path) for one in made)
 
-    def _digest(self, path: str, chosen: Selection) -> str:
+    def _digest(self, path: Path, chosen: Selection) -> str:
         """What changes when given demonstrations do."""
         if (path, chosen) not in self._digests:
-            found = demonstrations.digest(demonstrations.at(path), chosen)
-            self._digests[path, chosen] = found
+            self._digests[path, chosen] = demonstrations.digest(path, chosen)
         return self._digests[path, chosen]
 
     def learned(self, cell: Cell[RobotStreamRecipe]) -> RobotStreamRecipe:

@@ -30,7 +30,7 @@ from aegis_cli.models.backbones import shapes
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy_meta import PolicyMeta
-from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.recipes import Demos, Recipe, RobotStreamRecipe
 from aegis_cli.training import checkpoint, parallel
 
 Questions = sets.Scenes | sets.Listed
@@ -132,7 +132,7 @@ def load_demonstrations(
         AegisError: demonstrations of another task, with words that the backbone does not know, or
             of which the recipe's weights are not.
     """
-    _check_cameras(backbone, recipe)
+    check_cameras(backbone, recipe)
     mixture.check_weights(recipe.demos.weights, len(mixture.each(paths)))
     found = mixture.load(
         paths,
@@ -226,7 +226,7 @@ def _refuse_keys_of_a_path(settings: Demos) -> None:
             raise AegisError(f"demos.{name} without demos.path", expected, fix)
 
 
-def _check_cameras(backbone: Backbone, recipe: Recipe) -> None:
+def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> None:
     """Refuse several cameras before their frames are decoded."""
     named = recipe.demos.camera
     if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:

@@ -53,6 +53,11 @@ def test_every_suite_is_as_the_table_says() -> None:
         assert all(text and text == text.strip() for text in said)
 
 
+@pytest.mark.parametrize("suite", table.SUITES)
+def test_the_instructions_are_as_the_table_says(suite: str) -> None:
+    assert sim.make(f"libero/{suite}").spec.templates == table.instructions(f"libero/{suite}")
+
+
 def test_an_episode_follows_from_its_numbers_alone() -> None:
     env, before = made("libero/goal", 2, published=True), np.random.get_state()[1].copy()
     first = begun(env, 2)

@@ -30,6 +30,19 @@ def test_every_suite_has_its_tasks_by_their_numbers() -> None:
     assert len(set(table.names())) == len(table.names()) == 1 + 5 + 40 + 90
 
 
+def test_every_task_has_an_instruction_that_leads_back_to_it() -> None:
+    """Alone, but for a few that scenes of libero/90 share with each other and with two suites."""
+    for suite in SUITES:
+        tasks = sim.members(f"libero/{suite}")
+        texts = table.instructions(f"libero/{suite}")
+        assert len(texts) == len(tasks)
+        for task, text in zip(tasks, texts, strict=True):
+            assert task in table.told(text) and text == text.strip().lower()
+            assert len({*sim.members("libero/all")} & {*table.told(text)}) <= 1
+    assert table.told("do what you like") == table.told("") == ()
+    assert table.told("Turn on the stove\n") == ("libero/goal-7", "libero/90-20", "libero/90-44")
+
+
 def test_all_is_the_four_suites_that_papers_report() -> None:
     of_suites = [task for suite in SUITES[:-1] for task in sim.members(f"libero/{suite}")]
     assert list(sim.members("libero/all")) == of_suites and len(of_suites) == 40

@@ -166,11 +166,23 @@ class EpisodeIndex:
         length: number of its frames.
         data: the parquet file with its rows, as far as the meta folder knows (see `source`).
         clips: its clip for each video feature.
+        tasks: its instructions; empty where the meta folder does not tell them.
     """
 
     length: int
     data: Path
     clips: Mapping[str, Clip]
+    tasks: tuple[str, ...] = ()
+
+
+def tasks_of(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """The instructions that an episode's row of the meta folder has; () where they are no texts.
+
+    What is learned has the instructions of the data files. These only help to choose.
+    """
+    told = row.get("tasks")
+    is_list = isinstance(told, list) and all(isinstance(text, str) for text in told)
+    return tuple(told) if is_list else ()
 
 
 def simulated_task(robot_type: str | None) -> str | None:

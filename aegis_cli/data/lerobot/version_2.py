@@ -74,7 +74,7 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     place = layout.episode_place(info, int(row["episode_index"]))
     # Each video is of one episode alone, and ends with its file.
     clips = {key: Clip(layout.video_file(info, key, place), 0.0) for key in info.videos}
-    return EpisodeIndex(length, layout.data_file(info, place), clips)
+    return EpisodeIndex(length, layout.data_file(info, place), clips, layout.tasks_of(row))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:

@@ -76,7 +76,7 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
         raise ValueError(f"episode {row['episode_index']} has {length} frames from {span}")
     place = layout.file_place(int(row["data/chunk_index"]), int(row["data/file_index"]))
     clips = {key: _clip(row, key, info) for key in info.videos}
-    return EpisodeIndex(length, layout.data_file(info, place), clips)
+    return EpisodeIndex(length, layout.data_file(info, place), clips, layout.tasks_of(row))
 
 
 def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:

@@ -1,0 +1,107 @@
+"""Which episodes of a dataset are those of a task of LIBERO's: the ones with its instructions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from aegis_cli import sim
+from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot.dataset import Dataset
+from aegis_cli.sim import libero_table
+
+
+def is_task(only: str, splits: Mapping[str, str]) -> bool:
+    """Whether `demos.only` names a task of LIBERO's; a split of that name comes first.
+
+    Raises:
+        AegisError: a task that LIBERO does not have.
+    """
+    return only not in splits and sim.of_datasets(only) is not None
+
+
+def of_task(found: Dataset, task: str) -> list[int]:
+    """The numbers of a task's episodes, or of a suite's, rising.
+
+    Raises:
+        AegisError: there is none, or its instructions may be those of another task's scene.
+    """
+    own = {*libero_table.members(task)}
+    numbers = [n for n, tasks in enumerate(_tasks_of_each(found)) if tasks & own]
+    if not numbers:
+        raise AegisError(
+            f"no episode of '{task}' in '{found.folder}', by the instructions of its meta folder",
+            f"its instructions, such as '{libero_table.instructions(task)[0]}'",
+            "give demonstrations of that task, or choose episodes by their numbers (demos.only)",
+        )
+    _check_told_apart(found, task, own)
+    return numbers
+
+
+def is_choice(found: Dataset, task: str, shared: bool) -> bool:
+    """Whether a task has to choose its episodes, since the dataset holds others, too.
+
+    Where no instruction is one of LIBERO's, all episodes are the task's: somebody may have said it
+    in other words.
+
+    Args:
+        shared: whether other tasks learn from the dataset as well.
+
+    Raises:
+        AegisError: it is shared, and no instruction tells whose an episode is.
+    """
+    own = {*libero_table.members(task)}
+    tasks_of_each = _tasks_of_each(found)
+    if any(tasks_of_each):
+        return not all(tasks & own for tasks in tasks_of_each)
+    if shared:
+        raise AegisError(
+            f"'{found.folder}' for '{task}' and other tasks, none of whose instructions it has",
+            f"instructions such as '{libero_table.instructions(task)[0]}'",
+            "choose the episodes of each task by their numbers: demos.only",
+        )
+    return False
+
+
+def check_own(texts: list[str], task: str, where: str) -> None:
+    """Raise AegisError for an instruction that is another task's of LIBERO's.
+
+    Args:
+        texts: what is learned from has these instructions.
+        where: its name in a sentence.
+    """
+    own = {*libero_table.members(task)}
+    for text in texts:
+        told = libero_table.told(text)
+        if told and not own & {*told}:
+            raise AegisError(
+                f"'{text}' in {where} for '{task}'",
+                f"instructions of that task; this one is {told[0]}'s",
+                "correct demos.only, demos.paths or tasks",
+            )
+
+
+def _tasks_of_each(found: Dataset) -> list[set[str]]:
+    """The tasks that each episode may be of: those that have all its instructions."""
+    return [
+        set.intersection(*(set(libero_table.told(text)) for text in episode.tasks or ("",)))
+        for episode in found.episodes
+    ]
+
+
+def _check_told_apart(found: Dataset, task: str, own: set[str]) -> None:
+    """Raise AegisError where an instruction is another task's, too, whose suite is there as well.
+
+    `turn on the stove` is said in one scene of libero/goal, and in two of libero/90.
+    """
+    texts = dict.fromkeys(text for episode in found.episodes for text in episode.tasks)
+    suites_of_each = [{libero_table.place(t)[0] for t in libero_table.told(text)} for text in texts]
+    there = set[str]().union(*(suites for suites in suites_of_each if len(suites) == 1))
+    for text in texts:
+        told = {*libero_table.told(text)}
+        for other in sorted(told - own if told & own else ()):
+            if libero_table.place(other)[0] in there:
+                raise AegisError(
+                    f"'{text}' in '{found.folder}', which is said in '{other}' and in '{task}'",
+                    "instructions that tell these apart",
+                    "choose the episodes by their numbers: demos.only",
+                )
