@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -330,6 +331,20 @@ def test_one_set_for_all_and_chosen_parts_survive_a_recipes_file(
     recipe = make(demos=demos)
     (tmp_path / "r.yaml").write_text(recipes.to_yaml(recipe), encoding="utf-8")
     assert recipes.load_training(tmp_path / "r.yaml") == recipe
+
+
+def test_one_set_for_all_is_not_removed_with_the_run_that_it_lies_in(
+    make: Make, tmp_path: Path
+) -> None:
+    made = make(tasks=("reach",))
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "recipe.yaml").write_text(recipes.to_yaml(made), encoding="utf-8")
+    inside = shutil.copy(made.demos.of_task(0), out / "d.safetensors")
+    recipe = dataclasses.replace(made, demos=RobotDemos(paths=str(inside)))
+    with pytest.raises(AegisError, match="d.safetensors' in the run"):
+        train.run(recipe, out, overwrite=True)
+    assert inside.is_file()
 
 
 # --- a run of one task ----------------------------------------------------------------------------
