@@ -24,6 +24,7 @@ from aegis_cli.common.events import ignore
 from aegis_cli.continual import robots, train
 from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.selection import Selection
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import RobotDemos, RobotStreamRecipe
@@ -46,7 +47,9 @@ ANY = cast(
 )
 
 
-def libero(folder: Path, texts: Sequence[str], cameras: tuple[str, ...] = ("image",)) -> Path:
+def libero(
+    folder: Path, texts: Sequence[str], cameras: tuple[str, ...] = ("image",), **spec: Any
+) -> Path:
     """A dataset with the columns of LIBERO's, of one episode per text."""
     rng = np.random.default_rng(0)
     made = [
@@ -57,7 +60,8 @@ def libero(folder: Path, texts: Sequence[str], cameras: tuple[str, ...] = ("imag
         )
         for one in episodes(len(texts), cameras, (8, 8), texts=texts)
     ]
-    return save(folder, made, state_names=SPEC.proprio_names, action_names=SPEC.action_names)
+    names = {"state_names": SPEC.proprio_names, "action_names": SPEC.action_names}
+    return save(folder, made, **names, **spec)
 
 
 def texts_of(*tasks: str, each: int = 2, seed: int = 0) -> list[str]:
@@ -175,6 +179,29 @@ def test_a_set_of_some_suites_is_told_apart_from_scenes_of_others(tmp_path: Path
     for task in ("libero/goal", "libero/goal-7", "libero/10-5"):
         found = taken(stream([task], folder), 0)
         assert {texts[number] for number in found} == {*table.instructions(task)}
+
+
+@pytest.mark.parametrize("cache", [True, False])
+def test_words_are_read_before_frames_which_may_stay_in_their_videos(
+    cache: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a run of one task; words that other tasks have are not read."""
+    folder = libero(tmp_path / "d", texts_of("libero/goal", "libero/object"), as_video=True)
+    recipe = stream(("libero/goal", "libero/object"), folder, cache=cache)
+    frames = learned(recipe, 0).frames
+    assert isinstance(frames[0], FramesOnDemand) != cache
+    monkeypatch.setattr(demonstrations.camera_frames, "load", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(demonstrations.camera_frames, "video_parts", lambda *_: pytest.fail("read"))
+
+    def knows_objects(text: str) -> None:
+        if "basket" not in text:
+            raise AegisError(f"'{text}'", "known words", "others")
+
+    backbone = cast(Backbone, SimpleNamespace(image_size=None, check_prompt=knows_objects))
+    with pytest.raises(AegisError, match="'open|'put|'push|'turn"):
+        robots._demos(recipe, 0, backbone, Path("unused"), ignore)
+    with pytest.raises(pytest.fail.Exception):
+        robots._demos(recipe, 1, backbone, Path("unused"), ignore)
 
 
 # --- chosen episodes ------------------------------------------------------------------------------
