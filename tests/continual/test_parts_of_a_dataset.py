@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from samples.dataset_hub import DatasetHub
 from samples.interrupted import stop
 from samples.lerobot import as_version_2, episodes, frame_cache, save  # noqa: F401
 from samples.robots import Make
@@ -179,6 +180,22 @@ def test_a_set_of_some_suites_is_told_apart_from_scenes_of_others(tmp_path: Path
     for task in ("libero/goal", "libero/goal-7", "libero/10-5"):
         found = taken(stream([task], folder), 0)
         assert {texts[number] for number in found} == {*table.instructions(task)}
+
+
+def test_of_a_dataset_on_the_hub_only_the_tasks_files_are_downloaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = texts_of("libero/goal", "libero/object", each=1)
+    repository = as_version_2(libero(tmp_path / "d", texts), "v2.1")
+    hub = DatasetHub("lab/libero", repository, tmp_path / "snapshot")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", hub.snapshot)
+    monkeypatch.chdir(tmp_path)
+    recipe = stream(("libero/goal", "libero/object"), Path("lab/libero"))
+    found = learned(recipe, 1)
+    own = [i for i, text in enumerate(texts) if text in table.instructions("libero/object")]
+    assert found.episode_of[found.read].unique().tolist() == own
+    here = {int(path.stem.removeprefix("episode_")) for path in hub.local.glob("data/*/*.parquet")}
+    assert here == {*own} and found.datasets == ("lab/libero",)
 
 
 @pytest.mark.parametrize("cache", [True, False])
