@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from aegis_cli.anchors import passes
 from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
+from aegis_cli.common import memory as memory_of_process
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
@@ -28,6 +29,8 @@ from aegis_cli.models.wrappers import plain_names
 
 if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
     from aegis_cli.data.vqa.dataset import VQASet
+
+_LARGE = 10**8  # bytes of sums
 
 
 @dataclass
@@ -348,15 +351,19 @@ def measure(
     """
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
-    for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
-        own = drawn.of_process(ranks.rank)
-        recorder = InputRecorder(model, maps, follow_uses=False, whole=whole, drawn=own)
-        with recorder.watch(None):
-            for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
-                pass
-        recorder.add_up(ranks)
-        recorder.check_complete()
-        found |= recorder.spectra(energy, True, f"{stage} spectra", on_event)
+    with contextlib.ExitStack() as until_measured:
+        if sum(sized(module) for module in model.site_modules().values()) > _LARGE:
+            # Sums lie between what the passes take and free, of which much would be kept.
+            until_measured.enter_context(memory_of_process.returned())
+        for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
+            own = drawn.of_process(ranks.rank)
+            recorder = InputRecorder(model, maps, follow_uses=False, whole=whole, drawn=own)
+            with recorder.watch(None):
+                for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
+                    pass
+            recorder.add_up(ranks)
+            recorder.check_complete()
+            found |= recorder.spectra(energy, True, f"{stage} spectra", on_event)
     return found
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from pathlib import Path
 
 import pytest
 import torch
 from samples import processes
-from samples.workers import peaks
+from samples.workers import mapped_blocks, peaks
 
 from aegis_cli.common import memory
 
@@ -35,3 +36,13 @@ def test_what_is_free_is_known_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(Path, "read_text", missing)
     assert memory.free(CPU) is None
+
+
+@pytest.mark.skipif(
+    not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc 2.33, which tells what it maps"
+)
+def test_what_is_freed_goes_back_within_the_block_alone() -> None:
+    # In a process of its own: the setting is that of the whole process.
+    before, within, after = processes.alone(mapped_blocks)
+    assert before == after == 0
+    assert within >= 2_000_000

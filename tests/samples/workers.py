@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
@@ -51,6 +52,43 @@ def peaks() -> tuple[int, int, int, int]:
     after = memory.peak(cpu)
     assert ballast
     return size, before, base, after
+
+
+class _Allocated(ctypes.Structure):
+    """What glibc's `mallinfo2` returns; `hblkhd` are the bytes of blocks mapped by themselves."""
+
+    _fields_ = [
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks")),
+        ("hblkhd", ctypes.c_size_t),
+        ("others", ctypes.c_size_t * 5),
+    ]
+
+
+def mapped_blocks() -> tuple[int, int, int]:
+    """How many more bytes are mapped by themselves while a process has a tensor of 2 MB.
+
+    Before `memory.returned`, within it, and after it.
+    """
+    import torch
+
+    from aegis_cli.common import memory
+
+    tell = ctypes.CDLL(None).mallinfo2
+    tell.restype = _Allocated
+
+    def of_a_tensor() -> int:
+        before = tell().hblkhd
+        tensor = torch.empty(2_000_000, dtype=torch.uint8)
+        more = tell().hblkhd - before
+        assert len(tensor)
+        return more
+
+    for _ in range(2):  # a large block that is freed raises the limit
+        torch.empty(20_000_000, dtype=torch.uint8)
+    before = of_a_tensor()
+    with memory.returned():
+        within = of_a_tensor()
+    return before, within, of_a_tensor()
 
 
 if __name__ == "__main__":
