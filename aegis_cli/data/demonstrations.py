@@ -538,7 +538,7 @@ def _split(
             f"{len(episodes)} episode{'s' * (not len(episodes))} in '{path}'"
             + (f" by demos.only: {only}" if only else ""),
             "at least one" if needed == 1 else "2 or more: one is held out",
-            "choose more with demos.only" if only else "record more with aegis demos",
+            "choose more with demos.only" if only else "record more episodes",
         )
     # `held_out` counts the chosen episodes alone, so that each choice has some to validate on.
     validated = episodes[held_out(len(episodes), validation_share, seed)]

@@ -133,6 +133,7 @@ def text(
     # Others have the model that an earlier run began with, and not that run.
     began = meta.get("began_as", recipe.backbone)
     known = dataclasses.replace(recipe, backbone=began, probe=_asked(found, recipe))
+    looks_by = _looks_by(meta, facts["task"])
     return _CARD.format(
         front=_front_matter(form, facts.get("base_model"), facts.get("dataset")),
         title=f"{recipe.name}: {facts['task'] or 'a robot'} by {found.method}",
@@ -153,7 +154,7 @@ def text(
         merged=_merged(merge),
         stored=stored,
         inputs="\n".join(f"- {name}: `{digest}`" for name, digest in _inputs(at, recipe)),
-        use=_use(form, repo, known, facts["task"], cameras, _looks_by(meta, facts["task"])),
+        use=_use(form, repo, known, facts["task"], cameras, looks_by, meta.get("fps")),
     )
 
 
@@ -194,6 +195,7 @@ def _use(
     task: str | None,
     cameras: Sequence[str] = (),
     looks_by: Sequence[str] = (),
+    fps: float | None = None,
 ) -> str:
     """How somebody else uses the policy; one of no simulated task can only be evaluated."""
     act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
@@ -206,7 +208,7 @@ def _use(
         probe=_probe_command(repo, recipe),
         act=act,
         plugins=" and ".join(f"`{name}`" for name in plugins),
-        lerobot=_lerobot_command(repo, task, cameras, looks_by),
+        lerobot=_lerobot_command(repo, task, cameras, looks_by, fps),
     )
 
 
@@ -224,13 +226,18 @@ def _probe_command(repo: str, recipe: Recipe) -> str:
 
 
 def _lerobot_command(
-    repo: str, task: str | None, cameras: Sequence[str], looks_by: Sequence[str]
+    repo: str,
+    task: str | None,
+    cameras: Sequence[str],
+    looks_by: Sequence[str],
+    fps: float | None,
 ) -> str:
     """LeRobot's command that lets the policy act, in our simulation or on a robot."""
     if task is None:
+        rate = "" if fps is None else f" --fps={fps:g}"  # LeRobot takes 30 unless it is told
         return (
             f"lerobot-rollout --strategy.type=base --policy.path={repo} --robot.type=ROBOT "
-            "--task=INSTRUCTION"
+            f"--task=INSTRUCTION{rate}"
         )
     if sim.of_datasets(task) is not None:
         return _libero_command(repo, task, cameras, looks_by)

@@ -5,7 +5,7 @@
     pip install -e '.[hf]' -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
     python plugins/check/check.py
 
-It takes a few minutes of two cores, and is no part of the tests.
+It takes about ten minutes of two cores, and is no part of the tests.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -24,6 +23,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")  # nothing is fetched
 
 import augmentation
 import numpy as np
+import robot
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
@@ -33,6 +33,7 @@ from lerobot.processor import RelativeActionsProcessorStep
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
+from programs import command, remove
 from safetensors.torch import load_file, save_file
 from smolvla_in_miniature import save_smolvla, save_vlm
 from torch import Tensor
@@ -85,6 +86,12 @@ def failures(folder: Path) -> int:
         a_training_and_its_resumption,
         a_protected_training_and_its_resumption,
         a_hugging_face_backbone,
+        robot.a_robot_is_recorded_and_learned,
+        robot.a_robot_does_what_load_policy_says,
+        robot.a_robot_acts_in_real_time,
+        robot.a_robot_that_compiles,
+        robot.a_robot_records_what_it_does,
+        robot.another_robot_is_refused,
         smolvla_moves_orthogonally,
         smolvla_at_strength_0_is_adamw,
         frames_are_augmented_as_by_torchvision,
@@ -409,23 +416,6 @@ def actions_are_relative_as_in_lerobot(_: Path) -> str:
 def train(folder: Path, out: Path, *options: str) -> None:
     data = ("--dataset.repo_id=local/reach", f"--dataset.root={folder / 'dataset'}")
     command("lerobot-train", *data, "--batch_size=4", f"--output_dir={out}", *TRAIN, *options)
-
-
-def command(program: str, *arguments: str | Path) -> None:
-    """Run a program of this environment; what it says is shown where it fails."""
-    path = Path(sys.executable).parent / program
-    done = subprocess.run([path, *map(str, arguments)], capture_output=True, text=True)
-    if done.returncode:
-        print(done.stderr[-4000:], file=sys.stderr)
-        done.check_returncode()
-
-
-def remove(path: Path) -> Path:
-    """The path itself, where nothing is any more of what an earlier call has left there."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    return path
 
 
 def loaded(folder: Path) -> torch.nn.Module:

@@ -436,6 +436,53 @@ def test_a_blank_task_is_warned_of_once(plugin: Any, caplog: pytest.LogCaptureFi
     assert not caplog.records
 
 
+def test_where_lerobot_compiles_a_policy_acts_as_without_and_says_so(
+    plugin: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`lerobot-rollout --use_torch_compile`; the picture's processors would not compile."""
+    expected, policy = acting(plugin), acting(plugin)
+    graphs = list[Any]()
+
+    def backend(graph: Any, _: Any) -> Any:
+        graphs.append(graph)
+        return graph.forward
+
+    policy.predict_action_chunk = torch.compile(policy.predict_action_chunk, backend=backend)
+    with torch.inference_mode():
+        for _ in range(4):
+            found = policy.select_action(seen())
+            torch.testing.assert_close(found, expected.select_action(seen()), rtol=0, atol=0)
+    assert not graphs
+    said = [record for record in caplog.records if record.name == plugin.__name__]
+    assert [record.message for record in said] == [
+        "Nothing is compiled: a policy of Aegis acts as without --use_torch_compile"
+    ]
+
+
+def test_a_picture_that_is_missing_is_named_beside_those_that_are_there(plugin: Any) -> None:
+    batch = seen()
+    batch["observation.images.front"] = batch.pop(IMAGE)
+    with pytest.raises(AegisError) as caught:
+        acting(plugin).select_action(batch)
+    assert caught.value.found == f"no picture {IMAGE}; others are observation.images.front"
+    assert f'--rename_map=\'{{"observation.images.NAME": "{IMAGE}"}}\'' in caught.value.fix
+
+
+def test_a_loaded_policy_says_what_lerobot_does_not_compare_with_a_robot(
+    plugin: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And LeRobot itself knows what its actions are called."""
+    names = ["pan.pos", "lift.pos"]
+    model, meta = make_policy(), {**NAMED, "action_names": names, "fps": 15.0}
+    made = config(plugin, model, IMAGE)
+    plugin.AegisPolicy(made, model=model, meta=meta)._save_pretrained(tmp_path)
+    with caplog.at_level("INFO"):
+        plugin.AegisPolicy.from_pretrained(tmp_path, config=made)
+    said = " ".join(record.message for record in caplog.records)
+    assert "--fps=15" in said and "in this order: x, y, z" in said
+    assert made.action_feature_names == names
+
+
 def dataset(actions: list[str] | None, fps: int = 30, robot: str | None = None) -> Any:
     """LeRobot's metadata of a dataset, as far as a policy is told of it."""
     state = {"dtype": "float32", "shape": (3,), "names": {"motors": ["x", "y", "z"]}}

@@ -428,17 +428,21 @@ def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
         (
             None,
             ("observation.image",),
-            "lerobot-rollout --strategy.type=base {} --robot.type=ROBOT --task=INSTRUCTION",
+            "lerobot-rollout --strategy.type=base {} --robot.type=ROBOT --task=INSTRUCTION "
+            "--fps=15",
         ),
     ],
 )
 def test_a_card_for_lerobot_has_a_command_that_can_run(
     task: str | None, cameras: tuple[str, ...], command: str, run_folder: Path
 ) -> None:
-    """`lerobot-eval` stops without an environment, and ours have one camera."""
+    """`lerobot-eval` stops without an environment, and ours have one camera.
+
+    A robot acts at 30 frames a second unless LeRobot is told its rate.
+    """
     recipe = recipes.load(run_folder / "recipe.yaml")
     looks_by = () if task is None else card._looks_by(cast(PolicyMeta, {"cameras": cameras}), task)
-    said = card._use(card.LEROBOT, "somebody/x", recipe, task, cameras, looks_by)
+    said = card._use(card.LEROBOT, "somebody/x", recipe, task, cameras, looks_by, 15.0)
     line = said.split("```sh\n")[1].splitlines()[0]
     assert re.fullmatch(command.format("--policy.path=somebody/x"), line)
     ours = task is not None and sim.of_datasets(task) is None

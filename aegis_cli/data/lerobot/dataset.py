@@ -214,6 +214,12 @@ def load(folder: Path, rename: Renaming = ()) -> Dataset:
     info = layout.read_info(folder)  # JSON: what is no dataset is said without the package, too
     layout.require_pyarrow()
     reader = version_2 if info.has_episode_files else version_3
+    if not info.episodes and not all(path.exists() for path in reader.table_files(folder)):
+        raise AegisError(
+            f"no episode in '{folder}': its recording ended before one was saved",
+            "at least one",
+            "record it anew",
+        )
     tasks, episodes = reader.read_tasks(folder), reader.read_episodes(folder, info)
     found = Dataset(folder, info, tasks, episodes, rename)
     features = tuple(info.features)

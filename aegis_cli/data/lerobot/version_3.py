@@ -42,7 +42,11 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     """
     where, paths = folder / _EPISODES, _episode_files(folder)
     if not paths:
-        raise AegisError(f"no parquet file in '{where}'", "a row per episode there", layout.AGAIN)
+        raise AegisError(
+            f"no parquet file in '{where}'",
+            "a row per episode there, which LeRobot writes where a recording ends",
+            f"{layout.AGAIN}; record anew what was broken off",
+        )
     rows: list[dict[str, Any]] = []
     for path in paths:
         with layout.reading_parquet(path):

@@ -118,6 +118,16 @@ def test_a_missing_meta_file(
     bad(*command, says=("d/" + missing.split("/chunk")[0] if missing == EPISODES else missing,))
 
 
+@pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d")])
+def test_a_recording_that_was_broken_off(command: tuple[str, ...], bad: Bad, folder: Path) -> None:
+    """LeRobot writes the rows of episodes last: a recording that is killed has none."""
+    (folder / EPISODES).unlink()
+    bad(*command, says=("which LeRobot writes where a recording ends", "record anew"))
+    (folder / "meta/tasks.parquet").unlink()
+    edit_info(folder, lambda info: info.update(total_episodes=0, total_frames=0))
+    bad(*command, says=("no episode in 'd'", "ended before one was saved", "record it anew"))
+
+
 def rename_camera(name: str) -> Callable[[dict[str, Any]], None]:
     """The camera is a video of that name, whose file's path holds the name."""
 
@@ -387,7 +397,7 @@ def test_a_video_that_begins_at_no_time(value: float, bad: Bad, filmed: Path) ->
 
 def test_one_episode(bad: Bad, place: Path) -> None:
     save(place / "d", episodes(1))
-    bad(*FROM_FOLDER, says=("1 episode in 'd'",))
+    bad(*FROM_FOLDER, says=("1 episode in 'd'", "record more episodes"))
 
 
 # --- damage --------------------------------------------------------------------------------------

@@ -38,6 +38,8 @@ class AegisConfig(PreTrainedConfig):
         flow_samples: flow times that are drawn per frame in training.
         method: how `lerobot-train` fine-tunes the backbone; kfac and nullspace need `anchor`.
         decay_steps: after so many steps the learning rates have fallen; None: at the end.
+        action_feature_names: of a loaded policy, what its actions are called, where it knows;
+            LeRobot reads it. It is no setting, and the file of settings does not have it.
     """
 
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_unscaled)
@@ -64,6 +66,7 @@ class AegisConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.action_feature_names: list[str] | None = None
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise AegisError(
                 f"n_action_steps {self.n_action_steps} of a chunk of {self.chunk_size}",

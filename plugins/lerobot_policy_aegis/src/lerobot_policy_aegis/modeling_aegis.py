@@ -86,6 +86,9 @@ class AegisPolicy(PreTrainedPolicy):
         _check_cameras(self._cameras, self.model)
         chosen = methods.get(config.method)
         chosen.adapt(self.model.backbone, self.model.backbone.language_maps(), {})
+        # LeRobot's programs for robots name a policy's actions by these, where they ask for it.
+        config.action_feature_names = self._meta.get("action_names")
+        self._is_told_of_compiling = False
         self._generator = torch.Generator()
         self.reset()
 
@@ -147,6 +150,7 @@ class AegisPolicy(PreTrainedPolicy):
             )
         return True
 
+    @torch.compiler.disable  # backbones' processors of pictures and texts do not compile
     @torch.no_grad()
     def predict_action_chunk(
         self,
@@ -172,11 +176,20 @@ class AegisPolicy(PreTrainedPolicy):
         if noise is not None:
             raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
         self.eval()
+        self._warn_of_compiling()
         images, texts = self._images(batch), _texts(batch)
         self._warn_of_no_task(texts)
         state = self._state(batch, len(texts))
         continued = self._continued(prev_chunk_left_over, inference_delay or 0, len(texts))
         return check_actions(self.model.act(images, texts, state, self._generator, continued))
+
+    def _warn_of_compiling(self) -> None:
+        """Say once that `--use_torch_compile` changes nothing; LeRobot sets a method for it."""
+        if "predict_action_chunk" in vars(self) and not self._is_told_of_compiling:
+            self._is_told_of_compiling = True
+            _LOG.warning(
+                "Nothing is compiled: a policy of Aegis acts as without --use_torch_compile"
+            )
 
     def _warn_of_no_task(self, texts: Sequence[str]) -> None:
         """Say once an episode that a text is blank, as LeRobot's is where `--task` is left out."""
@@ -346,6 +359,7 @@ class AegisPolicy(PreTrainedPolicy):
         _check_recorded(meta, _recorded(kwargs.get("dataset_meta")))
         policy = cls(config, model=model, meta=meta)
         policy.to(config.device)
+        _say_what_robot(meta)
         return policy.eval()
 
     # --- batches ----------------------------------------------------------------------------------
@@ -389,10 +403,12 @@ class AegisPolicy(PreTrainedPolicy):
     def _images(self, batch: Mapping[str, Any]) -> Images:
         missing = [name for name in self._cameras if name not in batch]
         if missing:
+            others = [name for name in batch if "image" in name and name not in self._cameras]
             raise AegisError(
-                f"a batch without {', '.join(missing)}",
+                f"no picture {', '.join(missing)}; others are {', '.join(others) or 'not there'}",
                 f"the pictures {', '.join(self._cameras)}",
-                'rename them: --rename_map=\'{"their name": "our name"}\'',
+                "give all of them; of a camera that has another name: "
+                f'--rename_map=\'{{"{lerobot_folder.IMAGES}NAME": "{missing[0]}"}}\'',
             )
         pictures = [self._pictures(batch, name) for name in self._cameras]
         if len(pictures) == 1:
@@ -488,6 +504,14 @@ def _recorded(dataset_meta: Any) -> dict[str, Any]:
         if all(names):
             found[kind] = list(names)
     return found
+
+
+def _say_what_robot(known: Mapping[str, Any]) -> None:
+    """Say what LeRobot does not compare with a robot: the control rate and the joints' order."""
+    if (fps := known.get("fps")) is not None:
+        _LOG.info("Trained at %g actions a second; a robot does as many with --fps=%g", fps, fps)
+    if names := known.get("proprio_names"):
+        _LOG.info("Trained on these positions, in this order: %s", ", ".join(names))
 
 
 def _check_recorded(known: Mapping[str, Any], found: Mapping[str, Any]) -> None:
