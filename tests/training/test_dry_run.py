@@ -165,7 +165,15 @@ def test_processes_plan_what_each_of_them_needs(
         shared = replace(settings, train=replace(settings.train, parallel=way))
         job = Job(shared, "nullspace", demos_file, anchors, out)
         plans[way] = Planning(job, tmp_path / way)
-    run_together(2, list(plans.values()))
+    watched = replace(
+        settings,
+        train=replace(settings.train, validate_actions=8),
+        probe=replace(settings.probe, while_training=8),
+        rollout=replace(settings.rollout, while_training=2),
+    )
+    job = Job(watched, "nullspace", demos_file, anchors, out)
+    watching = Planning(job, tmp_path / "watched")
+    run_together(2, [*plans.values(), watching])
     alone = plan("nullspace")
     weights = 4e-6 * alone.parameters
     for way, planned in plans.items():
@@ -185,6 +193,13 @@ def test_processes_plan_what_each_of_them_needs(
             assert used[part] == pytest.approx(share * alone.memory_mb[part], rel=0.02)
         assert first["disk_mb"] == pytest.approx(alone.disk_mb)
         assert first["groups"] == alone.groups and first["parameters"] == alone.parameters
+        assert first["validation_s"].keys() == {"loss"}
+    # The first process asks, acts and predicts, and what it found is what all others tell.
+    first, second = (json.loads((watching.said / f"{k}.json").read_text()) for k in (0, 1))
+    found = first["validation_s"]
+    assert found.keys() == {"loss", "questions", "episodes", "actions"}
+    assert found.items() - second["validation_s"].items() <= {("loss", found["loss"])}
+    assert all(seconds > 0 for seconds in found.values())
     assert not out.exists()
 
 
