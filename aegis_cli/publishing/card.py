@@ -376,6 +376,9 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
         cells = [figures["task"], figures.get("colors") or "", f"{figures['episodes']:,}"]
         cells[-1] += f" ({otherwise})" if otherwise else ""
         yield f"| {' | '.join([*cells, _success(figures)])} |"
+        for suite, part in (figures.get("suites") or {}).items():
+            share = _share(part["success"], part["interval"])
+            yield f"| {suite}, of these |  | {part['episodes']:,} | {share} |"
 
 
 def _success(figures: Mapping[str, Any]) -> str:

@@ -158,6 +158,23 @@ def test_the_table_of_a_job_has_the_open_loop_error_of_what_cannot_be_rolled_out
     assert "Open-loop error" in page.said
 
 
+def test_the_success_in_each_suite_is_on_the_page(aegis, job: Path) -> None:
+    """Papers report LIBERO's four suites one by one."""
+    parts = {
+        "libero/spatial": {"success": 0.5, "interval": [0.25, 0.75], "episodes": 3},
+        "libero/goal": {"success": 0.0, "interval": [0.0, 0.5], "episodes": 1},
+    }
+    played = rollout("seen", 0.375) | {"task": "libero/all", "colors": None, "suites": parts}
+    results.keep(job / "naive", "rollout-seen-libero", played, {})
+    page, document = reported(aegis, job / "naive")
+    check_figures(page, document)
+    place = "/rollouts/1/figures/suites/libero~1spatial"
+    assert document["rollouts"][1]["figures"]["suites"] == parts
+    shown = {path for path, _, _ in page.figures}
+    assert {f"{place}/success", f"{place}/interval/1", f"{place}/episodes"} <= shown
+    assert "libero/spatial, of these" in page.said and "libero/goal, of these" in page.said
+
+
 def test_the_worst_instructions_of_an_open_loop_error_are_on_the_page(aegis, job: Path) -> None:
     entry = {"episodes": 2, "frames": 30, "relative_interval": [0.5, 1.5], "hold_error": 0.25}
     many = [

@@ -323,6 +323,16 @@ def test_a_card_has_the_open_loop_error_where_nothing_can_be_rolled_out_and_wher
     assert any("Hold is" in each for each in lines)
 
 
+def test_a_card_has_the_success_in_each_suite() -> None:
+    """Papers report LIBERO's four suites one by one."""
+    parts = {"libero/goal": {"success": 0.5, "interval": [0.25, 0.75], "episodes": 3}}
+    figures = rollout_figures("", 0.375) | {"task": "libero/all", "colors": None, "suites": parts}
+    played = PlayedResult("rollout-seen-libero", figures, {}, Played(0, 4, None))
+    rows = [*card._acting(card.inspection.InspectReport("run", "x", {}, rollouts=(played,)))]
+    place = next(i for i, row in enumerate(rows) if row.startswith("| libero/all |  | 4 | 37.5 %"))
+    assert rows[place + 1] == "| libero/goal, of these |  | 3 | 50.0 % (25.0 to 75.0) |"
+
+
 @pytest.mark.parametrize(
     ("interval", "said"), [((200.0, 300.0), "250 (200 to 300)"), (None, "250")]
 )

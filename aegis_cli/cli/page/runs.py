@@ -109,8 +109,8 @@ def successes(runs: Sequence[At]) -> Markup | None:
     apart = _otherwise(result for _, result in each)  # all empty where all were played alike
     rows = []
     for (label, result), otherwise in zip(each, apart, strict=True):
-        row = _success(label, result["figures"])
-        rows.append((*row, otherwise) if any(apart) else row)
+        for row in (_success(label, result["figures"]), *_by_suite(label, result["figures"])):
+            rows.append((*row, otherwise) if any(apart) else row)
     header = (
         "Run",
         "Task",
@@ -140,6 +140,13 @@ def _success(label: At, played: At) -> tuple[Child, ...]:
         share(played["wrong_target"]),
         "–" if distance.value is None else plain(distance),
     )
+
+
+def _by_suite(label: At, played: At) -> Iterator[tuple[Child, ...]]:
+    """A row of each suite, where a rollout is of several: LIBERO's four are told apart."""
+    for part in played["suites"]:
+        success = with_interval(part["success"], part["interval"], share)
+        yield label, f"{part.key}, of these", "–", whole(part["episodes"]), success, "–", "–"
 
 
 def _off(evaluated: At) -> Child:
