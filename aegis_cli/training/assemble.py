@@ -7,8 +7,9 @@ import shutil
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -53,6 +54,8 @@ from aegis_cli.training.validation_actions import ValidationActions
 from aegis_cli.training.validation_rollout import ValidationEpisodes
 from aegis_cli.training.validation_vqa import ValidationQuestions
 
+T = TypeVar("T")
+
 
 @dataclass
 class TrainingRun:
@@ -61,7 +64,7 @@ class TrainingRun:
     Attributes:
         ranks: the processes that take its steps together.
         plain: in the first process, a policy of the same shape whose weights are whole, by which a
-            sharded one is written; None where it is not sharded.
+            sharded one is written, and asked; None where it is not sharded.
         watched: the anchor's file, which stays memory-mapped.
         temporary: the checkpoint of an interruption, if the run has resumed from one; the next
             checkpoint replaces it.
@@ -99,6 +102,29 @@ class TrainingRun:
     episodes: ValidationEpisodes | None = None
     actions: ValidationActions | None = None
     told_of_drop: bool = False
+
+    @property
+    def shown(self) -> Policy:
+        """The policy that answers, acts and predicts while it trains, one with whole weights.
+
+        Where weights are sharded only the first process has it, and inside `by_whole` alone its
+        weights are those of the moment.
+        """
+        return self.policy if self.plain is None else self.plain
+
+    def by_whole(self, find: Callable[[Ranks], T]) -> T:
+        """What is found by `shown` as it is now, by all processes that have whole weights.
+
+        Where weights are sharded, the first process gathers them, finds it alone, and tells the
+        others, which wait.
+
+        Args:
+            find: what to do, with the processes that do it together.
+        """
+        if not parallel.is_sharded(self.policy):
+            return find(self.ranks)
+        with parallel.made_whole(self.policy, self.plain, self.ranks):
+            return self.ranks.by_first(partial(find, ALONE))
 
     @property
     def rates(self) -> list[dict[str, Any]]:

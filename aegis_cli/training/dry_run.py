@@ -174,7 +174,7 @@ def _planned(
     with loading_told("dry run", told):
         training = assemble.build(recipe, method, demos, anchor, out, on_event, ranks)
     training.questions = validation_vqa.chosen(recipe, training.policy.backbone, told)
-    training.episodes = validation_rollout.chosen(recipe, training.policy, training.meta, ranks)
+    training.episodes = validation_rollout.chosen(recipe, training.shown, training.meta, ranks)
     training.actions = validation_actions.chosen(
         recipe, training.policy, training.demos, training.meta
     )

@@ -8,9 +8,10 @@ and gradients arrive summed.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -59,7 +60,6 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
             )
     if shards(settings, ranks):
         _check_sharding(settings, method)
-        _check_nothing_is_watched(recipe)
     if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
             f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",
@@ -83,22 +83,6 @@ def _check_sharding(settings: Train, method: Method) -> None:
         )
     if settings.compile:
         raise AegisError("train.parallel: fsdp with train.compile", "one of the two", fix)
-
-
-def _check_nothing_is_watched(recipe: Recipe) -> None:
-    """Refuse to measure, while it trains, what no process has whole."""
-    watched = {
-        "probe.while_training": (recipe.probe.while_training, "write its answers", "probe"),
-        "rollout.while_training": (recipe.rollout.while_training, "act", "rollout"),
-        "train.validate_actions": (recipe.train.validate_actions, "predict actions", "evaluate"),
-    }
-    for key, (count, does, command) in watched.items():
-        if count is not None:
-            raise AegisError(
-                f"{key}: {count} with train.parallel: fsdp",
-                f"a model that each process has whole, to {does}",
-                f"delete {key}, and aegis {command} the checkpoints; or --set train.parallel=ddp",
-            )
 
 
 def shard(policy: Policy, precision: str, device: torch.device) -> None:
@@ -210,6 +194,25 @@ def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
         if name in weights:
             buffer.copy_(weights[name])
     return plain
+
+
+@contextlib.contextmanager
+def made_whole(policy: Policy, plain: Policy | None, ranks: Ranks) -> Generator[None]:
+    """Let a whole policy have a sharded one's weights inside the block, on the same device.
+
+    Args:
+        plain: the whole one, in the first process; it is on the CPU otherwise, since a GPU may have
+            no room for it beside a step.
+    """
+    weights = gathered(dict([*policy.named_parameters(), *policy.named_buffers()]), ranks)
+    if plain is not None:
+        filled(plain, weights).to(policy.backbone.device)
+    weights.clear()  # the copy on the CPU is as large as the policy
+    try:
+        yield
+    finally:
+        if plain is not None:
+            plain.to("cpu")
 
 
 def is_sharded(policy: Policy) -> bool:

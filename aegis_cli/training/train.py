@@ -37,6 +37,7 @@ from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import augment, demonstrations, mixture, spread
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
+from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models import flow
@@ -159,7 +160,7 @@ def run(
         is_finished = goes_on and _has_ended(out, recipe)
         if not is_finished:
             training.episodes = validation_rollout.chosen(
-                recipe, training.policy, training.meta, ranks
+                recipe, training.shown, training.meta, ranks
             )
             training.actions = validation_actions.chosen(
                 recipe, training.policy, training.demos, training.meta
@@ -202,12 +203,19 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
 
     A run that goes on asks them here too, before its checkpoint is put back.
     """
-    backbone = run.policy.backbone
-    questions = validation_vqa.chosen(run.recipe, backbone, on_event)
-    if questions is None:
+    backbone = run.shown.backbone
+    chosen = validation_vqa.chosen(run.recipe, backbone, on_event)
+    if chosen is None:
         return None
-    with run.masters.as_written(), _evaluating(run.policy):
-        questions = questions.asked_before(backbone, run.ranks, on_event)
+
+    def answered(ranks: Ranks) -> tuple[tuple[list[Graded], ...], float]:
+        # Without the questions' images, since a single process may have to tell all others.
+        found = chosen.asked_before(backbone, ranks, on_event)
+        return found.before, found.seconds
+
+    with run.masters.as_written(), _evaluating(run.shown):
+        before, seconds = run.by_whole(answered)
+    questions = dataclasses.replace(chosen, before=before, seconds=seconds)
     questions.warn_of_little_knowledge(run.recipe, on_event)
     return questions
 
@@ -899,16 +907,23 @@ def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, fl
     Raises:
         Diverged: a figure that is not finite, as an answer's likelihood can be.
     """
-    found: dict[str, float] = {}
-    with run.average.in_place(), run.masters.as_written(), _evaluating(run.policy):
+    if run.questions is None and run.episodes is None and run.actions is None:
+        return {}
+
+    def figures(ranks: Ranks) -> dict[str, float]:
+        found: dict[str, float] = {}
         if run.questions is not None:
             heard = hearing(run.questions.seconds)
-            found |= run.questions.figures(run.policy.backbone, run.ranks, heard)
+            found |= run.questions.figures(run.shown.backbone, ranks, heard)
         if run.episodes is not None:
-            found |= run.episodes.figures(run.ranks, hearing(run.episodes.seconds))
+            found |= run.episodes.figures(ranks, hearing(run.episodes.seconds))
         if run.actions is not None:
             heard = hearing(run.actions.seconds)
-            found |= run.actions.figures(run.policy, run.ranks, heard)
+            found |= run.actions.figures(run.shown, ranks, heard)
+        return found
+
+    with run.average.in_place(), run.masters.as_written(), _evaluating(run.shown):
+        found = run.by_whole(figures)
     check_finite(found, f"after step {finished}", LOWER, finished)
     return found
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 
 from aegis_cli.common.events import Event, OnEvent, Progress
-from aegis_cli.common.ranks import ALONE
+from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.training import train
@@ -58,21 +58,24 @@ def expected_s(work: Callable[[OnEvent], object]) -> float:
 def measured(run: TrainingRun, on_event: OnEvent) -> dict[str, float]:
     """About how many seconds the parts of one validation take, the loss and what is asked for.
 
-    Of several processes the first asks, acts and predicts, and questions are divided among all.
+    Of several processes the first asks, acts and predicts; questions are divided among all that
+    have whole weights.
     """
-    ranks, masters = run.ranks, run.masters
+    masters = run.masters
     parts = {"loss": (masters.rounded, partial(_loss_s, run))}
     # A backbone of which nothing learns is not asked again.
     if run.questions is not None and any(p.requires_grad for p in run.policy.backbone.parameters()):
-        asking = partial(_questions_s, run.questions, run.policy.backbone)
-        parts["questions"] = masters.as_written, lambda: ranks.by_first(asking) / ranks.count
+        asking = partial(_questions_s, run.questions, run.shown.backbone)
+        parts["questions"] = masters.as_written, partial(run.by_whole, asking)
     if run.episodes is not None:
-        parts["episodes"] = masters.as_written, partial(run.episodes.longest_s, ranks)
+        acting = partial(run.by_whole, run.episodes.longest_s)
+        parts["episodes"] = masters.as_written, acting
     if run.actions is not None:
-        predicting = partial(_actions_s, run.actions, run.policy)
-        parts["actions"] = masters.as_written, lambda: ranks.by_first(predicting)
+        predicting = partial(_actions_s, run.actions, run.shown)
+        parts["actions"] = masters.as_written, partial(run.by_whole, predicting)
     found: dict[str, float] = {}
     run.policy.eval()
+    run.shown.eval()
     on_event(Progress(_STAGE, 0, len(parts), "parts"))
     for name, (seen, measure) in parts.items():
         with seen():
@@ -86,13 +89,16 @@ def _loss_s(run: TrainingRun) -> float:
     return expected_s(partial(train.validation_loss, *given, run.ranks))
 
 
-def _questions_s(questions: ValidationQuestions, backbone: Backbone) -> float:
-    seconds = 0.0
-    for one in questions.asked:
-        alone = dataclasses.replace(questions, asked=(one,))
-        seconds += expected_s(partial(alone.asked_before, backbone, ALONE))
-    return seconds
+def _questions_s(questions: ValidationQuestions, backbone: Backbone, ranks: Ranks) -> float:
+    def asking() -> float:
+        seconds = 0.0
+        for one in questions.asked:
+            alone = dataclasses.replace(questions, asked=(one,))
+            seconds += expected_s(partial(alone.asked_before, backbone, ALONE))
+        return seconds
+
+    return ranks.by_first(asking) / ranks.count
 
 
-def _actions_s(actions: ValidationActions, policy: Policy) -> float:
-    return expected_s(partial(actions.figures, policy, ALONE))
+def _actions_s(actions: ValidationActions, policy: Policy, ranks: Ranks) -> float:
+    return ranks.by_first(lambda: expected_s(partial(actions.figures, policy, ALONE)))

@@ -171,9 +171,12 @@ def test_processes_plan_what_each_of_them_needs(
         probe=replace(settings.probe, while_training=8),
         rollout=replace(settings.rollout, while_training=2),
     )
-    job = Job(watched, "nullspace", demos_file, anchors, out)
-    watching = Planning(job, tmp_path / "watched")
-    run_together(2, [*plans.values(), watching])
+    watching = []
+    for way in plans:
+        shared = replace(watched, train=replace(watched.train, parallel=way))
+        job = Job(shared, "nullspace", demos_file, anchors, out)
+        watching.append(Planning(job, tmp_path / f"{way}-watched"))
+    run_together(2, [*plans.values(), *watching])
     alone = plan("nullspace")
     weights = 4e-6 * alone.parameters
     for way, planned in plans.items():
@@ -195,11 +198,12 @@ def test_processes_plan_what_each_of_them_needs(
         assert first["groups"] == alone.groups and first["parameters"] == alone.parameters
         assert first["validation_s"].keys() == {"loss"}
     # The first process asks, acts and predicts, and what it found is what all others tell.
-    first, second = (json.loads((watching.said / f"{k}.json").read_text()) for k in (0, 1))
-    found = first["validation_s"]
-    assert found.keys() == {"loss", "questions", "episodes", "actions"}
-    assert found.items() - second["validation_s"].items() <= {("loss", found["loss"])}
-    assert all(seconds > 0 for seconds in found.values())
+    for each in watching:
+        first, second = (json.loads((each.said / f"{k}.json").read_text()) for k in (0, 1))
+        found = first["validation_s"]
+        assert found.keys() == {"loss", "questions", "episodes", "actions"}
+        assert found.items() - second["validation_s"].items() <= {("loss", found["loss"])}
+        assert all(seconds > 0 for seconds in found.values())
     assert not out.exists()
 
 

@@ -30,10 +30,9 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.evaluation import kept_figures, open_loop
 from aegis_cli.evaluation.open_loop import OpenLoopReport
 from aegis_cli.inspection import folders
-from aegis_cli.methods import METHODS
 from aegis_cli.recipes import Kfac, Recipe
 from aegis_cli.reporting import gather
-from aegis_cli.training import checkpoint, dry_run, parallel, train, validation_actions
+from aegis_cli.training import checkpoint, dry_run, train, validation_actions
 
 COUNT = 9
 FIGURES = {"action_error", "action_error_low", "action_error_high"}
@@ -276,13 +275,6 @@ def test_actions_that_never_vary_are_refused_before_the_first_step(
     assert not (tmp_path / "run" / "recipe.yaml").exists()
     with pytest.raises(AegisError, match="never vary"):
         dry_run.run(predicting, "naive", demos, None, tmp_path / "run")
-
-
-def test_shares_of_the_weights_predict_nothing(predicting: Recipe) -> None:
-    sharded = replace(predicting, train=replace(PREDICTING, parallel="fsdp"))
-    with pytest.raises(AegisError, match="train.validate_actions: 9 with train.parallel: fsdp"):
-        parallel.check(sharded, METHODS["naive"], Ranks(1, 2))
-    parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
 
 
 def test_no_record_of_earlier_work_knows_the_key(predicting: Recipe) -> None:

@@ -29,13 +29,12 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import kept_figures, rollout
 from aegis_cli.inspection import folders
-from aegis_cli.methods import METHODS
 from aegis_cli.models import acting
 from aegis_cli.models.acting import RolloutReport
 from aegis_cli.recipes import Kfac, Nullspace, Recipe
 from aegis_cli.reporting import gather
 from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION
-from aegis_cli.training import checkpoint, dry_run, parallel, train, validation_rollout
+from aegis_cli.training import checkpoint, dry_run, train, validation_rollout
 
 COUNT, SEED = 2, 5
 FIGURES = {"rollout_success", "rollout_low", "rollout_high"}
@@ -357,14 +356,6 @@ def test_without_opengl_no_step_is_taken(
         start("naive", tmp_path / "run", recipe=playing)
     assert not (tmp_path / "run" / "recipe.yaml").exists()
     start("naive", tmp_path / "plain", recipe=without(playing))
-
-
-@pytest.mark.fast
-def test_shares_of_the_weights_do_not_act(playing: Recipe) -> None:
-    sharded = replace(playing, train=replace(SETTINGS, parallel="fsdp"))
-    with pytest.raises(AegisError, match="rollout.while_training: 2 with train.parallel: fsdp"):
-        parallel.check(sharded, METHODS["naive"], Ranks(1, 2))
-    parallel.check(sharded, METHODS["naive"], Ranks())  # one process has all of them
 
 
 @pytest.mark.fast
