@@ -8,7 +8,6 @@ task's steps (`loop`), the files (`files`), the report (`report`) and the probe 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -232,8 +231,7 @@ class StreamRun(ABC, Generic[S]):
     @property
     def inputs(self) -> dict[str, str]:
         """Digests of what the run is made from: a run goes on only with the same."""
-        part = files.canonical(recipes.training_part(self.recipe))
-        return {"recipe": hashlib.sha256(part.encode()).hexdigest()}
+        return {"recipe": files.sha256_value(recipes.training_part(self.recipe))}
 
     # --- what is measured -------------------------------------------------------------------------
 
@@ -361,8 +359,7 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     """
     path = run.out / STATE
     saved = artifacts.load(path, "training-state")
-    if saved.header.inputs != run.inputs:
-        different = changed_inputs(saved.header.inputs, run.inputs)
+    if different := changed_inputs(_as_written_now(run, saved.header.inputs), run.inputs):
         raise AegisError(
             f"another {', '.join(different)} than the run in '{run.out}' began with",
             "the same inputs",
@@ -387,6 +384,18 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
+
+
+def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:
+    """The inputs of a state, those of the run's own recipe as today's version names them.
+
+    An earlier version digested also the keys that came later and are at their defaults.
+    """
+    if not isinstance(run.recipe, RobotStreamRecipe):
+        return then
+    written, _ = recipes.read(run.out / "recipe.yaml")
+    earlier = files.sha256_value(recipes.earlier_training_part(run.recipe, written))
+    return {**then, "recipe": run.inputs["recipe"]} if then.get("recipe") == earlier else then
 
 
 def changed_inputs(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
