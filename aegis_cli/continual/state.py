@@ -145,7 +145,6 @@ class StreamRun(ABC, Generic[S]):
         out: the run folder.
         current: the task that is being learned.
         gaussians: what tells the tasks apart, one per task; none for a learner that need not know.
-        score_name: what a progress bar calls an entry of the matrix.
         partial_matrix: whether the matrix of the tasks so far is written after each of them.
     """
 
@@ -156,8 +155,12 @@ class StreamRun(ABC, Generic[S]):
     out: Path
     current: TaskInProgress = field(default_factory=TaskInProgress)
     gaussians: list[Gaussian] = field(default_factory=list)
-    score_name: ClassVar[str]
     partial_matrix: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def score_name(self) -> str:
+        """What a progress bar calls an entry of the matrix."""
 
     # --- what learns ------------------------------------------------------------------------------
 
