@@ -51,6 +51,10 @@ class HeldOut:
         errors = ActionErrors.of(demos, self._frames.at, anything, std)
         self.hold_error = mean(errors.held, errors.valid)
 
-    def error(self, policy: Policy, on_event: OnEvent) -> float:
-        """The policy's mean squared error over the variance of the training's actions."""
-        return self._frames.figures(policy, Ranks(), on_event)["action_error"]
+    def error(self, policy: Policy, on_event: OnEvent) -> tuple[float, list[float] | None]:
+        """The policy's mean squared error over the variance of the training's actions.
+
+        Beside it stands its 95 % interval by Student's t over episodes; None of a single one.
+        """
+        found = validation_actions.of_line(self._frames.figures(policy, Ranks(), on_event))
+        return found["relative_error"], found["relative_interval"]

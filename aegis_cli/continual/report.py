@@ -27,6 +27,7 @@ from aegis_cli.recipes import TEST
 from aegis_cli.training import folder
 
 Rows = tuple[tuple[float, ...], ...]
+Ends = Sequence[Sequence[float] | None]  # of the intervals of a row
 
 
 # --- a task ---------------------------------------------------------------------------------------
@@ -210,14 +211,20 @@ class RobotMatrix(Matrix):
     def measured_rows(self) -> Rows:
         """The triangle as it was measured."""
 
+    @property
+    def measured_intervals(self) -> Sequence[Ends]:
+        """The 95 % interval of each entry, where it has one."""
+        return ()
+
     @staticmethod
     @abstractmethod
     def of_measured(
-        rows: Sequence[Sequence[float]], held: Sequence[float | None]
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
     ) -> dict[str, Any]:
         """The triangle with its figures, by the names of a matrix.
 
         Args:
+            intervals: of each error, where errors are measured.
             held: of each task the error of holding the position, where errors are measured.
         """
 
@@ -254,7 +261,7 @@ class SuccessMatrix(RobotMatrix):
 
     @staticmethod
     def of_measured(
-        rows: Sequence[Sequence[float]], held: Sequence[float | None]
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
     ) -> dict[str, Any]:
         return {"success": as_rows(rows), "scores": seen_scores(rows)}
 
@@ -267,6 +274,7 @@ class ErrorMatrix(RobotMatrix):
         errors: row t with t + 1 entries: the error at held-out frames of task i after learning
             tasks 0 to t, the task told. It is the mean squared error over the variance of the
             training's actions, as `aegis evaluate` has it.
+        error_intervals: the 95 % interval of each, by Student's t over episodes; None of one.
         hold_errors: of each task the error of repeating the current position there; None where
             actions are no positions.
         scores: Average, Last and forgetting of the errors, of which less is better.
@@ -275,9 +283,10 @@ class ErrorMatrix(RobotMatrix):
 
     file = "error_matrix.json"
     score = "errors"
-    keys = ("tasks", "method", "errors", "hold_errors", "scores", "vqa")
+    keys = ("tasks", "method", "errors", "error_intervals", "hold_errors", "scores", "vqa")
 
     errors: Rows
+    error_intervals: tuple[tuple[tuple[float, float] | None, ...], ...]
     hold_errors: tuple[float | None, ...]
     scores: SeenScores
     vqa: tuple[VqaScore, ...]
@@ -290,12 +299,20 @@ class ErrorMatrix(RobotMatrix):
     def measured_rows(self) -> Rows:
         return self.errors
 
+    @property
+    def measured_intervals(self) -> Sequence[Ends]:
+        return self.error_intervals
+
     @staticmethod
     def of_measured(
-        rows: Sequence[Sequence[float]], held: Sequence[float | None]
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
     ) -> dict[str, Any]:
         return {
             "errors": as_rows(rows),
+            "error_intervals": tuple(
+                tuple(None if ends is None else (ends[0], ends[1]) for ends in row)
+                for row in intervals
+            ),
             "hold_errors": tuple(held)[: len(rows)],
             "scores": seen_error_scores(rows),
         }

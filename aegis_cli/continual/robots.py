@@ -28,6 +28,7 @@ from aegis_cli.common.state_dicts import check_state, outline, reading_meta, sha
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.held_out import HeldOut
 from aegis_cli.continual.report import (
+    Ends,
     ErrorMatrix,
     RecordedStreamReport,
     RobotStreamReport,
@@ -195,6 +196,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         self.demos[current.task].check_files()  # that nobody has written to them meanwhile
         # Each measurement activates what it measures; none relies on what the last one left.
         current.oracle.append(self.measuring.row(current.task))
+        if not self.recipe.simulated:
+            current.intervals.append(self.measuring.intervals(current.task))
         current.vqa.append(self.measuring.vqa())
         loss = self._validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
@@ -224,23 +227,26 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         # Without frozen experts, only the last row's weights are left.
         first = 0 if self.learner.frozen else count - 1
         rows = tuple(tuple(now[: t + 1]) for t in range(first, count))
-        measured = self.matrix([*before.measured_rows[:first], *rows])
+        ends = [self.measuring.intervals(t) for t in range(first, count)]
+        measured = self.matrix(
+            [*before.measured_rows[:first], *rows], [*before.measured_intervals[:first], *ends]
+        )
         # VQA has a score more than there are rows: the one before the first task.
         told = [(then.accuracy, then.cross_entropy) for then in before.vqa]
         vqa = vqa_scores([*told[: first + 1], *[known] * (count - first)])
         return dataclasses.replace(before, **measured, vqa=vqa), count - first
 
-    def matrix(self, rows: Sequence[Sequence[float]]) -> dict[str, Any]:
+    def matrix(self, rows: Sequence[Sequence[float]], intervals: Sequence[Ends]) -> dict[str, Any]:
         """What was measured of the tasks so far, with its figures, by a report's names."""
         kind = SuccessMatrix if self.recipe.simulated else ErrorMatrix
-        return kind.of_measured(rows, self.measuring.hold_errors)
+        return kind.of_measured(rows, intervals, self.measuring.hold_errors)
 
     def report(self) -> RobotStreamReport | RecordedStreamReport:
         current, common = self.current, self.summary()
         kind = RobotStreamReport if self.recipe.simulated else RecordedStreamReport
         return kind(
             **common,
-            **self.matrix(current.oracle),
+            **self.matrix(current.oracle, current.intervals),
             stream=", ".join(common["tasks"]),
             vqa=vqa_scores(current.vqa),
             inputs=self.inputs,
@@ -835,6 +841,10 @@ class RobotEvaluator:
         """Of each task the error of holding the position; none where a success is measured."""
         return ()
 
+    def intervals(self, done: int) -> list[list[float] | None]:
+        """Of each error of the tasks 0 to `done` its interval, as it was measured last."""
+        return []
+
     def row(self, done: int) -> list[float]:
         """What was measured after tasks 0 to t = `done`, of these alone."""
         return [self.tried(i) for i in range(done + 1)]
@@ -886,6 +896,7 @@ class HeldOutEvaluator(RobotEvaluator):
             HeldOut(task, shown, most, train.batch_size, train.chunk)
             for task, shown in zip(run.names, run.demos, strict=True)
         ]
+        self._intervals: dict[int, list[float] | None] = {}
 
     @property
     def hold_errors(self) -> Sequence[float | None]:
@@ -895,4 +906,8 @@ class HeldOutEvaluator(RobotEvaluator):
         """The error of the actions that are predicted in the task of that number."""
         self._run.activate(task)
         policy, on_event = self._run.policies[task].eval(), self._named(self._run.names[task])
-        return self._frames[task].error(policy, on_event)
+        error, self._intervals[task] = self._frames[task].error(policy, on_event)
+        return error
+
+    def intervals(self, done: int) -> list[list[float] | None]:
+        return [self._intervals[task] for task in range(done + 1)]

@@ -52,6 +52,8 @@ class TaskInProgress:
         masses: mean weights of the experts at the last check, per map.
         pruned, dropped: experts that left after phase 1, per map.
         records, oracle, inferred: what was found of the tasks learned so far.
+        intervals: the 95 % interval of each error in `oracle`, where errors are measured; None
+            where that is of one episode.
         vqa: accuracy and cross-entropy of a robot's backbone, before the first task and after each.
         window: losses since the last line of metrics.
     """
@@ -69,6 +71,7 @@ class TaskInProgress:
     records: list[dict[str, Any]] = field(default_factory=list)
     oracle: list[list[float]] = field(default_factory=list)
     inferred: list[list[float]] = field(default_factory=list)
+    intervals: list[list[list[float] | None]] = field(default_factory=list)
     vqa: list[list[float]] = field(default_factory=list)
     window: list[float] = field(default_factory=list)
 
@@ -103,6 +106,7 @@ class TaskInProgress:
             records=self.records,
             oracle=self.oracle,
             inferred=self.inferred,
+            intervals=self.intervals,
             vqa=self.vqa,
         )
 

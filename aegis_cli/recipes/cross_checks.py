@@ -193,19 +193,19 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     own = [task for task in recipe.tasks if not TASK.accepts(task)]
     simulated = [task for task in recipe.tasks if task not in own]
     near = did_you_mean(own[0], TASKS) if own else None
-    fix = "correct tasks." if near is None else f"did you mean '{near}'?"
+    fix = "correct tasks, or" if near is None else f"did you mean '{near}'? Or"
     if own and recipe.demos.paths is None:
         yield Problem(
             f"tasks: '{own[0]}', which is not simulated, without demos.paths",
             TASK.expected,
-            f"{fix} Or give the demonstrations of each task in demos.paths, if no simulator has it",
+            f"{fix} give the demonstrations of each task in demos.paths, if no simulator has it",
         )
         return
     if own and simulated:
         yield Problem(
             f"tasks: '{own[0]}', which is not simulated, beside '{simulated[0]}', which is",
             f"all tasks simulated ({TASK.expected}), or none: a stream is measured in one way",
-            f"{fix} Or give '{simulated[0]}' another name, if no simulator has it",
+            f"{fix} give '{simulated[0]}' another name, if no simulator has it",
         )
         return
     # What is not read is refused: whoever has set it has something in mind.

@@ -21,6 +21,7 @@ from samples.training_runs import contents
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.continual import files, probe, robots, state, train
+from aegis_cli.continual.held_out import HeldOut
 from aegis_cli.continual.report import RecordedStreamReport
 from aegis_cli.data import demonstrations, spread
 from aegis_cli.data.lerobot.write import NewEpisode
@@ -118,6 +119,7 @@ def test_errors_are_those_of_an_evaluation_of_held_out_frames(
         predicted = predict(run.policies[number].eval(), shown, at, 0, 4, "x")
         found = open_loop.compare(shown, at, predicted, np.array(shown.action_std))
         assert report.errors[-1][number] == pytest.approx(found.relative_error, rel=1e-6), task
+        assert report.error_intervals[-1][number] == pytest.approx(found.relative_interval)
         assert report.hold_errors[number] == pytest.approx(found.hold_error, rel=1e-12), task
 
 
@@ -139,7 +141,9 @@ def test_what_serves_a_learned_task_has_the_error_that_it_had(
 def test_nothing_is_called_a_success(method: str, done: Done) -> None:
     report, out = done(method)
     matrix = json.loads((out / "error_matrix.json").read_text())
-    assert matrix.keys() == {"tasks", "method", "errors", "hold_errors", "scores", "vqa"}
+    assert matrix.keys() == {
+        *("tasks", "method", "errors", "error_intervals", "hold_errors", "scores", "vqa")
+    }
     assert not (out / "success_matrix.json").exists()
     told = json.loads((out / "stream.json").read_text())
     assert "success" not in (out / "stream.json").read_text()
@@ -155,6 +159,7 @@ def test_a_probe_of_the_files_gives_the_same_errors(method: str, done: Done) -> 
     found = probe.run(out)
     assert found.largest_difference == 0 and found.measured == (2 if method == "igsp" else 1)
     assert found.to_json()["errors"] == report.errors
+    assert found.to_json()["error_intervals"] == report.error_intervals
     assert contents(out) == before
 
 
@@ -171,9 +176,16 @@ def test_where_actions_are_no_positions_there_is_no_error_of_holding_one(
 def test_an_error_that_is_no_number_ends_the_stream(
     real: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robots.HeldOutEvaluator, "row", lambda self, done: [float("inf")])
+    monkeypatch.setattr(HeldOut, "error", lambda *given: (float("inf"), None))
     with pytest.raises(Diverged, match="after task 'pick'"):
         train.run(real("sequential", steps=1), tmp_path / "run")
+
+
+def test_the_error_of_a_single_episode_has_no_interval(real: Make, tmp_path: Path) -> None:
+    recipe = real("sequential", steps=1, validation_share=0.05)
+    report = train.run(recipe, tmp_path / "run")
+    assert report.error_intervals == ((None,), (None, None))
+    assert probe.run(tmp_path / "run").error_intervals == report.error_intervals
 
 
 def test_two_tasks_take_their_episodes_of_one_dataset(

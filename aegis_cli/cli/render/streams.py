@@ -78,6 +78,9 @@ def _success(report: Any) -> list[RenderableType]:
 def _errors(report: Any) -> list[RenderableType]:
     """The open-loop errors, with those of holding the position, beside what the backbone knows."""
     header, rows = _beside_vqa(report, "Open-loop error", report.errors, _error)
+    if any(ends is not None for ends in report.error_intervals[-1]):
+        shown = ("-" if ends is None else _between(ends) for ends in report.error_intervals[-1])
+        rows.append(["95 % interval at the end", *shown, "-", "-", "-"])
     if any(error is not None for error in report.hold_errors):
         rows.append(["holding the position", *map(_error, report.hold_errors), "-", "-", "-"])
     s = report.scores
@@ -88,6 +91,11 @@ def _errors(report: Any) -> list[RenderableType]:
         plain_table(named, figures, left=0),
         Text(f"Errors are at held-out frames, {_UNIT}: 1 is that of always predicting their mean"),
     ]
+
+
+def _between(ends: Sequence[float]) -> str:
+    """The ends of an interval."""
+    return " to ".join(map(_error, ends))
 
 
 def _error(value: float | None) -> str:
