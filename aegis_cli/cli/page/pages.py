@@ -425,7 +425,7 @@ def _matrix_of(
         write=True,
     )
     written = [[tasks[k], *map(show, row)] for k, row in enumerate(rows)]
-    if errors:
+    if errors and any(error.value is not None for error in stream["hold_errors"]):
         written.append(["holding the position", *map(show, stream["hold_errors"])])
     figures = table(["After", *tasks], written)
     return [
