@@ -447,14 +447,7 @@ def load_policy(
     folder, device = Path(run), devices.pick()
     acts_in = devices.acting_precision(device, precision)
     if is_robot_stream_run(folder):
-        found = robots.load_policy(folder, task)
-        policy = found.policy.to(device)
-        policy.acts_in = acts_in
-        # A single picture needs no name.
-        cameras = found.cameras if len(found.cameras) > 1 else ()
-        return DeployedPolicy(
-            policy, found.task, cameras, found.replan, seed, found.sizes, ensemble=ensemble
-        )
+        return _of_stream(folder, task, device, acts_in, seed, ensemble)
     policy, meta = checkpoint.load_policy(folder)
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
@@ -469,6 +462,35 @@ def load_policy(
         checkpoint.sizes_of(meta),
         meta,
         meta.get("ensemble") if ensemble is None else ensemble,
+    )
+
+
+def _of_stream(
+    folder: Path,
+    task: str | None,
+    device: torch.device,
+    acts_in: str,
+    seed: int,
+    ensemble: float | None,
+) -> DeployedPolicy:
+    """The policy of one task of a stream."""
+    number = robots.number_of(folder, task)
+    run = robots.load_to_act(folder)
+    policy = run.policies[number]
+    policy.acts_in = acts_in
+    if run.recipe.simulated:
+        found = run.acting(number)
+        # A single picture needs no name.
+        cameras = found.cameras if len(found.cameras) > 1 else ()
+        return DeployedPolicy(
+            policy.to(device), found.task, cameras, found.replan, seed, found.sizes, None, ensemble
+        )
+    run.activate(number)
+    view, replan = run.views[number], run.recipe.rollout.replan
+    cameras = view.get("cameras", ())
+    sizes = checkpoint.sizes_of(view)
+    return DeployedPolicy(
+        policy.eval().to(device), None, cameras, replan, seed, sizes, view, ensemble
     )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -148,7 +149,11 @@ def test_of_a_stream_it_takes_a_picture_of_each_camera(
     """A single one needs no name there, either."""
     acting = Acting(make_policy().eval(), "libero/object", REPLAN, cameras)
     monkeypatch.setattr(deploy, "is_robot_stream_run", lambda _: True)
-    monkeypatch.setattr(robots, "load_policy", lambda *_: acting)
+    run = SimpleNamespace(
+        recipe=SimpleNamespace(simulated=True), policies=[acting.policy], acting=lambda _: acting
+    )
+    monkeypatch.setattr(robots, "number_of", lambda *_: 0)
+    monkeypatch.setattr(robots, "load_to_act", lambda _: run)
     found = load_policy(tmp_path, task="libero/object")
     several = len(cameras) > 1
     assert found.cameras == (cameras if several else ())

@@ -15,6 +15,7 @@ from aegis_cli.common.state_dicts import check_state, reading_meta
 from aegis_cli.continual import state
 from aegis_cli.continual.report import (
     ImageStreamReport,
+    RecordedStreamReport,
     RobotStreamReport,
     StreamReport,
     report_from,
@@ -62,8 +63,10 @@ def read(path: Path) -> StreamReport:
             f"continue it: {commands.aegis('train', path)}",
         )
     raw = files.load_json(path / REPORT)
-    kind = RobotStreamReport if recipes.is_robot_stream_run(path) else ImageStreamReport
     try:
+        kind: type[StreamReport] = ImageStreamReport
+        if recipes.is_robot_stream_run(path):
+            kind = RecordedStreamReport if "errors" in raw else RobotStreamReport
         return report_from(kind, raw, path)
     except (TypeError, ValueError, KeyError, AttributeError, ArithmeticError) as error:
         raise AegisError(

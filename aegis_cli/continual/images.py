@@ -59,12 +59,14 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
             tasks so far; none for a learner that does not compare them.
     """
 
-    score_name = "accuracy"
-
     encoder: DualEncoder
     tasks: tuple[StreamTask, ...]
     image_set: str
     prototypes: list[Tensor] = field(default_factory=list)
+
+    @property
+    def score_name(self) -> str:
+        return "accuracy"
 
     @property
     def model(self) -> DualEncoder:

@@ -15,12 +15,19 @@ from typing import Any, ClassVar
 
 from pydantic import TypeAdapter
 
-from aegis_cli.core.accuracy_matrix import SeenScores, StreamScores, reuse_rate
+from aegis_cli.core.accuracy_matrix import (
+    SeenScores,
+    StreamScores,
+    reuse_rate,
+    seen_error_scores,
+    seen_scores,
+)
 from aegis_cli.data.streams import mtil
 from aegis_cli.recipes import TEST
 from aegis_cli.training import folder
 
 Rows = tuple[tuple[float, ...], ...]
+Ends = Sequence[Sequence[float] | None]  # of the intervals of a row
 
 
 # --- a task ---------------------------------------------------------------------------------------
@@ -122,19 +129,21 @@ class Matrix(ABC):
         kind: what `aegis inspect` calls a run of such a stream.
         model_name: what the tables call the model that learns.
         file: name of the file that holds the matrix, whose keys are `keys`.
+        score: what the matrix holds.
     """
 
     kind: ClassVar[str]
     model_name: ClassVar[str]
     file: ClassVar[str]
     keys: ClassVar[tuple[str, ...]]
+    score: ClassVar[str]
 
     method: str
     tasks: tuple[str, ...]
 
     @abstractmethod
-    def shares(self) -> list[float]:
-        """All measured shares in [0, 1], in an order of their own."""
+    def figures(self) -> list[float]:
+        """All measured shares and errors, in an order of their own."""
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -162,6 +171,7 @@ class AccuracyMatrix(Matrix):
     kind = "stream-run"
     model_name = "encoder"
     file = "accuracy_matrix.json"
+    score = "accuracy"
     keys = ("tasks", "split", "method", "oracle", "inferred", "scores", "inferred_scores")
 
     split: str
@@ -170,7 +180,7 @@ class AccuracyMatrix(Matrix):
     scores: StreamScores
     inferred_scores: StreamScores
 
-    def shares(self) -> list[float]:
+    def figures(self) -> list[float]:
         return [share for row in (*self.oracle, *self.inferred) for share in row]
 
 
@@ -190,7 +200,37 @@ class VqaScore:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SuccessMatrix(Matrix):
+class RobotMatrix(Matrix):
+    """What policies reached on robot tasks, and what their backbone knows."""
+
+    kind = "robot-stream-run"
+    model_name = "backbone"
+
+    @property
+    @abstractmethod
+    def measured_rows(self) -> Rows:
+        """The triangle as it was measured."""
+
+    @property
+    def measured_intervals(self) -> Sequence[Ends]:
+        """The 95 % interval of each entry, where it has one."""
+        return ()
+
+    @staticmethod
+    @abstractmethod
+    def of_measured(
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
+    ) -> dict[str, Any]:
+        """The triangle with its figures, by the names of a matrix.
+
+        Args:
+            intervals: of each error, where errors are measured.
+            held: of each task the error of holding the position, where errors are measured.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessMatrix(RobotMatrix):
     """Success of a policy in closed loop, and what its backbone knows.
 
     Attributes:
@@ -203,18 +243,79 @@ class SuccessMatrix(Matrix):
             training.
     """
 
-    kind = "robot-stream-run"
-    model_name = "backbone"
     file = "success_matrix.json"
+    score = "success"
     keys = ("tasks", "method", "success", "scores", "vqa")
 
     success: Rows
     scores: SeenScores
     vqa: tuple[VqaScore, ...]
 
-    def shares(self) -> list[float]:
+    def figures(self) -> list[float]:
         success = [share for row in self.success for share in row]
         return success + [score.accuracy for score in self.vqa]
+
+    @property
+    def measured_rows(self) -> Rows:
+        return self.success
+
+    @staticmethod
+    def of_measured(
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
+    ) -> dict[str, Any]:
+        return {"success": as_rows(rows), "scores": seen_scores(rows)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorMatrix(RobotMatrix):
+    """Open-loop errors of a policy in tasks that no simulator has, and what its backbone knows.
+
+    Attributes:
+        errors: row t with t + 1 entries: the error at held-out frames of task i after learning
+            tasks 0 to t, the task told. It is the mean squared error over the variance of the
+            training's actions, as `aegis evaluate` has it.
+        error_intervals: the 95 % interval of each, by Student's t over episodes; None of one.
+        hold_errors: of each task the error of repeating the current position there; None where
+            actions are no positions.
+        scores: Average, Last and forgetting of the errors, of which less is better.
+        vqa: before the first task, and after each.
+    """
+
+    file = "error_matrix.json"
+    score = "errors"
+    keys = ("tasks", "method", "errors", "error_intervals", "hold_errors", "scores", "vqa")
+
+    errors: Rows
+    error_intervals: tuple[tuple[tuple[float, float] | None, ...], ...]
+    hold_errors: tuple[float | None, ...]
+    scores: SeenScores
+    vqa: tuple[VqaScore, ...]
+
+    def figures(self) -> list[float]:
+        errors = [error for row in self.errors for error in row]
+        return errors + [score.accuracy for score in self.vqa]
+
+    @property
+    def measured_rows(self) -> Rows:
+        return self.errors
+
+    @property
+    def measured_intervals(self) -> Sequence[Ends]:
+        return self.error_intervals
+
+    @staticmethod
+    def of_measured(
+        rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
+    ) -> dict[str, Any]:
+        return {
+            "errors": as_rows(rows),
+            "error_intervals": tuple(
+                tuple(None if ends is None else (ends[0], ends[1]) for ends in row)
+                for row in intervals
+            ),
+            "hold_errors": tuple(held)[: len(rows)],
+            "scores": seen_error_scores(rows),
+        }
 
 
 def vqa_scores(rows: Sequence[Sequence[float]]) -> tuple[VqaScore, ...]:
@@ -300,10 +401,15 @@ class ImageStreamReport(StreamReport, AccuracyMatrix):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStreamReport(StreamReport, SuccessMatrix):
-    """A stream of robot tasks, learned.
+    """A stream of simulated robot tasks, learned.
 
     `parameters` counts the action expert, scales, experts and routers.
     """
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedStreamReport(StreamReport, ErrorMatrix):
+    """A stream of robot tasks that no simulator has, learned; `parameters` counts as there."""
 
 
 def report_from(kind: type[StreamReport], raw: Mapping[str, Any], out: Path) -> StreamReport:
@@ -348,7 +454,7 @@ class StreamProbe(Matrix):
         measured: how many rows were measured, which are the last ones: all rows where what serves a
             learned task never changes, else the one of the end, since the weights of the other rows
             are gone. Those are as the training measured them.
-        largest_difference: largest difference between the measured shares and the training's.
+        largest_difference: largest difference between the measured figures and the training's.
         out: the run folder.
     """
 
@@ -367,11 +473,20 @@ class RobotStreamProbe(StreamProbe, SuccessMatrix):
     """The success on a stream of robot tasks and the backbone's knowledge, measured again."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecordedStreamProbe(StreamProbe, ErrorMatrix):
+    """The errors in a stream of robot tasks and the backbone's knowledge, measured again."""
+
+
 def probe_from(before: StreamReport, found: StreamReport, measured: int) -> StreamProbe:
     """The figures that were measured again, beside those of the training."""
-    kind = RobotStreamProbe if isinstance(found, SuccessMatrix) else ImageStreamProbe
-    pairs = zip(before.shares(), found.shares(), strict=True)
-    return kind(
+    kinds: dict[str, type[StreamProbe]] = {
+        SuccessMatrix.score: RobotStreamProbe,
+        ErrorMatrix.score: RecordedStreamProbe,
+        AccuracyMatrix.score: ImageStreamProbe,
+    }
+    pairs = zip(before.figures(), found.figures(), strict=True)
+    return kinds[found.score](
         **{key: getattr(found, key) for key in found.keys},
         measured=measured,
         largest_difference=max(abs(old - new) for old, new in pairs),

@@ -3,7 +3,8 @@
 The backbone's maps get experts with every task. The action expert learns whole with the first task
 and is frozen then; from the second task on low-rank experts adapt it too. With the task told, what
 served a learned task never changes. What is measured is the success in closed loop on the tasks so
-far, and what the backbone knows with no task active.
+far, or of tasks that no simulator has the error of the predicted actions on held-out episodes; and
+what the backbone knows with no task active.
 """
 
 from __future__ import annotations
@@ -12,23 +13,31 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
-from aegis_cli.common import artifacts, devices, gl
+from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import Event, OnEvent, Progress, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners
-from aegis_cli.continual.report import RobotStreamReport, StreamReport, as_rows, vqa_scores
+from aegis_cli.continual.held_out import HeldOut
+from aegis_cli.continual.report import (
+    Ends,
+    ErrorMatrix,
+    RecordedStreamReport,
+    RobotStreamReport,
+    StreamReport,
+    SuccessMatrix,
+    vqa_scores,
+)
 from aegis_cli.continual.state import StreamRun, changed_inputs
 from aegis_cli.core import routing
-from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.core.routing import Routed
 from aegis_cli.data import demonstrations, mixture, renaming, spread, task_episodes
 from aegis_cli.data.batch import Normalizer, RobotBatch
@@ -44,7 +53,7 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
-from aegis_cli.recipes import Demos, RobotStreamRecipe
+from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
@@ -79,7 +88,6 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         evaluator: what measures the run; None in a run that only acts.
     """
 
-    score_name = "success"
     partial_matrix = True
 
     policies: tuple[Policy, ...]
@@ -88,6 +96,10 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
     demos: tuple[Demonstrations, ...] = ()
     question_files: Mapping[str, str] = field(default_factory=dict)
     evaluator: RobotEvaluator | None = None
+
+    @property
+    def score_name(self) -> str:
+        return "success" if self.recipe.simulated else "action error"
 
     @property
     def model(self) -> Policy:
@@ -142,7 +154,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return {**super().inputs, "backbone": self.fingerprint, **digests, **self.question_files}
 
     def acting(self, task: int) -> Acting:
-        """The policy of the task of that number, which alone is active from here on."""
+        """The policy of the task of that number, which alone is active from here on.
+
+        Raises:
+            AegisError: no simulator has the task.
+        """
+        if not self.recipe.simulated:
+            raise no_simulator(self.out, self.names[task])
         self.activate(task)
         # The policies share backbone and action expert, and differ in their task's scales.
         policy, name, view = self.policies[task].eval(), self.names[task], self.views[task]
@@ -161,7 +179,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             AegisError: there are too few of them, or the backbone cannot read one.
         """
         self.question_files = source.sha256
-        self.evaluator = RobotEvaluator(self, source, on_event)
+        kind = RobotEvaluator if self.recipe.simulated else HeldOutEvaluator
+        self.evaluator = kind(self, source, on_event)
 
     @property
     def measuring(self) -> RobotEvaluator:
@@ -177,9 +196,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         self.demos[current.task].check_files()  # that nobody has written to them meanwhile
         # Each measurement activates what it measures; none relies on what the last one left.
         current.oracle.append(self.measuring.row(current.task))
+        if not self.recipe.simulated:
+            current.intervals.append(self.measuring.intervals(current.task))
         current.vqa.append(self.measuring.vqa())
         loss = self._validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
+        if not self.recipe.simulated:
+            figures["action error"] = current.oracle[-1][-1]
         where = f"after task '{self.names[current.task]}'"
         check_finite(figures, where, self.slower(self.parameters()), self.recipe.train.steps)
         return {"validation_loss": loss}
@@ -192,34 +215,39 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         policy = self.policies[number].eval()
         return train.validation_loss(policy, self.demos[number], settings, noise)
 
-    def measure_again(
-        self, before: StreamReport, on_event: OnEvent
-    ) -> tuple[RobotStreamReport, int]:
+    def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
         """Every task is tried once: with frozen experts a column has one policy in all rows."""
-        assert isinstance(before, RobotStreamReport)
+        assert isinstance(before, SuccessMatrix | ErrorMatrix)
         count = len(self.names)
         now = []
         for task in range(count):
-            now.append(self.measuring.success(task))
+            now.append(self.measuring.tried(task))
             on_event(Progress("probe", task + 1, count, "tasks"))
         known = self.measuring.vqa()
         # Without frozen experts, only the last row's weights are left.
         first = 0 if self.learner.frozen else count - 1
         rows = tuple(tuple(now[: t + 1]) for t in range(first, count))
-        success = (*before.success[:first], *rows)
+        ends = [self.measuring.intervals(t) for t in range(first, count)]
+        measured = self.matrix(
+            [*before.measured_rows[:first], *rows], [*before.measured_intervals[:first], *ends]
+        )
         # VQA has a score more than there are rows: the one before the first task.
         told = [(then.accuracy, then.cross_entropy) for then in before.vqa]
         vqa = vqa_scores([*told[: first + 1], *[known] * (count - first)])
-        found = dataclasses.replace(before, success=success, scores=seen_scores(success), vqa=vqa)
-        return found, count - first
+        return dataclasses.replace(before, **measured, vqa=vqa), count - first
 
-    def report(self) -> RobotStreamReport:
+    def matrix(self, rows: Sequence[Sequence[float]], intervals: Sequence[Ends]) -> dict[str, Any]:
+        """What was measured of the tasks so far, with its figures, by a report's names."""
+        kind = SuccessMatrix if self.recipe.simulated else ErrorMatrix
+        return kind.of_measured(rows, intervals, self.measuring.hold_errors)
+
+    def report(self) -> RobotStreamReport | RecordedStreamReport:
         current, common = self.current, self.summary()
-        return RobotStreamReport(
+        kind = RobotStreamReport if self.recipe.simulated else RecordedStreamReport
+        return kind(
             **common,
+            **self.matrix(current.oracle, current.intervals),
             stream=", ".join(common["tasks"]),
-            success=as_rows(current.oracle),
-            scores=seen_scores(current.oracle),
             vqa=vqa_scores(current.vqa),
             inputs=self.inputs,
         )
@@ -264,8 +292,9 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         AegisError: inputs that do not fit together; nothing has been recorded then.
     """
     source = questions(recipe, on_event)  # a bad set shows before anything is recorded
-    gl.check()
-    for task in recipe.tasks:
+    if recipe.simulated:
+        gl.check()
+    for task in recipe.tasks if recipe.simulated else ():
         if recipe.demos.paths is None:
             sim.check_recordable(task)
         else:
@@ -274,7 +303,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
     _check_given(recipe)
-    for task in recipe.tasks:
+    for task in recipe.tasks if recipe.simulated else ():
         _check_words(backbone, task)
     # Only now, when all else has been found to fit: recording takes long.
     demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
@@ -283,10 +312,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    views = [assemble.view(shown, backbone) for shown in demos]
-    if recipe.demos.rename is not None:
-        for view in views:
-            view["rename"] = recipe.demos.rename
+    views = [_view(recipe, shown, backbone) for shown in demos]
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
     run.measure_with(source, on_event)
     return run
@@ -301,8 +327,8 @@ def load(
         before: the run's report.
 
     Raises:
-        AegisError: files that are missing, damaged or of another backbone, or other questions than
-            the run was measured with.
+        AegisError: files that are missing, damaged or of another backbone, or other questions or
+            held-out episodes than the run was measured with.
     """
     run = load_to_act(path)
     source = questions(recipe, on_event)
@@ -313,8 +339,31 @@ def load(
             "the same files",
             "bring them back, or train the stream again in another --out",
         )
+    if not recipe.simulated:
+        run.demos = _as_learned(recipe, run, before, on_event)
     run.measure_with(source, on_event)
     return run
+
+
+def _as_learned(
+    recipe: RobotStreamRecipe, run: RobotStreamRun, before: StreamReport, on_event: OnEvent
+) -> tuple[Demonstrations, ...]:
+    """The demonstrations that a finished run has learned from, for its held-out episodes.
+
+    Raises:
+        AegisError: they are gone, or others than the run learned from.
+    """
+    count, backbone = len(recipe.tasks), run.model.backbone
+    demos = tuple(_demos(recipe, i, backbone, run.out, on_event) for i in range(count))
+    now = {f"demos of {task}": d.sha256 for task, d in zip(recipe.tasks, demos, strict=True)}
+    then = {name: before.inputs.get(name, "") for name in now}
+    if changed := changed_inputs(then, now):
+        raise AegisError(
+            f"other {', '.join(changed)} than the run in '{run.out}' learned from",
+            "the same demonstrations, whose held-out episodes it was measured on",
+            "bring them back, or train the stream again in another --out",
+        )
+    return demos
 
 
 def load_to_act(path: Path) -> RobotStreamRun:
@@ -400,11 +449,34 @@ def _assemble(
 
 
 def load_policy(path: Path, task: str | None) -> Acting:
-    """The policy of one of a run's tasks, ready to act.
+    """The policy of one of a run's tasks, ready to act in simulation.
 
     Raises:
-        AegisError: a task that the run has not learned, or none named, or what `load_to_act` finds
-            wrong.
+        AegisError: a task that the run has not learned, or none named, or that no simulator has, or
+            what `load_to_act` finds wrong.
+    """
+    number = number_of(path, task)
+    recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
+    if not recipe.simulated:  # before a large backbone is loaded
+        raise no_simulator(path, recipe.tasks[number])
+    return load_to_act(path).acting(number)
+
+
+def no_simulator(run: Path, task: str) -> AegisError:
+    """What is wrong with playing a task that is not simulated."""
+    return AegisError(
+        f"'{task}' of the stream in '{run}', a task that no simulator has",
+        "a simulated task, to be played",
+        f"let the robot act: {commands.aegis('serve', run, '--task', task)}; how far its actions "
+        f"are from held-out ones, {commands.aegis('inspect', run)} shows",
+    )
+
+
+def number_of(path: Path, task: str | None) -> int:
+    """The number of one of a run's tasks.
+
+    Raises:
+        AegisError: a task that the run has not learned, or none named.
     """
     known = files.read(path).tasks
     if task not in known:
@@ -414,8 +486,7 @@ def load_policy(path: Path, task: str | None) -> Acting:
             f"one of its tasks: {', '.join(known)}",
             f"--task {known[0]}",
         )
-    run = load_to_act(path)
-    return run.acting(known.index(task))
+    return known.index(task)
 
 
 def _checked_shape(
@@ -455,9 +526,23 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
         views = list(saved.header.meta.get("views", [{}] * tasks))
         if len(views) != tasks:
             raise ValueError(f"'views' of {len(views)} tasks for {tasks}")
-        for view in views:
+        for i, view in enumerate(views):
             policy_meta.check_view(view)
+            sizes = (len(saved.tensors[f"tasks.{i}.{kind}.mean"]) for kind in ("action", "proprio"))
+            policy_meta.check_recorded(view, *sizes)
     return views
+
+
+def _view(recipe: RobotStreamRecipe, shown: Demonstrations, backbone: Backbone) -> PolicyMeta:
+    """How a task's policy looks; of a robot that is not simulated also what its numbers are."""
+    found = assemble.view(shown, backbone)
+    if recipe.demos.rename is not None:
+        found["rename"] = recipe.demos.rename
+    if recipe.simulated:
+        return found
+    if "state" in (chosen := recipes.selected(recipe)):
+        found["state"] = chosen["state"]
+    return cast(PolicyMeta, {**found, **shown.recorded})
 
 
 def _scale(tensors: Mapping[str, Tensor], task: int, kind: str) -> Normalizer:
@@ -525,6 +610,9 @@ def _check_given(recipe: RobotStreamRecipe) -> None:
         if selection.only is not None:
             count = demonstrations.count_episodes(path)
             demonstrations.learned_from(path, count, selection.only)
+        if not recipe.simulated:
+            robot = mixture.robot_of(path, selection)  # with its cameras and features
+            _check_task(robot.task, recipe.tasks[number], path)
 
 
 def _demos(
@@ -549,20 +637,34 @@ def _demos(
     )
     if found.task is None:
         found = loading.of_named_task(found, task, recipe.demos.rename or {})
-    if found.task != task:
-        of = f"'{found.task}'" if found.task else "no simulated task"
-        raise AegisError(
-            f"demonstrations of {of} in '{path}' for the task '{task}'",
-            "one and the same task",
-            f"record with: aegis demos {task}"
-            if sim.of_datasets(task) is None
-            else "correct tasks, or demos.paths",
-        )
+    _check_task(found.task, task, path)
     if sim.of_datasets(task) is not None:
         task_episodes.check_own(found.texts, task, f"'{path}'")
     # An unknown word must end no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
+
+
+def _check_task(recorded: str | None, task: str, path: Path) -> None:
+    """Raise AegisError unless what was recorded is a task of the stream, or no simulated one.
+
+    Args:
+        recorded: the simulated task that the demonstrations are of; None of any other.
+        task: the recipe's.
+    """
+    if recorded == (task if TASK.accepts(task) else None):
+        return
+    of = "no simulated task" if recorded is None else f"'{recorded}'"
+    fix = f"record with: aegis demos {task}"
+    if not TASK.accepts(task):
+        fix = f"call the task '{recorded}' in tasks, or correct demos.paths"
+    elif sim.of_datasets(task) is not None:
+        fix = "correct tasks, or demos.paths"
+    elif recorded is None:
+        fix += "; or give the task, if it is another robot's, a name of your own in tasks"
+    raise AegisError(
+        f"demonstrations of {of} in '{path}' for the task '{task}'", "one and the same task", fix
+    )
 
 
 def _source(
@@ -591,7 +693,15 @@ def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
     if demos.only is not None:
         return path, demos.selection(demos.only[number])
     of_each = [demos.of_task(i) for i in range(len(recipe.tasks))]
-    only = demonstrations.part_of(path, recipe.tasks[number], of_each.count(named) > 1)
+    shared = of_each.count(named) > 1
+    if shared and not recipe.simulated:
+        raise AegisError(
+            f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
+            "would learn",
+            "demonstrations of its own for each task, or which of these episodes are whose",
+            "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
+        )
+    only = demonstrations.part_of(path, recipe.tasks[number], shared)
     return path, demos.selection(only)
 
 
@@ -726,9 +836,22 @@ class RobotEvaluator:
         seed = run.recipe.probe.seed
         self._asked = source.choose(part, count, seed, [check], on_event)
 
+    @property
+    def hold_errors(self) -> Sequence[float | None]:
+        """Of each task the error of holding the position; none where a success is measured."""
+        return ()
+
+    def intervals(self, done: int) -> list[list[float] | None]:
+        """Of each error of the tasks 0 to `done` its interval, as it was measured last."""
+        return []
+
     def row(self, done: int) -> list[float]:
-        """S[t, :] after tasks 0 to t = `done`, of these alone."""
-        return [self.success(i) for i in range(done + 1)]
+        """What was measured after tasks 0 to t = `done`, of these alone."""
+        return [self.tried(i) for i in range(done + 1)]
+
+    def tried(self, task: int) -> float:
+        """How the task of that number is done now."""
+        return self.success(task)
 
     def success(self, task: int) -> float:
         """Share of successes of the task of that number, or of the highest return."""
@@ -761,3 +884,30 @@ class RobotEvaluator:
             self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
 
         return passed_on
+
+
+class HeldOutEvaluator(RobotEvaluator):
+    """Predictions at held-out frames with the task told, and questions with no task active."""
+
+    def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
+        super().__init__(run, source, on_event)
+        most, train = run.recipe.rollout.frames, run.recipe.train
+        self._frames = [
+            HeldOut(task, shown, most, train.batch_size, train.chunk)
+            for task, shown in zip(run.names, run.demos, strict=True)
+        ]
+        self._intervals: dict[int, list[float] | None] = {}
+
+    @property
+    def hold_errors(self) -> Sequence[float | None]:
+        return [frames.hold_error for frames in self._frames]
+
+    def tried(self, task: int) -> float:
+        """The error of the actions that are predicted in the task of that number."""
+        self._run.activate(task)
+        policy, on_event = self._run.policies[task].eval(), self._named(self._run.names[task])
+        error, self._intervals[task] = self._frames[task].error(policy, on_event)
+        return error
+
+    def intervals(self, done: int) -> list[list[float] | None]:
+        return [self._intervals[task] for task in range(done + 1)]

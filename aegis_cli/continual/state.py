@@ -8,7 +8,6 @@ task's steps (`loop`), the files (`files`), the report (`report`) and the probe 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -53,6 +52,8 @@ class TaskInProgress:
         masses: mean weights of the experts at the last check, per map.
         pruned, dropped: experts that left after phase 1, per map.
         records, oracle, inferred: what was found of the tasks learned so far.
+        intervals: the 95 % interval of each error in `oracle`, where errors are measured; None
+            where that is of one episode.
         vqa: accuracy and cross-entropy of a robot's backbone, before the first task and after each.
         window: losses since the last line of metrics.
     """
@@ -70,6 +71,7 @@ class TaskInProgress:
     records: list[dict[str, Any]] = field(default_factory=list)
     oracle: list[list[float]] = field(default_factory=list)
     inferred: list[list[float]] = field(default_factory=list)
+    intervals: list[list[list[float] | None]] = field(default_factory=list)
     vqa: list[list[float]] = field(default_factory=list)
     window: list[float] = field(default_factory=list)
 
@@ -104,6 +106,7 @@ class TaskInProgress:
             records=self.records,
             oracle=self.oracle,
             inferred=self.inferred,
+            intervals=self.intervals,
             vqa=self.vqa,
         )
 
@@ -146,7 +149,6 @@ class StreamRun(ABC, Generic[S]):
         out: the run folder.
         current: the task that is being learned.
         gaussians: what tells the tasks apart, one per task; none for a learner that need not know.
-        score_name: what a progress bar calls an entry of the matrix.
         partial_matrix: whether the matrix of the tasks so far is written after each of them.
     """
 
@@ -157,8 +159,12 @@ class StreamRun(ABC, Generic[S]):
     out: Path
     current: TaskInProgress = field(default_factory=TaskInProgress)
     gaussians: list[Gaussian] = field(default_factory=list)
-    score_name: ClassVar[str]
     partial_matrix: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def score_name(self) -> str:
+        """What a progress bar calls an entry of the matrix."""
 
     # --- what learns ------------------------------------------------------------------------------
 
@@ -232,8 +238,7 @@ class StreamRun(ABC, Generic[S]):
     @property
     def inputs(self) -> dict[str, str]:
         """Digests of what the run is made from: a run goes on only with the same."""
-        part = files.canonical(recipes.training_part(self.recipe))
-        return {"recipe": hashlib.sha256(part.encode()).hexdigest()}
+        return {"recipe": files.sha256_value(recipes.training_part(self.recipe))}
 
     # --- what is measured -------------------------------------------------------------------------
 
@@ -361,8 +366,7 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     """
     path = run.out / STATE
     saved = artifacts.load(path, "training-state")
-    if saved.header.inputs != run.inputs:
-        different = changed_inputs(saved.header.inputs, run.inputs)
+    if different := changed_inputs(_as_written_now(run, saved.header.inputs), run.inputs):
         raise AegisError(
             f"another {', '.join(different)} than the run in '{run.out}' began with",
             "the same inputs",
@@ -387,6 +391,18 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
+
+
+def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:
+    """The inputs of a state, those of the run's own recipe as today's version names them.
+
+    An earlier version digested also the keys that came later and are at their defaults.
+    """
+    if not isinstance(run.recipe, RobotStreamRecipe):
+        return then
+    written, _ = recipes.read(run.out / "recipe.yaml")
+    earlier = files.sha256_value(recipes.earlier_training_part(run.recipe, written))
+    return {**then, "recipe": run.inputs["recipe"]} if then.get("recipe") == earlier else then
 
 
 def changed_inputs(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -4,7 +4,8 @@
     experts.safetensors  routing.safetensors   of a learner with experts
     encoder/, backbone/                        of one that trains the model itself
     expert.safetensors                         a robot's action expert, and scales per task
-    accuracy_matrix.json, success_matrix.json  of images, of robots
+    accuracy_matrix.json                       of images
+    success_matrix.json, error_matrix.json     of robots: simulated ones, others
     parameters.json  stream.json
     state.safetensors                          what --resume needs; gone when the stream is done
     ../demos/                                  what was recorded, for all runs beside this one

@@ -34,7 +34,7 @@ class StreamScores:
 
 @dataclass(frozen=True)
 class SeenScores:
-    """Figures for tasks that cannot be tried before they are learned: shares in [0, 1].
+    """Figures for tasks that cannot be tried before they are learned: shares in [0, 1], or errors.
 
     They read the entries with t >= i alone.
     """
@@ -61,6 +61,16 @@ def seen_scores(rows: Rows) -> SeenScores:
     """The figures of a triangle: row t has t + 1 entries, of the tasks learned so far."""
     average = _mean([accuracy for row in rows for accuracy in row])
     return SeenScores(average, _mean(rows[-1]), _forgetting(rows))
+
+
+def seen_error_scores(rows: Rows) -> SeenScores:
+    """The figures of a triangle of errors, of which less is better.
+
+    Forgetting is by how much the errors have grown: the final one less the smallest since the task
+    was learned.
+    """
+    found = seen_scores([[-error for error in row] for row in rows])
+    return SeenScores(-found.average, -found.last, found.forgetting)
 
 
 def _forgetting(rows: Rows) -> float | None:

@@ -72,7 +72,7 @@ def check(meta: PolicyMeta, actions: int, positions: int) -> None:
         if name not in meta:
             raise ValueError(f"no '{name}'")
     _check_types(meta)
-    _check_recorded(meta, actions, positions)
+    check_recorded(meta, actions, positions)
 
 
 def _check_types(meta: PolicyMeta) -> None:
@@ -106,7 +106,7 @@ def check_view(meta: PolicyMeta) -> None:
         raise ValueError(f"'rename' is {meta['rename']!r}")
 
 
-def _check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:
+def check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:
     """Raise ValueError unless names, spread and rate, where there are any, are of such a robot.
 
     Checkpoints that were written before these were kept have none of them.

@@ -45,6 +45,7 @@ from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Tow
 from aegis_cli.recipes.reader import (
     digest,
     drawn,
+    earlier_training_part,
     every_key,
     from_mapping,
     is_robot_stream_run,
@@ -164,6 +165,7 @@ __all__ = [
     "describe",
     "digest",
     "drawn",
+    "earlier_training_part",
     "every_key",
     "from_mapping",
     "is_robot_stream_run",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.data.vqa.gate import MEAN
@@ -13,13 +14,14 @@ from aegis_cli.recipes.policy import (
     MERGE_UNREAD,
     NEEDS,
     SUITE,
+    TASK,
     TASKS,
     Recipe,
     Train,
 )
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
-from aegis_cli.recipes.streams import RobotDemos, RobotStreamRecipe, StreamRecipe
-from aegis_cli.recipes.strict_yaml import Problem, refuse
+from aegis_cli.recipes.streams import RobotDemos, RobotRollout, RobotStreamRecipe, StreamRecipe
+from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, refuse
 
 _NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
 
@@ -158,6 +160,7 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _demos_checks(recipe.demos, len(recipe.tasks))
+    yield from _task_checks(recipe)
     plain = [task for task in recipe.tasks if task not in TASKS]
     if recipe.expert.start is not None:
         found = f"expert.start: {recipe.expert.start} with a stream"
@@ -180,9 +183,41 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     if not isinstance(recipe.probe.vqa, str):
         found = f"probe.vqa: {', '.join(recipe.probe.vqa)} with a stream"
         yield Problem(found, "one set of questions", f"set probe.vqa to {recipe.probe.vqa[0]}")
-    if plain and "colors" in changed(recipe.rollout):
+    if recipe.simulated and plain and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {recipe.rollout.colors} with task {plain[0]}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
+
+
+def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
+    """Whether all tasks are simulated or none is, and what measures them is theirs."""
+    own = [task for task in recipe.tasks if not TASK.accepts(task)]
+    simulated = [task for task in recipe.tasks if task not in own]
+    near = did_you_mean(own[0], TASKS) if own else None
+    fix = "correct tasks, or" if near is None else f"did you mean '{near}'? Or"
+    if own and recipe.demos.paths is None:
+        yield Problem(
+            f"tasks: '{own[0]}', which is not simulated, without demos.paths",
+            TASK.expected,
+            f"{fix} give the demonstrations of each task in demos.paths, if no simulator has it",
+        )
+        return
+    if own and simulated:
+        yield Problem(
+            f"tasks: '{own[0]}', which is not simulated, beside '{simulated[0]}', which is",
+            f"all tasks simulated ({TASK.expected}), or none: a stream is measured in one way",
+            f"{fix} give '{simulated[0]}' another name, if no simulator has it",
+        )
+        return
+    # What is not read is refused: whoever has set it has something in mind.
+    read = {"frames", "replan"} if own else {f.name for f in fields(RobotRollout)} - {"frames"}
+    for name in sorted(changed(recipe.rollout).keys() - read):
+        found = f"rollout.{name}: {getattr(recipe.rollout, name)} with task {recipe.tasks[0]}"
+        expected = (
+            "rollout.frames and rollout.replan alone: no simulator plays this task"
+            if own
+            else "no such key: a simulated task is played, and no recorded frame looked at"
+        )
+        yield Problem(found, expected, f"delete rollout.{name}")
 
 
 def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:

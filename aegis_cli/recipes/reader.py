@@ -29,6 +29,7 @@ _READS: dict[str | None, str] = {
     "pretrain": "a recipe for `aegis pretrain`",
 }
 _STREAMS = (StreamRecipe, RobotStreamRecipe)
+_WRITTEN_WHOLE = ("train", "expert", "probe")  # see `earlier_training_part`
 
 
 def load(
@@ -176,27 +177,49 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     """
     # What this returns is compared with what a run's folder holds, of any earlier version: a key
     # that is added here may only stand in it with a value that no older run had.
+    part: dict[str, Any]
     if isinstance(recipe, RobotStreamRecipe):
-        everything = dataclasses.asdict(recipe)
-        own = ("tasks", "backbone", "seed", "train", "expert", "rollout", "probe")
-        part = {key: everything[key] for key in own} | {recipe.train.method: options(recipe)}
+        part = {key: getattr(recipe, key) for key in ("tasks", "backbone", "seed")}
+        part |= {key: recorded(getattr(recipe, key)) for key in (*_WRITTEN_WHOLE, "rollout")}
         if chosen := selected(recipe):
             part["demos"] = chosen
-        return part | {"rollout": recorded(recipe.rollout)}
+        return part | _own_part(recipe)
     if isinstance(recipe, StreamRecipe):
-        shared = ["stream", "order", "encoder", "seed", "train", "inference"]
+        part = {key: getattr(recipe, key) for key in ("stream", "order", "encoder", "seed")}
+        part |= {key: recorded(getattr(recipe, key)) for key in ("train", "inference")}
         if recipe.split != TEST:
-            shared.append("split")
-        everything = dataclasses.asdict(recipe)
-        return {key: everything[key] for key in shared} | {recipe.train.method: options(recipe)}
-    part: dict[str, Any] = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
+            part["split"] = recipe.split
+        return part | _own_part(recipe)
+    part = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
     # Any number of processes trains the same weights, however they share them.
     part["train"].pop("parallel", None)
     if chosen := drawn(recipe):  # the digest of the data says nothing of the choice
         part["demos"] = chosen
+    return part | _own_part(recipe)
+
+
+def earlier_training_part(recipe: RobotStreamRecipe, written: Mapping[str, Any]) -> dict[str, Any]:
+    """What an earlier version took for the training part of a run whose `recipe.yaml` it wrote.
+
+    It wrote every key that it knew, and every one of some sections was in the part, also those that
+    came later and were at their defaults.
+
+    Args:
+        written: the raw keys of that file.
+    """
+    part = training_part(recipe)
+    for name, section in ((name, getattr(recipe, name)) for name in _WRITTEN_WHOLE):
+        known = written.get(name) or {}
+        values = dataclasses.asdict(section)
+        part[name] = {key: value for key, value in values.items() if key in known}
+    return part
+
+
+def _own_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
+    """What counts of the options of `recipe.train.method`."""
     own = _own_section(recipe)
-    return part | {recipe.train.method: {} if own is None else recorded(own)}
+    return {recipe.train.method: {} if own is None else recorded(own)}
 
 
 def selected(recipe: Recipe | RobotStreamRecipe) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from aegis_cli.recipes.keys import (
     SEED,
     SHARE,
     UP_TO_ONE,
+    Check,
     choice,
     key,
     section,
@@ -29,6 +30,7 @@ from aegis_cli.recipes.policy import (
     PART,
     PRECISIONS,
     TASK,
+    TASKS,
     Expert,
     Probe,
 )
@@ -49,6 +51,13 @@ UNREAD_RATES: Mapping[str, Mapping[str, str | None]] = {
     "sequential": {"train.lr": "sequential.lr", "train.router_lr": None},
     "moe-adapters": {"train.router_lr": "moe_adapters.router_lr"},
 }
+# A task's name in a stream: a simulated one's, or somebody's own. Which of both a stream may have,
+# the cross-checks know.
+STREAM_TASK = Check(
+    f"{TASK.expected}; or where no simulator has them, names of your own ({FOLDER_NAME.expected})",
+    lambda v: TASK.accepts(v) or FOLDER_NAME.accepts(v),
+    TASKS,
+)
 SPLITS = ("evaluation", "validation")  # of episodes and questions
 PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
 
@@ -232,7 +241,10 @@ class RobotDemos:
 
 @section
 class RobotRollout:
-    """How success is measured after each task of a stream."""
+    """How each task of a stream so far is measured after each of them.
+
+    Simulated ones are played; of others, actions are predicted at held-out frames.
+    """
 
     episodes: int = key(MADE, default=50, doc="Number of episodes per task.")
     seed: int = key(
@@ -249,6 +261,13 @@ class RobotRollout:
         default="evaluation",
         doc="Episodes and questions that figures are of; validation takes others, to choose "
         "settings on.",
+    )
+    frames: int = key(
+        POSITIVE,
+        default=1000,
+        later=True,
+        doc="Held-out frames per task, at most, at which actions are predicted where no simulator "
+        "has the tasks.",
     )
 
 
@@ -425,7 +444,11 @@ class RobotStreamRecipe:
     """Lets a policy learn several robot tasks one after the other."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run.")
-    tasks: tuple[str, ...] = key(TASK, doc="Tasks in the order in which they are learned.")
+    tasks: tuple[str, ...] = key(
+        STREAM_TASK,
+        doc="Tasks in the order in which they are learned: simulated ones, or with `demos.paths` "
+        "names of your own for those that no simulator has.",
+    )
     backbone: str = key(
         NOT_EMPTY,
         default="embedded",
@@ -441,3 +464,8 @@ class RobotStreamRecipe:
     sequential: Sequential = Sequential()
     isolated_lora: IsolatedLora = IsolatedLora()
     igsp: Igsp = Igsp()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the tasks are played in simulation; none is where the first is not."""
+        return TASK.accepts(self.tasks[0])

@@ -25,6 +25,8 @@ from aegis_cli.recipes.streams import LEARNERS, ROBOT_LEARNERS
 PER_SEED = {"demos": "demos", "anchor": "anchor", "questions": "probe", "episodes": "rollout"}
 _NO_ANCHOR = [name for name in PER_SEED if name != "anchor"]
 _SOME = Check("at least one", bool)
+# A stream may have others, which are measured by their open-loop error.
+_SIMULATED = Check(f"simulated ones: {TASK.expected}", TASK.accepts, TASK.choices)
 
 
 @section
@@ -227,7 +229,9 @@ class RobotStreamStudyRecipe:
     """Compares learners over seeds on one stream of robot tasks, each at the best of its knobs."""
 
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
-    tasks: tuple[str, ...] = key(TASK, doc="Tasks in the order in which they are learned.")
+    tasks: tuple[str, ...] = key(
+        _SIMULATED, doc="Simulated tasks in the order in which they are learned."
+    )
     seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
     variants: dict[str, RobotStreamVariant] = key(
         _SOME, doc="What is compared: a name for each variant."

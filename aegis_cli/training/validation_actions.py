@@ -109,6 +109,16 @@ def chosen(
             "actions of which at least one varies",
             "delete train.validate_actions",
         )
-    held_out = demos.validation
-    at = held_out[spread.rows(len(held_out), count)]
-    return ValidationActions(demos, at, std, recipe.train.batch_size, recipe.train.compile)
+    return held_out(demos, count, std, recipe.train.batch_size, recipe.train.compile)
+
+
+def held_out(
+    demos: Demonstrations,
+    most: int,
+    training_std: np.ndarray,
+    batch_size: int,
+    compiled: bool = False,
+) -> ValidationActions:
+    """At most so many frames, evenly spread over the held-out episodes."""
+    at = demos.validation[spread.rows(len(demos.validation), most)]
+    return ValidationActions(demos, at, training_std, batch_size, compiled)

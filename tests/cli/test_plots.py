@@ -237,6 +237,20 @@ def test_a_stream_of_any_length_has_a_panel_a_task(count: int) -> None:
     assert sum(bool(axes.get_title()) and axes.get_visible() for axes in figure.axes) == count
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_routing_plots_title_and_legend_have_room_above_few_tasks(count: int) -> None:
+    records = [
+        SimpleNamespace(task=f"t{i}", sites=(routed("expert.layers.0.down", (i,), (1.0,)),))
+        for i in range(count)
+    ]
+    report = SimpleNamespace(tasks=tuple(r.task for r in records), records=records)
+    figure = plots._routing(report, "runs/s")
+    figure.draw_without_rendering()
+    for drawn in (figure._suptitle, *figure.legends):
+        place = drawn.get_window_extent()
+        assert place.x0 >= 0 and place.x1 <= figure.bbox.x1
+
+
 @pytest.mark.parametrize("name", ["runs/$x\\frac$/y", "a$b", "plain"])
 def test_a_path_is_drawn_as_it_is_and_not_as_mathematics(name: str) -> None:
     report = energies([[0.5, 0.25]])

@@ -20,9 +20,10 @@ from samples.training import CHUNK, RobotBatch, images, make_policy, same_bits, 
 from samples.training_runs import contents
 from samples.vqa_files import hub_rows, write_jsonl
 
-from aegis_cli import inspection, sim
+from aegis_cli import inspection, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, loop, probe, robots, state, train
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.continual.robots import RobotEvaluator, RobotStreamRun
@@ -46,6 +47,7 @@ from aegis_cli.recipes import (
     load_training,
     to_yaml,
 )
+from aegis_cli.recipes.strict_yaml import dump
 
 Done = Callable[[str], tuple[RobotStreamReport, Path]]
 Aegis = Callable[..., tuple[int, str, str]]
@@ -591,6 +593,55 @@ def assert_learned_and_tried(cut: Path, whole: Path) -> None:
     assert so_far["scores"]["last"] == all_of_it["success"][0][0]
     with pytest.raises(AegisError, match="not learned to its end"):
         inspection.run(cut)
+
+
+LATER = (("train", "freeze"), ("probe", "while_training"))
+
+
+@pytest.mark.parametrize("unknown", [(), LATER[1:], LATER])
+def test_a_run_that_an_earlier_version_began_goes_on_to_the_same_bytes(
+    unknown: tuple[tuple[str, str], ...], make: Make, done: Done, tmp_path: Path
+) -> None:
+    """It wrote all keys that it knew into the recipe, and digested all of some sections."""
+    recipe, out = make("igsp"), tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train.run(recipe, out, on_event=partial(stop, TWO, 3))
+    everything = dataclasses.asdict(recipe)
+    written = json.loads(json.dumps(recipes.read(out / "recipe.yaml")[0]))
+    for section, key in unknown:
+        del everything[section][key], written[section][key]
+    (out / "recipe.yaml").write_text(dump(written))
+    part = {name: everything[name] for name in ("tasks", "backbone", "seed", "train", "expert")}
+    part |= {"probe": everything["probe"], "rollout": recipes.recorded(recipe.rollout)}
+    began_with(out, sha256_value(part | {"igsp": everything["igsp"]}))
+    train.run(recipe, out, resume=True)
+    (out / "recipe.yaml").write_text(to_yaml(recipe))
+    assert contents(out) == contents(done("igsp")[1])
+
+
+def test_a_state_of_another_recipe_is_refused(make: Make, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train.run(make("igsp"), out, on_event=partial(stop, ONE, 3))
+    began_with(out, sha256_value(recipes.training_part(make("igsp", lr=2e-2))))
+    with pytest.raises(AegisError, match="another recipe than the run"):
+        train.run(make("igsp"), out, resume=True)
+
+
+def began_with(run: Path, digest: str) -> None:
+    """Let the state of an interrupted run say that its recipe had this digest."""
+    saved = artifacts.load(run / state.STATE)
+    inputs = {**saved.header.inputs, "recipe": digest}
+    assert inputs != saved.header.inputs
+    artifacts.save(
+        run / state.STATE,
+        "training-state",
+        saved.tensors,
+        seed=saved.header.seed,
+        inputs=inputs,
+        fingerprint=saved.header.fingerprint,
+        meta=saved.header.meta,
+    )
 
 
 def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -384,9 +385,34 @@ def _stream(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
 
 def _matrix(stream: At) -> list[Markup]:
     """What was reached on each task after each task, as a heat map and a table."""
-    rows = stream["oracle"] or stream["success"]  # of images, or of robots
+    rows = stream["oracle"] or stream["success"]  # of images, or of simulated robots
+    if rows:
+        title = "What was reached on each task, after each task (%)"
+        return _matrix_of(stream, rows, "accuracy matrix", title, share, 1.0)
+    rows = stream["errors"]  # of other robots
     if not rows:
         return []
+    title = "The open-loop error in each task, after each task"
+    largest = max(float(error.value) for row in rows for error in row) or 1.0
+    return _matrix_of(stream, rows, "error matrix", title, partial(decimal, digits=3), largest)
+
+
+def _matrix_of(
+    stream: At,
+    rows: At,
+    name: str,
+    title: str,
+    show: Callable[[At], Child],
+    deepest: float,
+) -> list[Markup]:
+    """A matrix as a heat map and a table.
+
+    Args:
+        name: of the map, for who cannot see it.
+        show: how the table has a value.
+        deepest: the value with the deepest colour.
+    """
+    errors = stream["errors"]
     tasks = [str(task) for task in stream["tasks"]]
     numbers = [str(number + 1) for number in range(len(tasks))]
     chart = HeatMap(
@@ -394,16 +420,18 @@ def _matrix(stream: At) -> list[Markup]:
         columns=tasks,
         edges=[(k + 0.5, number) for k, number in enumerate(numbers)],
         x_label="task",
-        shade=lambda value: value,
-        say=lambda value: f"{100 * value:.0f}",
+        shade=lambda value: value / deepest,
+        say=lambda value: f"{value:.3f}" if errors else f"{100 * value:.0f}",
         write=True,
     )
-    written = [[tasks[k], *map(share, row)] for k, row in enumerate(rows)]
+    written = [[tasks[k], *map(show, row)] for k, row in enumerate(rows)]
+    if errors and any(error.value is not None for error in stream["hold_errors"]):
+        written.append(["holding the position", *map(show, stream["hold_errors"])])
     figures = table(["After", *tasks], written)
     return [
         section(
-            "What was reached on each task, after each task (%)",
-            figure(charts.heat(chart, "accuracy matrix"), wide=True),
+            title,
+            figure(charts.heat(chart, name), wide=True),
             element("details", element("summary", "The figures"), figures),
         )
     ]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _DECADES = 4  # of the log scale of the energy
 _PANELS, _CELL = 5, 0.29  # of the routing: tasks a line; inches of a cell's width
+_TITLED = 6.8  # width in inches that the routing's title and legend need
 _WRITTEN = {"fontsize": 6.5, "ha": "center", "va": "center"}
 _PATCH = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 _IMPOSSIBLE, _NOTHING, _PRUNED = "#b8b8b8", "#ededed", "#c81e2d"
@@ -206,8 +207,9 @@ def _routing(report: Any, path: str) -> Any:
     count, sites = len(report.tasks), [site.site for site in report.records[-1].sites]
     rows = math.ceil(count / _PANELS)
     columns = math.ceil(count / rows)
+    width = max(_TITLED, 3.2 + _CELL * count * columns)
     drawn = figure(
-        figsize=(3.2 + _CELL * count * columns, 1.6 + (0.5 + 0.23 * len(sites)) * rows),
+        figsize=(width, 1.6 + (0.5 + 0.23 * len(sites)) * rows),
         layout="constrained",
     )
     panels = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()

@@ -1,12 +1,12 @@
 """A stream as tables: its matrix with the figures, parameters, and the routing per map.
 
-The matrix of images holds accuracies; that of robots holds successes, beside what the backbone
-knows.
+The matrix of images holds accuracies; that of robots holds successes, or open-loop errors,
+beside what the backbone knows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -14,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
+
+_UNIT = "squared and over the variance of the training's actions"
 
 
 def stream(report: Any) -> RenderableType:
@@ -45,7 +47,8 @@ def stream_inspect(inspection: Any) -> RenderableType:
 
 def _matrix(report: Any) -> list[RenderableType]:
     """The tables of what was measured."""
-    return {"stream-run": _accuracy, "robot-stream-run": _success}[report.kind](report)
+    views = {"accuracy": _accuracy, "success": _success, "errors": _errors}
+    return views[report.score](report)
 
 
 def _accuracy(report: Any) -> list[RenderableType]:
@@ -63,13 +66,58 @@ def _accuracy(report: Any) -> list[RenderableType]:
 
 
 def _success(report: Any) -> list[RenderableType]:
-    """The successes beside what the backbone knows; tasks that have not come are '-'."""
-    header = ("Success %", *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
+    """The successes beside what the backbone knows."""
+    s = report.scores
+    figures = [(percent(s.average), percent(s.last), percent(s.forgetting, 2))]
+    return [
+        plain_table(*_beside_vqa(report, "Success %", report.success, percent)),
+        plain_table(("Average %", "Last %", "Forgetting (points)"), figures, left=0),
+    ]
+
+
+def _errors(report: Any) -> list[RenderableType]:
+    """The open-loop errors, with those of holding the position, beside what the backbone knows."""
+    header, rows = _beside_vqa(report, "Open-loop error", report.errors, _error)
+    if any(ends is not None for ends in report.error_intervals[-1]):
+        shown = ("-" if ends is None else _between(ends) for ends in report.error_intervals[-1])
+        rows.append(["95 % interval at the end", *shown, "-", "-", "-"])
+    if any(error is not None for error in report.hold_errors):
+        rows.append(["holding the position", *map(_error, report.hold_errors), "-", "-", "-"])
+    s = report.scores
+    figures = [(_error(s.average), _error(s.last), _error(s.forgetting))]
+    named = ("Average error", "Last error", "Forgetting (rise of the error)")
+    return [
+        plain_table(header, rows),
+        plain_table(named, figures, left=0),
+        Text(f"Errors are at held-out frames, {_UNIT}: 1 is that of always predicting their mean"),
+    ]
+
+
+def _between(ends: Sequence[float]) -> str:
+    """The ends of an interval."""
+    return " to ".join(map(_error, ends))
+
+
+def _error(value: float | None) -> str:
+    return "-" if value is None else fixed(value, 3)
+
+
+def _beside_vqa(
+    report: Any,
+    title: str,
+    matrix: Sequence[Sequence[float]],
+    show: Callable[[float], str],
+) -> tuple[Sequence[str], list[list[str]]]:
+    """The header and the rows of a triangle beside what the backbone knows.
+
+    Tasks that have not come are '-'.
+    """
+    header = (title, *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
     rows = []
-    # VQA is measured before the first task too, when there is no success yet.
-    measured = zip(("", *report.tasks), ((), *report.success), report.vqa, strict=True)
+    # VQA is measured before the first task too, when nothing has been learned yet.
+    measured = zip(("", *report.tasks), ((), *matrix), report.vqa, strict=True)
     for after, found, known in measured:
-        line = [f"after {after}" if after else "before", *map(percent, found)]
+        line = [f"after {after}" if after else "before", *map(show, found)]
         line += ["-"] * (len(report.tasks) - len(found))
         line += [
             percent(known.accuracy),
@@ -77,12 +125,7 @@ def _success(report: Any) -> list[RenderableType]:
             fixed(known.cross_entropy, 3),
         ]
         rows.append(line)
-    s = report.scores
-    figures = [(percent(s.average), percent(s.last), percent(s.forgetting, 2))]
-    return [
-        plain_table(header, rows),
-        plain_table(("Average %", "Last %", "Forgetting (points)"), figures, left=0),
-    ]
+    return header, rows
 
 
 def _published(report: Any) -> list[RenderableType]:

@@ -1,0 +1,60 @@
+"""How well a task is learned that no simulator has: its actions at frames of held-out episodes.
+
+The error is that of `aegis evaluate` and `train.validate_actions`, on the same frames after every
+task, and stands in the place of a success.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.models.action_errors import ActionErrors, mean
+from aegis_cli.models.policy import Policy
+from aegis_cli.training import validation_actions
+
+
+class HeldOut:
+    """Held-out frames of one task, at which a policy predicts.
+
+    Attributes:
+        hold_error: the error of repeating the current position; None where actions are no
+            positions.
+    """
+
+    def __init__(
+        self, task: str, demos: Demonstrations, most: int, batch_size: int, chunk: int
+    ) -> None:
+        """Choose the frames.
+
+        Args:
+            most: how many there are at most, evenly spread.
+            chunk: how many actions are predicted at each.
+
+        Raises:
+            AegisError: actions that never vary, so that no error is relative to anything.
+        """
+        std = np.array(demos.action_std)
+        if not std.any():
+            raise AegisError(
+                f"demonstrations of '{task}' whose actions never vary",
+                "actions of which at least one varies, to measure errors by",
+                "choose the actions by demos.action, or give other demonstrations",
+            )
+        self._frames = validation_actions.held_out(demos, most, std, batch_size)
+        # Whatever is predicted, the error of the position is the same.
+        anything = torch.zeros(len(self._frames.at), chunk, len(std))
+        errors = ActionErrors.of(demos, self._frames.at, anything, std)
+        self.hold_error = mean(errors.held, errors.valid)
+
+    def error(self, policy: Policy, on_event: OnEvent) -> tuple[float, list[float] | None]:
+        """The policy's mean squared error over the variance of the training's actions.
+
+        Beside it stands its 95 % interval by Student's t over episodes; None of a single one.
+        """
+        found = validation_actions.of_line(self._frames.figures(policy, Ranks(), on_event))
+        return found["relative_error"], found["relative_interval"]

@@ -1,0 +1,394 @@
+"""Streams of robot tasks that no simulator has: the error of the actions on held-out episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples.interrupted import at_each, stop
+from samples.lerobot import frame_cache, save  # noqa: F401
+from samples.robots import Make
+from samples.training_runs import contents
+
+from aegis_cli import recipes
+from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.continual import files, probe, robots, state, train
+from aegis_cli.continual.held_out import HeldOut
+from aegis_cli.continual.report import RecordedStreamReport
+from aegis_cli.data import demonstrations, spread
+from aegis_cli.data.lerobot.write import NewEpisode
+from aegis_cli.deploy import load_acting, load_policy
+from aegis_cli.evaluation import open_loop
+from aegis_cli.models.action_errors import predict
+from aegis_cli.recipes import RobotDemos, RobotRollout, RobotStreamRecipe, to_yaml
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
+
+Done = Callable[[str], tuple[RecordedStreamReport, Path]]
+TASKS = ("pick", "open-drawer")
+JOINTS = {"pick": 3, "open-drawer": 2}  # two robots
+TEXTS = {"pick": "go to the red target", "open-drawer": "move the finger to the red target"}
+FRAMES = 9  # of those that are held out
+
+
+def robot(
+    folder: Path,
+    task: str = "pick",
+    cameras: Sequence[str] = ("top",),
+    scale: float = 1.0,
+    actions: Sequence[str] | None = None,
+    count: int = 6,
+) -> Path:
+    """A dataset of a real robot's, whose actions are the positions to take.
+
+    Args:
+        scale: of all numbers.
+        actions: their names; by default those of the positions.
+    """
+    rng = np.random.default_rng(len(task))
+    made = []
+    for number in range(count):
+        length = 6 + number % 3
+        path = scale * rng.normal(size=(length + 1, JOINTS[task])).cumsum(0).astype(np.float32)
+        shown = rng.integers(0, 256, (length, 16, 16, 3), dtype=np.uint8)
+        made.append(NewEpisode(dict.fromkeys(cameras, shown), path[:-1], path[1:], TEXTS[task]))
+    names = tuple(f"joint {n}.pos" for n in range(JOINTS[task]))
+    return save(folder, made, state_names=names, action_names=tuple(actions or names))
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A dataset of each task; read only."""
+    folder = tmp_path_factory.mktemp("robots")
+    return {task: robot(folder / task, task) for task in TASKS}
+
+
+@pytest.fixture(scope="module")
+def real(make: Make, paths: dict[str, Path]) -> Make:
+    """A recipe; `changes` replace keys of `train`, or whole keys."""
+
+    def recipe(method: str = "igsp", **changes: Any) -> RobotStreamRecipe:
+        own = {"demos": RobotDemos(paths=tuple(str(paths[task]) for task in TASKS))}
+        own |= {"rollout": RobotRollout(replan=2, frames=FRAMES)}
+        settings = {"chunk": 4, "validation_share": 0.4}
+        return dataclasses.replace(make(method, **settings | own | changes), tasks=TASKS)
+
+    return recipe
+
+
+@pytest.fixture(scope="module")
+def done(real: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """A finished run of a learner; read only."""
+    made: dict[str, tuple[RecordedStreamReport, Path]] = {}
+
+    def get(method: str) -> tuple[RecordedStreamReport, Path]:
+        if method not in made:
+            out = tmp_path_factory.mktemp("recorded") / method
+            report = train.run(real(method), out)
+            assert isinstance(report, RecordedStreamReport)
+            made[method] = report, out
+        return made[method]
+
+    return get
+
+
+# --- what is measured -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["igsp", "isolated-lora", "sequential"])
+def test_errors_are_those_of_an_evaluation_of_held_out_frames(
+    method: str, done: Done, real: Make
+) -> None:
+    report, out = done(method)
+    run = robots.load_to_act(out)
+    for number, task in enumerate(TASKS):
+        shown = robots._demos(real(method), number, run.model.backbone, out, lambda event: None)
+        # Those that no step has learned from, evenly spread.
+        assert len(shown.validation) > FRAMES
+        at = shown.validation[spread.rows(len(shown.validation), FRAMES)]
+        assert not set(at.tolist()) & set(shown.train.tolist())
+        run.activate(number)
+        predicted = predict(run.policies[number].eval(), shown, at, 0, 4, "x")
+        found = open_loop.compare(shown, at, predicted, np.array(shown.action_std))
+        assert report.errors[-1][number] == pytest.approx(found.relative_error, rel=1e-6), task
+        assert report.error_intervals[-1][number] == pytest.approx(found.relative_interval)
+        assert report.hold_errors[number] == pytest.approx(found.hold_error, rel=1e-12), task
+
+
+@pytest.mark.parametrize(("method", "keeps"), [("igsp", True), ("sequential", False)])
+def test_what_serves_a_learned_task_has_the_error_that_it_had(
+    method: str, keeps: bool, done: Done
+) -> None:
+    report, _ = done(method)
+    assert [len(row) for row in report.errors] == [1, 2]
+    assert (report.errors[0][0] == report.errors[1][0]) == keeps
+    assert (report.scores.forgetting == 0) == keeps
+    rise = report.errors[1][0] - min(report.errors[0][0], report.errors[1][0])
+    assert report.scores.forgetting == pytest.approx(rise)
+    assert report.scores.last == pytest.approx(sum(report.errors[1]) / 2)
+    assert report.scores.average == pytest.approx(sum(sum(report.errors, ())) / 3)
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential"])
+def test_nothing_is_called_a_success(method: str, done: Done) -> None:
+    report, out = done(method)
+    matrix = json.loads((out / "error_matrix.json").read_text())
+    assert matrix.keys() == {
+        *("tasks", "method", "errors", "error_intervals", "hold_errors", "scores", "vqa")
+    }
+    assert not (out / "success_matrix.json").exists()
+    told = json.loads((out / "stream.json").read_text())
+    assert "success" not in (out / "stream.json").read_text()
+    assert {key: told[key] for key in matrix} == matrix
+    assert files.read(out) == report
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential"])
+def test_a_probe_of_the_files_gives_the_same_errors(method: str, done: Done) -> None:
+    report, out = done(method)
+    before = contents(out)
+    (out / "error_matrix.json").unlink()
+    found = probe.run(out)
+    assert found.largest_difference == 0 and found.measured == (2 if method == "igsp" else 1)
+    assert found.to_json()["errors"] == report.errors
+    assert found.to_json()["error_intervals"] == report.error_intervals
+    assert contents(out) == before
+
+
+def test_where_actions_are_no_positions_there_is_no_error_of_holding_one(
+    real: Make, tmp_path: Path
+) -> None:
+    moves = robot(tmp_path / "moves", "pick", actions=("dx", "dy", "dz"))
+    drawer = robot(tmp_path / "drawer", "open-drawer")
+    recipe = real("sequential", steps=1, demos=RobotDemos(paths=(str(moves), str(drawer))))
+    report = train.run(recipe, tmp_path / "run")
+    assert report.hold_errors[0] is None and report.hold_errors[1] > 0
+
+
+def test_an_error_that_is_no_number_ends_the_stream(
+    real: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(HeldOut, "error", lambda *given: (float("inf"), None))
+    with pytest.raises(Diverged, match="after task 'pick'"):
+        train.run(real("sequential", steps=1), tmp_path / "run")
+
+
+def test_the_error_of_a_single_episode_has_no_interval(real: Make, tmp_path: Path) -> None:
+    recipe = real("sequential", steps=1, validation_share=0.05)
+    report = train.run(recipe, tmp_path / "run")
+    assert report.error_intervals == ((None,), (None, None))
+    assert probe.run(tmp_path / "run").error_intervals == report.error_intervals
+
+
+def test_two_tasks_take_their_episodes_of_one_dataset(
+    real: Make, paths: dict[str, Path], tmp_path: Path
+) -> None:
+    one = RobotDemos(paths=str(paths["pick"]), only=("0-2", "3-5"))
+    built = train.build(real("sequential", demos=one), tmp_path / "run")
+    of_each = [set(shown.episode_of[shown.read].tolist()) for shown in built.demos]
+    assert of_each == [{0, 1, 2}, {3, 4, 5}]
+
+
+# --- interrupted ----------------------------------------------------------------------------------
+
+
+ONE, TWO = "task 1 pick", "task 2 open-drawer"
+PLACES = {
+    "igsp": ((ONE, 1), (ONE, 5), ("actions pick", FRAMES), ("stream", 1), (TWO, 5), ("stream", 2)),
+    "sequential": ((ONE, 5), ("stream", 1), (TWO, 3), ("actions open-drawer", FRAMES)),
+}
+
+
+@pytest.mark.parametrize("method", PLACES)
+def test_interrupted_anywhere_and_resumed_it_ends_in_the_same_bytes(
+    method: str, real: Make, done: Done, tmp_path: Path
+) -> None:
+    begin = partial(train.run, real(method), tmp_path / "run")
+    for place in at_each(PLACES[method], begin):
+        if place == ("stream", 1):  # what is known so far lies there already
+            so_far = json.loads((tmp_path / "run" / "error_matrix.json").read_text())
+            whole = done(method)[0]
+            assert so_far["errors"] == [list(whole.errors[0])]
+            assert so_far["hold_errors"] == [whole.hold_errors[0]]
+    report = begin(resume=True)
+    wanted, out = done(method)
+    assert contents(tmp_path / "run") == contents(out)
+    alike = [dataclasses.replace(each, minutes=0, out="") for each in (report, wanted)]
+    assert alike[0] == alike[1] and not (tmp_path / "run" / state.STATE).exists()
+    assert begin(resume=True).errors == report.errors
+
+
+def test_other_demonstrations_neither_continue_nor_probe_a_run(real: Make, tmp_path: Path) -> None:
+    own = [robot(tmp_path / task, task) for task in TASKS]
+    recipe = real("sequential", steps=2, demos=RobotDemos(paths=tuple(map(str, own))))
+    with pytest.raises(KeyboardInterrupt):
+        train.run(recipe, tmp_path / "cut", on_event=partial(stop, TWO, 1))
+    train.run(recipe, tmp_path / "run")
+    shutil.rmtree(own[1])
+    robot(own[1], "open-drawer", scale=2.0)
+    with pytest.raises(AegisError, match="another demos of open-drawer"):
+        train.run(recipe, tmp_path / "cut", resume=True)
+    with pytest.raises(AegisError, match="other demos of open-drawer than the run"):
+        probe.run(tmp_path / "run")
+    shutil.rmtree(own[1])
+    with pytest.raises(AegisError, match="open-drawer"):
+        probe.run(tmp_path / "run")
+
+
+# --- the robot acts -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["igsp", "sequential"])
+def test_the_policy_of_a_task_acts_on_the_robot(
+    method: str, done: Done, paths: dict[str, Path]
+) -> None:
+    out = done(method)[1]
+    run = robots.load_to_act(out)
+    for number, task in enumerate(TASKS):
+        policy = load_policy(out, task)
+        names = tuple(f"joint {n}.pos" for n in range(JOINTS[task]))
+        assert (policy.action_names, policy.state_names, policy.fps) == (names, names, 10.0)
+        assert (policy.task, policy.replan, policy.chunk) == (None, 2, 4)
+        shown = demonstrations.load(paths[task], None, 0, image_size=run.model.backbone.image_size)
+        batch = shown.batch(torch.tensor([3]), 1)
+        picture, position = batch.images[0].numpy(), batch.proprio[0].numpy()
+        observation = dict(zip(names, position.tolist(), strict=True)) | {"top": picture}
+        action = policy.select_action(observation, TEXTS[task])
+        run.activate(number)
+        draws = torch.Generator().manual_seed(0)
+        chunk = run.policies[number].eval()
+        wanted = chunk.act(batch.images, [TEXTS[task]], batch.proprio, draws)[0, 0]
+        np.testing.assert_allclose(action, wanted.numpy(), rtol=1e-5)
+        assert list(policy.named(action)) == list(names)
+
+
+def test_no_simulator_plays_it(done: Done) -> None:
+    out = done("igsp")[1]
+    with pytest.raises(AegisError, match="(?s)'pick'.*no simulator has.*aegis serve") as caught:
+        load_acting(out, "pick")
+    assert "--task pick" in caught.value.fix
+    with pytest.raises(AegisError, match="one of its tasks: pick, open-drawer"):
+        load_acting(out, "reach")
+
+
+def test_policies_of_several_cameras_say_which(
+    real: Make, hf_folder: Callable[[str], Path], tmp_path: Path
+) -> None:
+    own = [robot(tmp_path / task, task, ("wrist", "top", "side")) for task in TASKS]
+    demos = RobotDemos(paths=tuple(map(str, own)), camera=("top", "wrist"))
+    backbone = str(hf_folder("paligemma"))
+    recipe = real("sequential", steps=1, backbone=backbone, demos=demos)
+    report = train.run(recipe, tmp_path / "run")
+    assert probe.run(tmp_path / "run").errors[-1] == report.errors[-1]
+    cameras = load_policy(tmp_path / "run", "pick").cameras
+    assert cameras == ("observation.images.top", "observation.images.wrist")
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(real: Make, paths: dict[str, Path], tmp_path: Path, monkeypatch: Any) -> Path:
+    (tmp_path / "robot.yaml").write_text(to_yaml(real("igsp", steps=2)))
+    robot(tmp_path / "still", "pick", scale=0.0)
+    robot(tmp_path / "single", "open-drawer", count=1)
+    shutil.copytree(paths["pick"], tmp_path / "picked")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+TRAIN = ("train", "robot.yaml", "--out", "run")
+
+
+def test_train_inspect_probe_and_report(
+    aegis: Callable[..., tuple[int, str, str]], place: Path, bad: Callable[..., str]
+) -> None:
+    code, out, _ = aegis(*TRAIN)
+    assert code == 0 and "Success" not in out
+    for word in ("Open-loop error", "after pick", "holding the position", "rise of the error"):
+        assert word in out
+    code, out, _ = aegis("inspect", "run")
+    assert code == 0 and "Open-loop error" in out and "holding the position" in out
+    code, out, _ = aegis("inspect", "run", "--json")
+    told = json.loads(out)
+    assert code == 0 and told["kind"] == "robot-stream-run" and "success" not in told["report"]
+    code, out, _ = aegis("probe", "run", "--json")
+    assert code == 0 and json.loads(out)["errors"] == told["report"]["errors"]
+    code, out, _ = aegis("report", "run")
+    page = (place / "run" / "report.html").read_text()
+    assert code == 0 and "The open-loop error in each task" in page
+    assert f"{told['report']['errors'][0][0]:.3f}" in page and "What was reached" not in page
+    bad("rollout", "run", "--task", "pick", says=("'pick'", "no simulator has", "aegis serve run"))
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (
+            ("--set", "tasks=[reech, point]", "--set", "demos.paths=null"),
+            ("'reech'", "one of reach, point", "did you mean 'reach'?", "demos.paths"),
+        ),
+        (
+            ("--set", "tasks=[reech, point]"),
+            ("'reech', which is not simulated, beside 'point'", "one of reach, point", "'reach'?"),
+        ),
+        (("--set", "tasks=[a/b, c]"), ("tasks", "one of reach, point", "names of your own")),
+        (("--set", "tasks=[reach, point]"), ("rollout.frames: 9 with task reach", "delete")),
+        (
+            ("--set", "rollout.episodes=3"),
+            ("rollout.episodes: 3 with task pick", "no simulator plays", "delete rollout.episodes"),
+        ),
+        (("--set", "rollout.split=validation"), ("rollout.split", "no simulator plays")),
+        (
+            ("--set", "demos.paths=picked"),
+            ("'picked' for 'pick' and other tasks", "demos.only, such as [0-49, 50-99]"),
+        ),
+        (
+            ("--set", "demos.paths=[still, picked]"),
+            ("'pick' whose actions never vary", "demos.action"),
+        ),
+        (
+            ("--set", "tasks=[reach, point]", "--set", "rollout.frames=1000"),
+            ("no simulated task", "for the task 'reach'", "a name of your own"),
+        ),
+        (("--set", "demos.paths=[picked, single]"), ("1 episode",)),
+    ],
+)
+def test_what_cannot_be_trained(
+    place: Path, bad: Callable[..., str], args: tuple[str, ...], says: tuple[str, ...]
+) -> None:
+    bad(*TRAIN, *args, says=says)
+
+
+def test_demonstrations_of_a_simulated_task_are_told_by_what_they_say(
+    place: Path, bad: Callable[..., str], demos_file: Path
+) -> None:
+    """Before anything is decoded."""
+    given = f"demos.paths=[{demos_file}, picked]"
+    says = ("demonstrations of 'reach'", "for the task 'reech'", "call the task 'reach'")
+    bad(*TRAIN, "--set", "tasks=[reech, pick]", "--set", given, says=says)
+
+
+def test_what_a_later_dataset_lacks_is_found_before_the_first_is_decoded(
+    real: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = [robot(tmp_path / task, task, (task,)) for task in TASKS]
+    monkeypatch.setattr(demonstrations, "load", lambda *given, **options: pytest.fail("decoded"))
+    demos = RobotDemos(paths=tuple(map(str, own)), camera="pick")
+    with pytest.raises(AegisError, match="open-drawer"):
+        train.build(real(demos=demos), tmp_path / "run")
+
+
+def test_a_recipe_says_whether_its_tasks_are_simulated(real: Make, make: Make) -> None:
+    assert make().simulated and not real().simulated
+    assert recipes.training_part(make())["rollout"].keys() == {
+        *("episodes", "colors", "replan", "split")
+    }
