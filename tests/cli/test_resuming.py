@@ -245,7 +245,8 @@ def test_a_command_that_a_message_names_is_one_for_a_shell(place: Path, bad: Bad
     bad(*again, says=("continue it: aegis train 'my run', or",))
     bad("train", "my run", "--out", "new", says=("aegis train 'my run/recipe.yaml' --out new",))
     says = "go on with its own: aegis train 'my run'; compare"
-    bad("train", "my run", "--set", "seed=7", says=(says,))
+    learned = "--set 'backbone=my run' --set 'expert.start=my run'"
+    bad("train", "my run", "--set", "seed=7", says=(says, learned))
 
 
 def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -> None:
