@@ -419,6 +419,7 @@ def train(
         raise AegisError("no --out", "a folder for the run", fix)
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
+        resuming.check_here(run, resolved)
     # Where the command is ended by a signal, exits.py asks what goes on with the run (GOES_ON).
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])

@@ -26,6 +26,7 @@ from typer.core import TyperGroup
 from aegis_cli.cli import other_trainers, render
 from aegis_cli.common import interrupts, launch
 from aegis_cli.common.errors import AegisError, PeerLost
+from aegis_cli.common.home import word_at_home
 from aegis_cli.recipes import Recipe
 from aegis_cli.recipes.decoding import below
 
@@ -38,6 +39,7 @@ class Commands(TyperGroup):
     """The commands, in the order of the pipeline, and what becomes of their errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        args = [word_at_home(word) for word in args]
         ctx.meta["aegis.args"] = list(args)  # as they were typed; click takes its own list apart
         try:
             return super().parse_args(ctx, args)

@@ -6,7 +6,7 @@ import dataclasses
 import shlex
 from pathlib import Path
 
-from aegis_cli.cli import render
+from aegis_cli.cli import render, resuming
 from aegis_cli.common import launch
 from aegis_cli.recipes import Probe
 
@@ -28,7 +28,7 @@ def chosen(
             limit of the drop is one of its own sets.
         skip_bad: the recipe may ask for it too, of its own set.
     """
-    named = _of_run(model, warn=vqa is None)
+    named = _of_run(model, asks=vqa is None)
     own = named[0]
     of_recipe = vqa is None or vqa in [each.vqa for each in named]
     return dataclasses.replace(
@@ -63,21 +63,28 @@ def baseline(model: str, anchor: Path | None = None) -> str | None:
         # A drift is one from the model of the anchor, and so the drop is one from it, too.
         origins = origins[: known[0] + 1] if known else origins
     *between, began_from = [origin.name for origin in origins]  # the nearest first
+    resuming.check_seen(run, [began_from], "probe")
     if launch.rank() == 0:
         by_way = f" by way of {', '.join(between)}" if between else ""
         render.note(f"the baseline is '{began_from}', the model that the run began from{by_way}")
     return began_from
 
 
-def _of_run(model: str, warn: bool) -> tuple[Probe, ...]:
-    """The `probe` of a run's recipe, of each set; the defaults for a model without a run."""
+def _of_run(model: str, asks: bool) -> tuple[Probe, ...]:
+    """The `probe` of a run's recipe, of each set; the defaults for a model without a run.
+
+    Args:
+        asks: whether the first of these is what is asked.
+    """
     from aegis_cli.evaluation import results
 
     run = results.run_of(Path(model))
     if run is None:
         return (Probe(),)
     first, *others = named = results.recipe_of(run).probe.of_each_set()
-    if warn and others and launch.rank() == 0:
+    if asks:
+        resuming.check_seen(run, [str(first.vqa)], "probe")
+    if asks and others and launch.rank() == 0:
         left = ", ".join(f"--vqa {shlex.quote(str(other.vqa))}" for other in others)
         render.note(f"asked are the questions of '{first.vqa}'; the run's recipe also names {left}")
     return named

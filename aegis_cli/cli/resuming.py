@@ -86,6 +86,28 @@ def inputs_of(
     return list(demos), anchor
 
 
+def check_here(run: Path, recipe: Recipe) -> None:
+    """Raise AegisError if the recipe's paths are seen from another folder, the run's first one."""
+    sets = recipe.probe.of_each_set() if recipe.probe.while_training else ()
+    named = [recipe.backbone, recipe.expert.start, *(each.vqa for each in sets)]
+    check_seen(run, [name for name in named if isinstance(name, str)], "train")
+
+
+def check_seen(run: Path, names: Iterable[str], command: str) -> None:
+    """Raise AegisError if one that a run's recipe names lies where the run was begun, not here."""
+    from aegis_cli.training import inputs
+
+    began = inputs.began_in(run)
+    for name in [name.partition("#")[0] for name in names]:
+        if began is not None and not Path(name).exists() and (began / name).exists():
+            again = commands.aegis(command, run.absolute())
+            raise AegisError(
+                f"no '{name}' here, which the recipe of the run in '{run}' names",
+                f"the folder that the run was begun in, '{began}', where it lies",
+                f"go on from there: {commands.shell('cd', began)} && {again}",
+            )
+
+
 def demonstrations_of(run: Path) -> Path:
     """The demonstrations that a run learned from, for `aegis evaluate` that is given none.
 

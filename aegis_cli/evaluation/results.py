@@ -275,8 +275,38 @@ class PlayedResult(Result):
 
 
 def probes(run: Path) -> list[Result]:
-    """The probes of a run's last checkpoint; that of `aegis run` comes first."""
-    return [found for _, found in _read(run, "probe", ProbeFigures)]
+    """The probes of a run's last checkpoint; that of `aegis run` comes first.
+
+    One that asked the same again and found the same is told with it, as one.
+    """
+    recipe, each = recipe_of(run), list[Result]()
+    for _, found in _read(run, "probe", ProbeFigures):
+        by_recipe = [i for i, first in enumerate(each) if not first.settings]
+        again = [i for i in by_recipe if _is_again(found, each[i], recipe)]
+        for i in again[:1]:  # it may know more, such as the baseline's drift
+            each[i] = dataclasses.replace(each[i], figures={**each[i].figures, **found.figures})
+        each += [] if again else [found]
+    return each
+
+
+def _is_again(found: Result, first: Result, recipe: recipes.Recipe) -> bool:
+    """Whether a probe asked what `first` did, which is by the recipe, and found the same."""
+    limits = {"max_drop": recipe.probe.max_drop, "gate": recipe.probe.gate}
+    if question_set(found, recipe) != question_set(first, recipe):
+        return False
+    if found.figures.get("passed") is not None and limits != {
+        name: found.settings.get(name, limit) for name, limit in limits.items()
+    }:
+        return False
+    here, there = (_without_baseline(one.figures) for one in (first, found))
+    both = here.keys() & there.keys()
+    return _told(there) <= _told(here) and all(here[name] == there[name] for name in both)
+
+
+def _without_baseline(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """A probe's figures, less the drift of the model before training, which `aegis run` leaves."""
+    layers = [{**layer, "baseline_w2": None} for layer in figures.get("layers") or []]
+    return {**figures, "layers": layers}
 
 
 def rollouts(run: Path) -> list[PlayedResult]:

@@ -162,7 +162,7 @@ class PolicyRun:
             if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
         if (kept := places.of(self._run)) is not None:
-            places.keep(folder, kept, out)
+            places.keep(folder, kept, out, places.began_in(self._run))
         # A checkpoint before the last one knows nothing of the steps after it.
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")

@@ -11,6 +11,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from aegis_cli.common.home import at_home
 from aegis_cli.recipes.keys import (
     LARGEST,
     LARGEST_FLOAT,
@@ -51,7 +52,8 @@ def build(
 ) -> Any:
     """The dataclass `kind` from a raw mapping, or None if there are problems.
 
-    What is wrong is appended to `problems`.
+    What is wrong is appended to `problems`. A text that begins with `~/` names what lies in the
+    home folder.
 
     Args:
         kind: a class made by `keys.section`.
@@ -62,7 +64,7 @@ def build(
     from pydantic import ValidationError
 
     try:
-        made = _adapter(kind).validate_python(raw)
+        made = _adapter(kind).validate_python(at_home(raw))
     except ValidationError as error:
         wrong = error.errors(include_url=False, include_context=False)
         found = [_problem(kind, raw, each["loc"], prefix, places) for each in wrong]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from aegis_cli import recipes
@@ -79,8 +80,19 @@ def check(
             f"{_differences(_begun(out, recipe), recipe)}",
             "the recipe and overrides it began with",
             f"go on with its own: {commands.aegis('train', out)}; compare with '{saved}', or start "
-            "anew in another --out",
+            f"anew in another --out{_or_go_on_from(out, recipe)}",
         )
+
+
+def learned(out: Path) -> str:
+    """The options of a run that begins with what another one of a policy has learned."""
+    return f"--set {quote(f'backbone={out}')} --set {quote(f'expert.start={out}')}"
+
+
+def _or_go_on_from(out: Path, recipe: Trained) -> str:
+    """How a policy is trained on with other settings, such as another learning rate."""
+    is_policy = isinstance(recipe, Recipe) and checkpoint.begun(out)
+    return f", there with what this run has learned by {learned(out)}" if is_policy else ""
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:

@@ -18,6 +18,7 @@ from aegis_cli.data.selection import Paths
 
 NAME = "inputs.json"
 _RELATIVE = "relative"  # of its keys: the places as they are seen from the run
+_BEGAN_IN = "began_in"  # and the folder from which the recipe's own paths are seen
 
 
 @dataclass(frozen=True)
@@ -53,18 +54,33 @@ def is_gone(place: str) -> bool:
     return path.is_absolute() and not path.exists()  # what is kept of a file is absolute
 
 
-def keep(out: Path, inputs: Inputs, place: Path | None = None) -> None:
+def keep(out: Path, inputs: Inputs, place: Path | None = None, began: Path | None = None) -> None:
     """Write them into a run's folder, also as they are seen from there.
 
     Args:
         place: where the folder is going to lie; None: where it is.
+        began: the folder that the run was begun in; None: what the run says, else the present one.
     """
-    here = (place or out).absolute()
+    here, first = (place or out).absolute(), str(began or began_in(out) or Path.cwd())
 
     def relative(given: str) -> str:
         return os.path.relpath(given, here) if Path(given).is_absolute() else given
 
-    files.save_json(out / NAME, asdict(inputs) | {_RELATIVE: asdict(inputs.each(relative))})
+    seen = asdict(inputs.each(relative)) | {_BEGAN_IN: relative(first)}
+    files.save_json(out / NAME, asdict(inputs) | {_BEGAN_IN: first, _RELATIVE: seen})
+
+
+def began_in(out: Path) -> Path | None:
+    """The folder that a run was begun in, also where both have been moved together.
+
+    None of a run that does not say it, or where it is gone.
+    """
+    said = files.load_json(out / NAME) if (out / NAME).is_file() else None
+    if not isinstance(said, dict) or not isinstance(said.get(_RELATIVE), dict):
+        return None
+    places = [said.get(_BEGAN_IN), said[_RELATIVE].get(_BEGAN_IN)]
+    known = [out.absolute() / place for place in places if isinstance(place, str)]
+    return next((Path(os.path.normpath(path)) for path in known if path.is_dir()), None)
 
 
 def of(out: Path) -> Inputs | None:

@@ -21,6 +21,7 @@ from aegis_cli.common.ranks import Ranks
 from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.data import demonstrations, joints, mixture
+from aegis_cli.data.outliers import outliers
 from aegis_cli.data.relative import Places
 from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
@@ -83,6 +84,7 @@ def load(
     # Last, since it may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
+    warn_of_outliers(demos, recorded, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -301,6 +303,35 @@ def _warn_of_no_instruction(
             "instruction, but an empty text: a policy learns from them to act without being told "
             "what to do. Write what they do as the dataset's tasks, or choose others with "
             "demos.only"
+        )
+        on_event(Warned("train", text))
+
+
+def warn_of_outliers(paths: Paths, found: demonstrations.Demonstrations, on_event: OnEvent) -> None:
+    """Warn of joints whose scale is that of a few values far off, as of a sensor's glitch.
+
+    On such a scale all that the joint does otherwise is nearly alike, and errors look small.
+    """
+    told = list[str]()
+    for what, tensor, names in (
+        ("action", "actions", found.action_names),
+        ("position", "proprio", found.proprio_names),
+    ):
+        for one in outliers(found.tensors[tensor][found.train]):
+            name = names[one.dimension] if names else str(one.dimension)
+            # Of several sets the episodes are numbered anew.
+            episode = f" in episode {int(found.episode_of[found.train[one.row]])}"
+            where = episode if len(mixture.each(paths)) == 1 else ""
+            told.append(
+                f"{what} {name} ({one.value:.6g}{where}; deviation {one.std:.4g}, of the others "
+                f"{one.others:.4g})"
+            )
+    if told:
+        text = (
+            f"a few values far from all others make most of the spread in {mixture.said(paths)}: "
+            f"{', '.join(told)}. Beside them all that the joint does is nearly alike to the "
+            "policy, and its errors look small. If they are faults of the recording, leave these "
+            "episodes out (demos.only)"
         )
         on_event(Warned("train", text))
 

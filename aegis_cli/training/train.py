@@ -9,7 +9,6 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -336,13 +335,12 @@ def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inp
             )
         kept = inputs.of(out)
         if kept is not None and kept.demos == places.demos:
-            learned = f"--set {quote(f'backbone={out}')} --set {quote(f'expert.start={out}')}"
             return AegisError(
                 f"the demonstrations in {', '.join(map(repr, places.demos))} have changed since "
                 f"the run in '{out}' began",
                 "the same episodes, with the same frames and numbers",
                 "bring them back as they were, or begin another run with what this one has "
-                f"learned: {learned}, in another --out",
+                f"learned: {folder.learned(out)}, in another --out",
             )
     return AegisError(
         f"{mixture.differing(there, run.inputs)} than the run in '{out}' began with",

@@ -45,6 +45,26 @@ def test_what_a_question_becomes_needs_no_quotes(text: str) -> None:
     assert found.probe.ask == found.anchor.ask == text.strip('"')
 
 
+@pytest.mark.parametrize("words", [("--demos=~/arm",), ("--demos", "~/arm")])
+def test_a_path_in_the_home_folder_is_one_however_it_is_given(
+    words: tuple[str, ...], bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    bad("train", "reach", "--out", "x", *words, says=(f"'{tmp_path}/arm'",))
+
+
+def test_a_recipe_may_name_what_lies_in_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    file = tmp_path / "recipe.yaml"
+    file.write_text("kind: policy\nname: x\nbackbone: ~/vlm\nprobe: {vqa: [~/a.jsonl, scenes]}\n")
+    found = recipes.load(file, ["demos.path=~/arm", "anchor.vqa=./~/b.jsonl"])
+    assert (found.backbone, found.demos.path) == (f"{tmp_path}/vlm", f"{tmp_path}/arm")
+    assert found.probe.vqa == (f"{tmp_path}/a.jsonl", "scenes")
+    assert found.anchor.vqa == "./~/b.jsonl"
+
+
 @pytest.mark.parametrize(
     ("method", "asked", "command"),
     [

@@ -60,6 +60,25 @@ def test_it_ends_in_the_bytes_of_a_run_that_was_never_interrupted(
     assert_same_run(run, place / "whole")
 
 
+def test_what_the_recipe_names_from_another_folder_is_looked_for_there(
+    place: Path, bad: Bad, aegis: Aegis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = "train", "small.yaml", "--method", "naive", "--demos", "demos.safetensors"
+    code, _, err = aegis(*words, "--out", "run", "--set", "backbone=model.safetensors")
+    assert code == 0, err
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    bad("train", place / "run", says=(f"'{place}'", f"cd {place} && aegis train {place}/run"))
+    gated = "probe", place / "run", "--max-drop", 3
+    bad(*gated, says=(f"cd {place} && aegis probe {place}/run",))
+    moved = place.rename(tmp_path / "moved")
+    bad("train", moved / "run", says=(f"cd {moved} && aegis train {moved}/run",))
+    code, _, err = aegis("train", moved / "run", "--set", f"backbone={moved}/model.safetensors")
+    assert code == 0, err
+    monkeypatch.chdir(moved)
+    assert aegis("train", "run")[0] == 0
+
+
 def test_a_run_of_several_sets_goes_on_with_all_of_them(
     place: Path, aegis: Aegis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,7 +245,8 @@ def test_a_command_that_a_message_names_is_one_for_a_shell(place: Path, bad: Bad
     bad(*again, says=("continue it: aegis train 'my run', or",))
     bad("train", "my run", "--out", "new", says=("aegis train 'my run/recipe.yaml' --out new",))
     says = "go on with its own: aegis train 'my run'; compare"
-    bad("train", "my run", "--set", "seed=7", says=(says,))
+    learned = "--set 'backbone=my run' --set 'expert.start=my run'"
+    bad("train", "my run", "--set", "seed=7", says=(says, learned))
 
 
 def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -> None:

@@ -34,6 +34,28 @@ def test_what_is_kept_is_read_back_after_that_of_aegis_run(run: Path) -> None:
     assert second.figures == found
 
 
+def test_a_probe_that_was_repeated_is_told_once(run: Path) -> None:
+    again = results.probes(run)[0].figures
+    asked = {"vqa": "scenes", "questions": 40, "seed": 0}
+    results.keep(run, "probe-scenes", again, asked)
+    assert [found.name for found in results.probes(run)] == ["probe"]
+    results.keep(run, "probe-scenes", {**again, "accuracy": 0.25}, asked)
+    assert len(results.probes(run)) == 2
+    for settings in ({**asked, "vqa": "easy-vqa"}, {**asked, "max_drop": 5.0, "gate": "mean"}):
+        results.keep(run, "probe-scenes", {**again, "passed": True}, settings)
+        assert len(results.probes(run)) == 2
+
+
+def test_a_repeated_probe_adds_what_it_alone_knows(run: Path) -> None:
+    layer = {"layer": "layers.0", "w2": 0.5, "baseline_w2": None}
+    first = files.load_json(run / "probe.json") | {"layers": [layer]}
+    files.save_json(run / "probe.json", first)
+    known = [layer | {"baseline_w2": 0.25}]
+    results.keep(run, "probe-scenes", {**first, "layers": known}, {"vqa": "scenes"})
+    (found,) = results.probes(run)
+    assert (found.name, found.settings, found.figures["layers"]) == ("probe", {}, known)
+
+
 def test_a_later_one_replaces_it_and_leaves_that_of_aegis_run(run: Path) -> None:
     before = (run / "rollout-seen.json").read_bytes()
     for success in (0.25, 0.5):
