@@ -391,6 +391,14 @@ def test_the_plot_is_written_whole(suffix, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == [out.name, "run"]
 
 
+def test_the_course_of_a_run_without_energies_is_drawn(tmp_path, capsys):
+    run = save_run(tmp_path / "run", tt=[], ta=[], aa=[], method="naive")
+    shown(capsys, run, "--plot", tmp_path / "course.svg")
+    drawn = (tmp_path / "course.svg").read_text()
+    assert all(title in drawn for title in ("Training loss", "Validation loss", "naive in"))
+    assert "Energy shed" not in drawn
+
+
 def test_a_plot_of_a_run_that_never_conflicts(tmp_path):
     report = inspection.run(save_ledger(tmp_path / "l.safetensors", ta=[[1.0, 1.0]] * 2))
     render.energy_plot(report, tmp_path / "energy.png")

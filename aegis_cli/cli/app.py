@@ -850,8 +850,8 @@ def inspect(
         Path | None,
         Option(
             metavar="PNG",
-            help="Also draw a run's energy shed, a stream's routing, a study's frontier, or a "
-            "dataset's frames.",
+            help="Also draw a run's course (of aegis, the energy that was shed), a stream's "
+            "routing, a study's frontier, or a dataset's frames.",
         ),
     ] = None,
     verify: Annotated[

@@ -10,7 +10,7 @@ from typing import Any
 from aegis_cli.cli import render
 from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
-from aegis_cli.recipes import Recipe, describe, shipped, study_cells
+from aegis_cli.recipes import Recipe, describe, load, shipped, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
 # What `aegis run` leaves in a study's folder; the modules that write it need torch.
@@ -181,7 +181,7 @@ def _anything(
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:
-    """A stream's routing, a dataset's frames, or the energy that a run shed."""
+    """A stream's routing, a dataset's frames, the energy that a run shed, or how it trained."""
     from aegis_cli import inspection
 
     if isinstance(report, inspection.StreamInspection):
@@ -189,11 +189,17 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
     elif report.kind == "dataset":
         from aegis_cli.data.lerobot import dataset, download, summary
 
-        folder = path
+        home = path
         if not path.exists():  # an id on the hub; the files of the frames shown are fetched alone
             found = dataset.load(download.meta(str(path)))
             shown = summary.on_sheet(found)
-            folder = download.fetch(str(path), found, found.info.cameras, shown)
-        summary.save_sheet(folder, plot)
+            home = download.fetch(str(path), found, found.info.cameras, shown)
+        summary.save_sheet(home, plot)
+    elif report.kind == "run" and not report.layers:
+        from aegis_cli.training import folder
+
+        sets = load(path / "recipe.yaml", kind=Recipe).probe.sets
+        title = f"{report.facts['method']} in {path}"
+        render.curves_plot(folder.read_metrics(path, "step"), sets, title, plot)
     else:
         render.energy_plot(report, plot)

@@ -84,7 +84,7 @@ def load(
     # Last, since it may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
-    warn_of_outliers(demos, recorded, on_event)
+    warn_of_outliers(demos, recorded, recipe.train.normalization, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -307,11 +307,19 @@ def _warn_of_no_instruction(
         on_event(Warned("train", text))
 
 
-def warn_of_outliers(paths: Paths, found: demonstrations.Demonstrations, on_event: OnEvent) -> None:
+def warn_of_outliers(
+    paths: Paths,
+    found: demonstrations.Demonstrations,
+    normalization: str,
+    on_event: OnEvent,
+) -> None:
     """Warn of joints whose scale is that of a few values far off, as of a sensor's glitch.
 
     On such a scale all that the joint does otherwise is nearly alike, and errors look small.
+    Quantiles hardly notice these values.
     """
+    if normalization != "mean_std":
+        return
     told = list[str]()
     for what, tensor, names in (
         ("action", "actions", found.action_names),
@@ -331,7 +339,7 @@ def warn_of_outliers(paths: Paths, found: demonstrations.Demonstrations, on_even
             f"a few values far from all others make most of the spread in {mixture.said(paths)}: "
             f"{', '.join(told)}. Beside them all that the joint does is nearly alike to the "
             "policy, and its errors look small. If they are faults of the recording, leave these "
-            "episodes out (demos.only)"
+            "episodes out (demos.only), or set train.normalization to quantiles"
         )
         on_event(Warned("train", text))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,8 +12,10 @@ import pytest
 from matplotlib.colors import LogNorm, to_hex
 from samples.studies import found
 
-from aegis_cli.cli.render import frontier, open_loops, plots
+from aegis_cli.cli import render
+from aegis_cli.cli.render import frontier, open_loops, plots, training_curves
 from aegis_cli.cli.render.labels import Box, Label, place
+from aegis_cli.common.errors import AegisError
 from aegis_cli.evaluation.open_loop import Trace
 from aegis_cli.inspection import Bin, LayerEnergy
 
@@ -259,6 +262,47 @@ def test_a_path_is_drawn_as_it_is_and_not_as_mathematics(name: str) -> None:
     figure.draw_without_rendering()
     title = figure.axes[0].get_title(loc="left")
     assert title.replace(r"\$", "$").startswith(f"{name};")
+
+
+# --- the course of a training ---------------------------------------------------------------------
+
+
+def test_a_course_has_a_panel_for_each_figure_that_was_logged() -> None:
+    lines = [
+        {"step": 1, "loss": 2.0, "step_s": 0.5},
+        {"step": 2, "loss": 0.5, "rollout_success": 0.25, "rollout_low": 0.125, "rollout_high": 1},
+        {"step": 3, "vqa_drop_points": 1.0, "vqa_drop_points_2": 3.0}
+        | {"vqa_drop_low_2": 2.0, "vqa_drop_high_2": 5.0, "validation_loss": None},
+    ]
+    there = [
+        curve
+        for curve in training_curves.curves(["scenes", "sets/easy-vqa"])
+        if training_curves.points(lines, curve.name, 1.0)
+    ]
+    drawn = training_curves._drawn(lines, there, "naive in runs/$x$")
+    drawn.draw_without_rendering()
+    panels = {axes.get_title(loc="left"): axes for axes in drawn.axes if axes.get_visible()}
+    loss, first, second, success, time = panels.values()
+    assert [*panels] == [
+        "Training loss",
+        "VQA drop on scenes, validation (points)",
+        "VQA drop on easy-vqa, validation (points)",
+        "Success, validation (%)",
+        "Time of a step (s)",
+    ]
+    assert loss.get_yscale() == "log"
+    assert [*loss.lines[0].get_xydata().ravel()] == [1, 2.0, 2, 0.5]
+    assert [*success.lines[0].get_xydata().ravel()] == [2, 25.0]
+    bars = [axes.collections[0].get_segments() for axes in (second, success)]
+    assert [[*map(tuple, bar)] for (bar,) in bars] == [[(3, 2.0), (3, 5.0)], [(2, 12.5), (2, 100)]]
+    assert first.collections[0].get_segments() == []  # its interval is not known
+    assert drawn._suptitle.get_text() == r"naive in runs/\$x\$"
+
+
+def test_a_training_that_has_logged_nothing_has_no_course(tmp_path: Path) -> None:
+    with pytest.raises(AegisError, match="no figure in the metrics of naive in x"):
+        render.curves_plot([], ["scenes"], "naive in x", tmp_path / "x.png")
+    assert [*tmp_path.iterdir()] == []
 
 
 # --- predicted and recorded actions ---------------------------------------------------------------

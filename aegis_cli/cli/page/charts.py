@@ -20,12 +20,6 @@ COLORS = 8  # classes c0 to c7 of the style sheet
 Point = tuple[float, float]
 
 
-def is_number(value: object) -> bool:
-    """Whether a value can be drawn."""
-    whole_or_not = isinstance(value, int | float) and not isinstance(value, bool)
-    return whole_or_not and math.isfinite(value)
-
-
 # --- scales ---------------------------------------------------------------------------------------
 
 

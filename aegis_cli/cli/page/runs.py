@@ -7,11 +7,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from aegis_cli.cli.page import charts
-from aegis_cli.cli.page.charts import HeatMap, Row, Series, is_number
+from aegis_cli.cli.page.charts import HeatMap, Row, Series
 from aegis_cli.cli.page.cursor import At, between, decimal, plain, share, whole, with_interval
 from aegis_cli.cli.page.html import Child, Markup, element
 from aegis_cli.cli.page.tables import pairs, shaded, table, verdict
-from aegis_cli.cli.render.layout import INSTRUCTIONS
+from aegis_cli.cli.render import training_curves
+from aegis_cli.cli.render.layout import INSTRUCTIONS, is_number
 from aegis_cli.evaluation.results import Played, evaluated_on, told_apart
 
 _TICKS = 5  # below a heat map
@@ -303,56 +304,25 @@ def _wrong(example: At) -> Markup:
 
 # --- learning -------------------------------------------------------------------------------------
 
-_VQA_DROP = "vqa_drop_points"  # of the first question set; the number of another one follows
-# A field of metrics.jsonl, its title, whether its axis is logarithmic, and a factor.
-_CURVES = (
-    ("loss", "Training loss", True, 1.0),
-    ("validation_loss", "Validation loss", False, 1.0),
-    (_VQA_DROP, "VQA drop, validation (points)", False, 1.0),
-    ("rollout_success", "Success, validation (%)", False, 100.0),
-    ("rollout_mean_return", "Mean return, validation", False, 1.0),
-    ("action_error", "Error of held-out actions (1: of their mean)", False, 1.0),
-    ("energy_shed", "Energy shed (%)", True, 100.0),
-    ("lr_backbone", "Learning rate of the backbone", False, 1.0),
-    ("step_s", "Time of a step (s)", False, 1.0),
-)
-
 
 def curves(runs: Sequence[At]) -> Markup | None:
     """What metrics.jsonl logged, a chart for each figure that some run has."""
+    given = [run["recipe"]["probe"]["vqa"].value for run in runs]
+    sets = max((names for names in given if isinstance(names, list)), key=len, default=[])
     drawn = []
-    for name, title, log, scale in _curves_of(runs):
+    for curve in training_curves.curves(sets):
         series = []
         for number, run in enumerate(runs):
-            points = _points(run["metrics"].value, name, scale)
+            points = training_curves.points(run["metrics"].value, curve.name, curve.scale)
             series.append(Series(str(run["label"]), points, number, marks=True))
         if any(s.points for s in series):
-            chart = charts.lines(series, "step", title, title, log)
+            chart = charts.lines(series, "step", curve.title, curve.title, curve.log)
             drawn.append(figure(chart))
     if not drawn:  # a run that was interrupted before its first line
         return None
     names = [(str(run["label"]), number) for number, run in enumerate(runs)]
     legend = charts.legend(names) if len(runs) > 1 else None
     return section("Learning", legend, element("div", *drawn, class_="charts"))
-
-
-def _curves_of(runs: Sequence[At]) -> Iterator[tuple[str, str, bool, float]]:
-    """`_CURVES`, with one of the VQA drop for each set of questions that a run is asked."""
-    given = [run["recipe"]["probe"]["vqa"].value for run in runs]
-    sets = max((names for names in given if isinstance(names, list)), key=len, default=[])
-    for curve in _CURVES:
-        if curve[0] != _VQA_DROP or len(sets) < 2:
-            yield curve
-            continue
-        for number, name in enumerate(sets, start=1):
-            field = _VQA_DROP if number == 1 else f"{_VQA_DROP}_{number}"
-            short = name.rpartition("/")[2]  # of a path
-            yield field, f"VQA drop on {short}, validation (points)", False, 1.0
-
-
-def _points(lines: Sequence[dict[str, Any]], name: str, scale: float) -> list[tuple[float, float]]:
-    """(step, value) of the lines that have the figure: not every line has every one."""
-    return [(line["step"], scale * line[name]) for line in lines if is_number(line.get(name))]
 
 
 def drift(runs: Sequence[At]) -> Markup | None:

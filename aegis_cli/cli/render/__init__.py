@@ -36,6 +36,7 @@ from aegis_cli.cli.render.tables import (
     serving,
     trained,
 )
+from aegis_cli.cli.render.training_curves import curves_plot
 
 __all__ = [
     "STDOUT",
@@ -45,6 +46,7 @@ __all__ = [
     "compared",
     "doctor",
     "dual",
+    "curves_plot",
     "energy_plot",
     "error",
     "facts",

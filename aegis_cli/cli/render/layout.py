@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -18,6 +19,12 @@ _SUCCESSES = {
     "Wrong target %": "wrong_target",
 }
 _RETURNS = {"Return % of highest": "return_share"}
+
+
+def is_number(value: object) -> bool:
+    """Whether a value can be drawn."""
+    whole_or_not = isinstance(value, int | float) and not isinstance(value, bool)
+    return whole_or_not and math.isfinite(value)
 
 
 def acting(rows: Sequence[Any]) -> dict[str, str]:
