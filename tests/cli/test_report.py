@@ -510,6 +510,17 @@ def test_a_step_time_is_shown_in_the_digits_that_decide(aegis, tmp_path: Path) -
     assert [text for path, _, text in page.figures if path.endswith(place)] == ["1.0204"]
 
 
+def test_a_page_says_what_of_the_bar_was_not_measured(aegis, tmp_path: Path) -> None:
+    study = found(("naive", "x"), 5)
+    result = replace(study.tasks[0].results[1], seen_gain_points=None)
+    barred = bar(POLICY_BAR, result)
+    study.tasks[0].results[1] = replace(result, bar=barred)
+    files.save_json(tmp_path / "table.json", study.to_json())
+    (name,) = (check.name for check in barred.checks if check.value is None)
+    said = f"no variant passes the bar, since it was not measured: {name}."
+    assert said in reported(aegis, tmp_path)[0].said
+
+
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:
     point = PolicyPoint("x", "kfac", 0.1, 0.875, 0.9, 0.5, chosen=True)
     table = replace(found(("naive", "x")), tasks=[], tuning_task="reach", tuning=[point])

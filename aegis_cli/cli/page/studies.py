@@ -126,10 +126,17 @@ def passing(compared: At) -> str:
     for task in compared["tasks"]:
         barred = [result for result in task["results"] if result["bar"]]
         names = [str(r["variant"]) for r in barred if r["bar"]["passed"].value]
-        if barred:
-            who = ", ".join(names) or "no variant"
-            asked = f" asked {task['vqa']}" if task["vqa"] else ""
-            said.append(f"On {task['task']}{asked}, {who} passes the bar.")
+        if not barred:
+            continue
+        asked = f" asked {task['vqa']}" if task["vqa"] else ""
+        who = ", ".join(names) or "no variant"
+        unknown = [
+            str(check["name"])
+            for number, check in enumerate(barred[0]["bar"]["checks"])
+            if all(result["bar"]["checks"][number]["value"].value is None for result in barred)
+        ]
+        why = f", since it was not measured: {', '.join(unknown)}" if unknown else ""
+        said.append(f"On {task['task']}{asked}, {who} passes the bar{why}.")
     return " ".join(said)
 
 

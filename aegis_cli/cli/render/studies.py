@@ -297,6 +297,13 @@ def _notes(report: Any) -> list[str]:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
         said = f"bar, by the worse end of each interval: {'; '.join(demands)}"
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
+        unknown = [
+            check.name
+            for number, check in enumerate(bars[0].checks)
+            if all(bar.checks[number].value is None for bar in bars)
+        ]
+        if unknown:
+            notes.append(f"nobody can pass the bar, for it was not measured: {', '.join(unknown)}")
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
     mixed = sum(task.across_versions for task in report.tasks)
