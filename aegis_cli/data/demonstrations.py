@@ -534,11 +534,12 @@ def _split(
     validation_share, seed, only = split
     needed = 1 if validation_share is None else 2  # one is held out
     if len(episodes) < needed:
+        record = "record more episodes" + ("" if path.is_dir() else " with aegis demos")
         raise AegisError(
             f"{len(episodes)} episode{'s' * (not len(episodes))} in '{path}'"
             + (f" by demos.only: {only}" if only else ""),
             "at least one" if needed == 1 else "2 or more: one is held out",
-            "choose more with demos.only" if only else "record more episodes",
+            "choose more with demos.only" if only else record,
         )
     # `held_out` counts the chosen episodes alone, so that each choice has some to validate on.
     validated = episodes[held_out(len(episodes), validation_share, seed)]
