@@ -40,7 +40,9 @@ class Commands(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         args = [word_at_home(word) for word in args]
-        ctx.meta["aegis.args"] = list(args)  # as they were typed; click takes its own list apart
+        ctx.meta["aegis.args"] = list(
+            args
+        )  # but for ~/, as they were typed; click takes its own list apart
         try:
             return super().parse_args(ctx, args)
         except OSError as error:  # of --help, whose output may be a full disk

@@ -199,7 +199,7 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
         from aegis_cli.training import folder
 
         sets = load(path / "recipe.yaml", kind=Recipe).probe.sets
-        title = f"{report.facts['method']} in {path}"
+        title = f"{report.facts['method']} in {path.absolute().name}"
         render.curves_plot(folder.read_metrics(path, "step"), sets, title, plot)
     else:
         render.energy_plot(report, plot)

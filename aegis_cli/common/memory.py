@@ -16,8 +16,9 @@ from aegis_cli.common.errors import AegisError
 
 _STATUS = Path("/proc/self/status")
 _RESTART = Path("/proc/self/clear_refs")  # a 5 in it: the peak begins anew
-# glibc's `mallopt`: from which size on a block is mapped by itself, and unmapped when it is freed.
-_MAPPED_FROM = -3
+# glibc's `mallopt`: from which size on a block is mapped by itself, and unmapped when it is freed;
+# and how much may be free at the heap's end before that is given back.
+_MAPPED_FROM, _FREE_AT_END = -3, -1
 _MAPPED, _USUAL = 2**20, 2**25  # bytes
 
 
@@ -90,5 +91,6 @@ def returned() -> Generator[None]:
     try:
         yield
     finally:
-        # What it would have risen to; from now on it stays there.
+        # What both would have risen to; glibc raises neither any more.
         library.mallopt(_MAPPED_FROM, _USUAL)
+        library.mallopt(_FREE_AT_END, 2 * _USUAL)

@@ -642,6 +642,8 @@ def _demos(
         task_episodes.check_own(found.texts, task, f"'{path}'")
     # An unknown word must end no training half-way.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
+    if not recipe.simulated:
+        loading.warn_of_outliers(path, found, recipe.train, on_event)
     return found
 
 

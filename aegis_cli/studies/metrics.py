@@ -298,6 +298,16 @@ class Bar:
     passed: bool | None
 
 
+def unmeasured(bars: Sequence[Mapping[str, float | None]]) -> str:
+    """The demands that no variant has a figure of, in words: nobody can pass such a bar.
+
+    Args:
+        bars: of each variant, demand -> its figure; all have the same demands.
+    """
+    names = bars[0] if bars else ()
+    return ", ".join(name for name in names if all(bar[name] is None for bar in bars))
+
+
 @dataclass(frozen=True)
 class Limit:
     """What is good enough: in words, and as a test of a measured figure.

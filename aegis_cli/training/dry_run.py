@@ -302,13 +302,15 @@ def _needs(
     fits = _fits(needed, free, device, ranks)
     step_s, validation_s, measured = None, None, None
     if fits is not False:
-        # Before the steps, which move the weights; what it takes is part of the training's peak.
-        validation_s = _where_it_fits(partial(validation_time.measured, training, on_event), ranks)
-        if validation_s is not None:
-            step_s = _where_it_fits(partial(_timed, training, on_event), ranks)
-        fits = False  # unless the steps show that it does
-    if step_s is not None:
-        # Steps were taken, but no checkpoint was written: its share is still the estimate's.
+        step_s = _where_it_fits(partial(_timed, training, on_event), ranks)
+        if step_s is not None:
+            # After the steps, for gradients and what the optimizer keeps are there while it
+            # validates: together they are part of the training's peak.
+            measure = partial(validation_time.measured, training, on_event)
+            validation_s = _where_it_fits(measure, ranks)
+        fits = False  # unless both show that it does
+    if validation_s is not None:
+        # No checkpoint was written: its share is still the estimate's.
         needed = memory.peak(device) - base + parts["checkpoint"]
         measured = max(ranks.gathered(needed))
         fits = _fits(needed, free, device, ranks)

@@ -31,7 +31,7 @@ from aegis_cli.models.backbones import shapes
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape
 from aegis_cli.models.policy_meta import PolicyMeta
-from aegis_cli.recipes import Demos, Recipe, RobotStreamRecipe
+from aegis_cli.recipes import Demos, Recipe, RobotStreamRecipe, RobotTrain, Train
 from aegis_cli.training import checkpoint, parallel
 
 Questions = sets.Scenes | sets.Listed
@@ -84,7 +84,7 @@ def load(
     # Last, since it may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
-    warn_of_outliers(demos, recorded, recipe.train.normalization, on_event)
+    warn_of_outliers(demos, recorded, recipe.train, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -310,21 +310,24 @@ def _warn_of_no_instruction(
 def warn_of_outliers(
     paths: Paths,
     found: demonstrations.Demonstrations,
-    normalization: str,
+    settings: Train | RobotTrain,
     on_event: OnEvent,
 ) -> None:
     """Warn of joints whose scale is that of a few values far off, as of a sensor's glitch.
 
     On such a scale all that the joint does otherwise is nearly alike, and errors look small.
-    Quantiles hardly notice these values.
+    Quantiles hardly notice these values, and actions that are relative have a scale of their own.
     """
-    if normalization != "mean_std":
+    if settings.normalization != "mean_std":
         return
+    relative = getattr(settings, "relative_actions", False)  # a stream has no such key
     told = list[str]()
     for what, tensor, names in (
         ("action", "actions", found.action_names),
         ("position", "proprio", found.proprio_names),
     ):
+        if relative and what == "action":
+            continue
         for one in outliers(found.tensors[tensor][found.train]):
             name = names[one.dimension] if names else str(one.dimension)
             # Of several sets the episodes are numbered anew.
@@ -338,8 +341,9 @@ def warn_of_outliers(
         text = (
             f"a few values far from all others make most of the spread in {mixture.said(paths)}: "
             f"{', '.join(told)}. Beside them all that the joint does is nearly alike to the "
-            "policy, and its errors look small. If they are faults of the recording, leave these "
-            "episodes out (demos.only), or set train.normalization to quantiles"
+            "policy, and its errors look small. If they are faults of the recording, and no motion "
+            "that is rare, leave these episodes out (demos.only), or scale by quantiles "
+            "(train.normalization)"
         )
         on_event(Warned("train", text))
 

@@ -624,17 +624,6 @@ def test_a_step_time_beside_its_verdict_has_the_digits_that_decide(
     assert shown in text_of(study(made))
 
 
-def test_a_bar_that_nobody_can_be_judged_by_says_what_was_not_measured() -> None:
-    """As success is not, of a robot that no simulator has."""
-    made = found(("naive", "x"), 5)
-    result = replace(made.tasks[0].results[1], seen_gain_points=None, held_out_gain_points=None)
-    made.tasks[0].results[1] = replace(result, bar=bar(POLICY_BAR, result))
-    (said,) = (line for line in text_of(study(made)).splitlines() if "nobody can pass" in line)
-    names = [check.name for check in bar(POLICY_BAR, result).checks if check.value is None]
-    assert len(names) == 2 and said.endswith(f"it was not measured: {', '.join(names)}")
-    assert "nobody can pass" not in text_of(study(found(("naive", "x"), 5)))
-
-
 def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() -> None:
     rows = LayerEnergy("layers.3", 0.1, 0.2, 0.5)
     frozen = tuple(f"layers.{i}" for i in (0, 1, 2, 4, 10, 11))

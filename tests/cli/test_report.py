@@ -21,6 +21,7 @@ from samples.studies import found
 
 from aegis_cli.cli.page import pages
 from aegis_cli.cli.page.cursor import At
+from aegis_cli.cli.render.studies import _notes
 from aegis_cli.common import files
 from aegis_cli.evaluation import results
 from aegis_cli.recipes import Train
@@ -510,15 +511,18 @@ def test_a_step_time_is_shown_in_the_digits_that_decide(aegis, tmp_path: Path) -
     assert [text for path, _, text in page.figures if path.endswith(place)] == ["1.0204"]
 
 
-def test_a_page_says_what_of_the_bar_was_not_measured(aegis, tmp_path: Path) -> None:
+def test_page_and_table_say_what_of_the_bar_was_not_measured(aegis, tmp_path: Path) -> None:
+    """As success is not, of a robot that no simulator has."""
     study = found(("naive", "x"), 5)
     result = replace(study.tasks[0].results[1], seen_gain_points=None)
     barred = bar(POLICY_BAR, result)
     study.tasks[0].results[1] = replace(result, bar=barred)
     files.save_json(tmp_path / "table.json", study.to_json())
     (name,) = (check.name for check in barred.checks if check.value is None)
-    said = f"no variant passes the bar, since it was not measured: {name}."
+    said = f"no variant passes the bar, for there is no figure of {name}."
     assert said in reported(aegis, tmp_path)[0].said
+    assert f"on reach nobody can pass the bar: no figure of {name}" in " ".join(_notes(study))
+    assert "nobody can pass" not in " ".join(_notes(found(("naive", "x"), 5)))
 
 
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import torch
 from aegis_cli.common.events import Event, Warned
 from aegis_cli.data import demonstrations
 from aegis_cli.data.outliers import outliers
+from aegis_cli.recipes import RobotTrain, Train
 from aegis_cli.training import loading
 
 
@@ -49,13 +50,14 @@ def test_a_training_warns_of_the_joint_and_the_episode(demos_file: Path) -> None
     found = dataclasses.replace(loaded, train=loaded.read)
     assert len(found.train) >= 100  # as many as it takes to tell
     told = list[Event]()
-    loading.warn_of_outliers(demos_file, found, "mean_std", told.append)
+    loading.warn_of_outliers(demos_file, found, Train(), told.append)
     assert told == []
     found.tensors["actions"] = found.tensors["actions"].clone()
     found.tensors["actions"][found.train[5], 1] = 1e4
-    loading.warn_of_outliers(demos_file, found, "quantiles", told.append)
-    assert told == []  # no value shifts these by much
-    loading.warn_of_outliers(demos_file, found, "mean_std", told.append)
+    for settings in (Train(normalization="quantiles"), Train(relative_actions=True)):
+        loading.warn_of_outliers(demos_file, found, settings, told.append)
+        assert told == []  # no value shifts these by much; those have a scale of their own
+    loading.warn_of_outliers(demos_file, found, RobotTrain(), told.append)
     (warned,) = told
     assert isinstance(warned, Warned)
     episode = int(found.episode_of[found.train[5]])

@@ -103,7 +103,7 @@ def test_a_path_that_is_missing_is_never_asked_of_the_hub(
         said = bad(
             *command,
             says=(
-                f"'{name}': no such file or folder",
+                f"'{os.path.expanduser(name)}': no such file or folder",
                 "run's folder (it holds checkpoints/last)",
                 "hub id",
             ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import sys
 import time
 from pathlib import Path
@@ -65,7 +66,7 @@ class _Allocated(ctypes.Structure):
 
 
 def mapped_blocks() -> tuple[int, int, int]:
-    """How many more bytes are mapped by themselves while a process has a tensor of 2 MB.
+    """How many more bytes are mapped by themselves while a process has a tensor of 24 MB.
 
     Before `memory.returned`, within it, and after it.
     """
@@ -78,17 +79,39 @@ def mapped_blocks() -> tuple[int, int, int]:
 
     def of_a_tensor() -> int:
         before = tell().hblkhd
-        tensor = torch.empty(2_000_000, dtype=torch.uint8)
+        tensor = torch.empty(24_000_000, dtype=torch.uint8)  # larger than any hole
         more = tell().hblkhd - before
         assert len(tensor)
         return more
 
     for _ in range(2):  # a large block that is freed raises the limit
-        torch.empty(20_000_000, dtype=torch.uint8)
+        torch.empty(30_000_000, dtype=torch.uint8)
     before = of_a_tensor()
     with memory.returned():
         within = of_a_tensor()
     return before, within, of_a_tensor()
+
+
+def faults_after_returned() -> tuple[int, int]:
+    """Page faults of ten blocks of 20 MB, after `memory.returned`, and how many pages they have."""
+    import torch
+
+    from aegis_cli.common import memory
+
+    def fill() -> None:
+        assert torch.ones(20_000_000, dtype=torch.uint8).numel()
+
+    def faults() -> int:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+    with memory.returned():
+        pass
+    for _ in range(10):  # the first ones find their place
+        fill()
+    before = faults()
+    for _ in range(10):
+        fill()
+    return faults() - before, 10 * 20_000_000 // resource.getpagesize()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from aegis_cli.cli.render.frontier import (
 )
 from aegis_cli.cli.render.studies import knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
-from aegis_cli.studies.metrics import columns, deciding_decimals
+from aegis_cli.studies.metrics import columns, deciding_decimals, unmeasured
 
 _DECLARED = columns(PolicyResult)
 _LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
@@ -130,12 +130,12 @@ def passing(compared: At) -> str:
             continue
         asked = f" asked {task['vqa']}" if task["vqa"] else ""
         who = ", ".join(names) or "no variant"
-        unknown = [
-            str(check["name"])
-            for number, check in enumerate(barred[0]["bar"]["checks"])
-            if all(result["bar"]["checks"][number]["value"].value is None for result in barred)
+        each = [
+            {str(check["name"]): check["value"].value for check in result["bar"]["checks"]}
+            for result in barred
         ]
-        why = f", since it was not measured: {', '.join(unknown)}" if unknown else ""
+        unknown = unmeasured(each)
+        why = f", for there is no figure of {unknown}" if unknown else ""
         said.append(f"On {task['task']}{asked}, {who} passes the bar{why}.")
     return " ".join(said)
 

@@ -34,8 +34,8 @@ def energy_plot(report: Any, path: Path) -> None:
     if not report.layers:
         raise AegisError(
             f"no projection energy in {report.path}",
-            "a run or ledger of method aegis",
-            "leave out --plot",
+            "a run, or a checkpoint or ledger of method aegis",
+            "leave out --plot, or give the run of a checkpoint",
         )
     save_figure(lambda: _energy(report), path)
 

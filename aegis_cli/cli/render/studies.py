@@ -25,7 +25,7 @@ from aegis_cli.cli.render.layout import (
     spread,
     unmarked,
 )
-from aegis_cli.studies.metrics import Column, columns, deciding_decimals
+from aegis_cli.studies.metrics import Column, columns, deciding_decimals, unmeasured
 from aegis_cli.studies.tuning import POLICY_RULE, ROBOT_STREAM_RULE, STREAM_RULE, Rule
 
 
@@ -297,13 +297,11 @@ def _notes(report: Any) -> list[str]:
         demands = [f"{check.name} {check.demand}" for check in bars[0].checks]
         said = f"bar, by the worse end of each interval: {'; '.join(demands)}"
         notes.append(textwrap.fill(said, 100, subsequent_indent="  "))
-        unknown = [
-            check.name
-            for number, check in enumerate(bars[0].checks)
-            if all(bar.checks[number].value is None for bar in bars)
-        ]
-        if unknown:
-            notes.append(f"nobody can pass the bar, for it was not measured: {', '.join(unknown)}")
+        for task in report.tasks:
+            barred = [r.bar for r in task.results if r.bar]
+            unknown = unmeasured([{c.name: c.value for c in bar.checks} for bar in barred])
+            if unknown:
+                notes.append(f"on {task.task} nobody can pass the bar: no figure of {unknown}")
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
     mixed = sum(task.across_versions for task in report.tasks)

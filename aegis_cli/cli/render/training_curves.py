@@ -104,10 +104,11 @@ def curves_plot(
 
 
 def _drawn(lines: Sequence[Mapping[str, Any]], there: Sequence[Curve], title: str) -> Any:
-    count = -(-len(there) // _COLUMNS)
+    columns = min(_COLUMNS, len(there))
+    count = -(-len(there) // columns)
     drawn = figure(figsize=(9.5, 0.5 + 2.3 * count), layout="constrained")
     drawn.suptitle(literal(title), x=0.01, ha="left", fontsize=12, fontweight="bold")
-    panels = list(drawn.subplots(count, _COLUMNS, squeeze=False).flat)
+    panels = list(drawn.subplots(count, columns, squeeze=False).flat)
     for axes, curve in zip(panels, there, strict=False):
         _draw_curve(axes, lines, curve)
     for axes in panels[len(there) :]:
