@@ -10,6 +10,7 @@ what the backbone knows with no task active.
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -179,7 +180,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             AegisError: there are too few of them, or the backbone cannot read one.
         """
         self.question_files = source.sha256
-        kind = RobotEvaluator if self.recipe.simulated else HeldOutEvaluator
+        kind = ClosedLoopEvaluator if self.recipe.simulated else HeldOutEvaluator
         self.evaluator = kind(self, source, on_event)
 
     @property
@@ -824,10 +825,10 @@ def _seed(seed: int, index: int, purpose: int) -> int:
 # --- what is measured -----------------------------------------------------------------------------
 
 
-class RobotEvaluator:
-    """Closed loops with the task told, and questions with no task active.
+class RobotEvaluator(ABC):
+    """How tasks are done with the task told, and questions with no task active.
 
-    The questions and the episodes are the same every time.
+    The questions are the same every time, and so is what a task is tried on.
     """
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
@@ -844,33 +845,19 @@ class RobotEvaluator:
         return ()
 
     def intervals(self, done: int) -> list[list[float] | None]:
-        """Of each error of the tasks 0 to `done` its interval, as it was measured last."""
+        """Of each error of the tasks 0 to `done` its interval, as it was measured last.
+
+        A success has none.
+        """
         return []
 
     def row(self, done: int) -> list[float]:
         """What was measured after tasks 0 to t = `done`, of these alone."""
         return [self.tried(i) for i in range(done + 1)]
 
+    @abstractmethod
     def tried(self, task: int) -> float:
         """How the task of that number is done now."""
-        return self.success(task)
-
-    def success(self, task: int) -> float:
-        """Share of successes of the task of that number, or of the highest return."""
-        acting, settings = self._run.acting(task), self._run.recipe.rollout
-        split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
-        found = play(
-            acting,
-            settings.episodes,
-            settings.colors,
-            split,
-            on_event=self._named(acting.task),
-            seed=settings.seed,
-        )
-        # A task of dm_control's suite has no success, but a return.
-        share = found.return_share if found.success is None else found.success
-        assert share is not None
-        return share
 
     def vqa(self) -> list[float]:
         """Accuracy and cross-entropy of the backbone with no task active."""
@@ -888,8 +875,29 @@ class RobotEvaluator:
         return passed_on
 
 
+class ClosedLoopEvaluator(RobotEvaluator):
+    """Lets policies act in simulated tasks."""
+
+    def tried(self, task: int) -> float:
+        """Share of successes of the task of that number, or of the highest return."""
+        acting, settings = self._run.acting(task), self._run.recipe.rollout
+        split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
+        found = play(
+            acting,
+            settings.episodes,
+            settings.colors,
+            split,
+            on_event=self._named(acting.task),
+            seed=settings.seed,
+        )
+        # A task of dm_control's suite has no success, but a return.
+        share = found.return_share if found.success is None else found.success
+        assert share is not None
+        return share
+
+
 class HeldOutEvaluator(RobotEvaluator):
-    """Predictions at held-out frames with the task told, and questions with no task active."""
+    """Lets policies predict at held-out frames of tasks that no simulator has."""
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
         super().__init__(run, source, on_event)

@@ -26,7 +26,7 @@ from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, loop, probe, robots, state, train
 from aegis_cli.continual.report import RobotStreamReport
-from aegis_cli.continual.robots import RobotEvaluator, RobotStreamRun
+from aegis_cli.continual.robots import ClosedLoopEvaluator, RobotStreamRun
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.data import demonstrations
 from aegis_cli.data import record as demos
@@ -82,7 +82,7 @@ def chunks(run: RobotStreamRun, task: int) -> torch.Tensor:
 def test_a_task_that_ends_in_no_numbers_ends_the_stream(
     where: str, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evaluator = RobotEvaluator
+    evaluator = ClosedLoopEvaluator
     monkeypatch.setattr(evaluator, "row", lambda self, done: [0.0] * (done + 1))
     if where == "validation":
         monkeypatch.setattr(robots.train, "validation_loss", lambda *_: math.nan)
@@ -412,7 +412,7 @@ def test_settings_are_chosen_by_other_questions_than_the_probes(
 ) -> None:
     run = robots.load_to_act(done("igsp")[1])
     run.recipe = dataclasses.replace(run.recipe, rollout=RobotRollout(split=split))
-    asked = RobotEvaluator(run, robots.questions(run.recipe))._asked
+    asked = ClosedLoopEvaluator(run, robots.questions(run.recipe))._asked
     images = {name: load_scenes(name, 7, 0).images for name in ("probe", "validation")}
     assert not (images["probe"] == images["validation"]).all()
     assert len(asked.questions) == 7 and (asked.images == images[part]).all()

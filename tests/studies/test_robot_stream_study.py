@@ -300,7 +300,7 @@ def test_a_stream_asks_and_plays_by_the_seeds_of_its_recipe(
     ]
     asked = [[q.text for q in run.evaluator._asked.questions] for run in runs]
     for run in runs:
-        run.evaluator.success(0)
+        run.evaluator.tried(0)
     assert (asked[0] != asked[1]) == (section == "probe")
     assert played == ([0, 0] if section == "probe" else [0, 7])
 
