@@ -112,8 +112,9 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGSTOP"]
     other = subprocess.Popen(command)
     try:
-        while not any(tmp_path.iterdir()) or not next(tmp_path.iterdir()).stat().st_size:
-            assert other.poll() is None
+        # A signal that comes before it has stopped itself would not wake it.
+        _, status = os.waitpid(other.pid, os.WUNTRACED)
+        assert os.WIFSTOPPED(status)
         files.save_json(path, 1)
         assert len(list(tmp_path.iterdir())) == 2
         other.send_signal(signal.SIGCONT)
