@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples.training_runs import SETTINGS, contents
 
-from aegis_cli.common.events import OnEvent, Progress, Warned
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 from aegis_cli.recipes import Probe, Recipe
 from aegis_cli.training import dry_run, validation_time
 from aegis_cli.training.validation_time import expected_s
@@ -83,7 +83,13 @@ def test_a_dry_run_tells_the_parts_that_there_are(
     method: str, without: set[str], watching: Recipe, demos_file: Path, tmp_path: Path
 ) -> None:
     """A backbone that stands still is not asked again."""
-    plan = dry_run.run(watching, method, demos_file, None, tmp_path / "run")
+    events: list[Event] = []
+    plan = dry_run.run(watching, method, demos_file, None, tmp_path / "run", False, events.append)
+    # After the steps, whose gradients and moments a validation has beside it in a training.
+    stages = [e.stage for e in events if isinstance(e, Progress) and e.stage.startswith("dry run")]
+    assert stages.index("dry run (validation)") > max(
+        place for place, stage in enumerate(stages) if stage == "dry run"
+    )
     assert plan.validation_s is not None and plan.step_s is not None
     assert plan.validation_s.keys() == {"loss", "questions", "episodes", "actions"} - without
     assert all(seconds > 0 for seconds in plan.validation_s.values())
