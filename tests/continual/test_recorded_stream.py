@@ -20,6 +20,7 @@ from samples.training_runs import contents
 
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError, Diverged
+from aegis_cli.common.events import Warned
 from aegis_cli.continual import files, probe, robots, state, train
 from aegis_cli.continual.held_out import HeldOut
 from aegis_cli.continual.report import RecordedStreamReport
@@ -121,6 +122,27 @@ def test_errors_are_those_of_an_evaluation_of_held_out_frames(
         assert report.errors[-1][number] == pytest.approx(found.relative_error, rel=1e-6), task
         assert report.error_intervals[-1][number] == pytest.approx(found.relative_interval)
         assert report.hold_errors[number] == pytest.approx(found.hold_error, rel=1e-12), task
+
+
+def test_a_joint_whose_scale_a_glitch_makes_is_warned_of(
+    done: Done, real: Make, tmp_path: Path
+) -> None:
+    _, out = done("igsp")
+    backbone = robots.load_to_act(out).model.backbone
+    rng = np.random.default_rng(0)
+    made = []
+    for glitch in (0.0, 1e4, 0.0):
+        path = rng.normal(size=(101, JOINTS[TASKS[0]])).astype(np.float32)
+        path[50, 0] += glitch
+        shown = np.zeros((100, 16, 16, 3), dtype=np.uint8)
+        made.append(NewEpisode({"top": shown}, path[:-1], path[1:], TEXTS[TASKS[0]]))
+    names = tuple(f"joint {n}.pos" for n in range(JOINTS[TASKS[0]]))
+    folder = save(tmp_path / "robot", made, state_names=names, action_names=names)
+    recipe = real(demos=RobotDemos(paths=(str(folder), str(folder)), only=("0-2", "0-2")))
+    told: list[Any] = []
+    robots._demos(recipe, 0, backbone, out, told.append)
+    warned = [event.text for event in told if isinstance(event, Warned)]
+    assert any("make most of the spread" in text and "in episode 1;" in text for text in warned)
 
 
 @pytest.mark.parametrize(("method", "keeps"), [("igsp", True), ("sequential", False)])
