@@ -888,7 +888,10 @@ def inspect(
 def compare(
     paths: Annotated[
         list[Path],
-        Argument(metavar="RUN ...", help="Folders of runs; a job's stands for all of its runs."),
+        Argument(
+            metavar="RUN ...",
+            help="Folders of runs; a job's, or any other with runs in it, stands for all of them.",
+        ),
     ],
     wide: Wide = False,
     as_json: Json = False,
@@ -900,6 +903,7 @@ def compare(
 
     \b
     Example: aegis compare runs/x runs/y
+    Example: aegis compare runs
     Example: aegis compare runs/quickstart runs/x --json
     """
     stages.COMPARE.run(paths, wide=wide, as_json=as_json)

@@ -32,6 +32,12 @@ from aegis_cli.recipes.decoding import below
 
 # What a command that goes on needs beside its own words; `run` skips what is up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
+# What pydantic calls a value of the wrong type, and what it is then.
+_NO_NUMBER = {
+    "int_parsing": "no whole number",
+    "int_from_float": "no whole number",
+    "float_parsing": "no number",
+}
 GOES_ON = "aegis.goes_on"  # what finds the words by which a run goes on by itself, or None
 
 
@@ -117,8 +123,21 @@ def _misused(error: Any) -> int:
     Click would show it where nobody looks after a stderr that cannot be written.
     """
     _name_the_key(error)
+    _name_the_value(error)
     _say(lambda misuse: misuse.show(), error)
     return error.exit_code
+
+
+def _name_the_value(error: Any) -> None:
+    """Say of an option's value what it is: pydantic, by which typer reads it, leaves it out."""
+    problems = getattr(error.__cause__, "errors", None)
+    if problems is None:
+        return
+    first = problems()[0]
+    if first["type"] == "value_error":  # typer's own words of a choice, which name the value
+        error.message = error.message.removeprefix("Value error, ")
+    elif first["type"] in _NO_NUMBER:
+        error.message = f"{first['input']!r} is {_NO_NUMBER[first['type']]}."
 
 
 def _name_the_key(error: Any) -> None:

@@ -70,9 +70,10 @@ def tiled(
     height = _CAPTION + tile + 2 * _GAP
     sheet = Image.new("RGB", (columns * width, math.ceil(len(cells) / columns) * height), "white")
     draw = ImageDraw.Draw(sheet)
+    # One font for all: captions of a few languages would else be set in two.
+    draw.font = _font("".join(caption for caption, _ in cells), text)
     for i, (caption, frames) in enumerate(cells):
         x, y = i % columns * width, i // columns * height
-        draw.font = _font(caption, text)
         above = (_CAPTION - text) // 2 - 1
         draw.text((x + _GAP, y + above), _shortened(draw, caption, width - 2 * _GAP), fill="black")
         for k, frame in enumerate(frames):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -107,11 +107,11 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
     compared where episodes, frames and seed are the same, trained on or not.
 
     Raises:
-        AegisError: a path that is no run of a policy, and no job of such.
+        AegisError: a path that is no run of a policy, and no folder with such.
     """
     found = []
-    for given in paths:  # a run, or a job with several
-        found += [(path, _inspected(path)) for path in _runs(Path(given))]
+    for given in paths:  # a run, or a folder with several
+        found += [(path, _inspected(path)) for path in _runs(Path(given), on_event)]
     # What is compared is chosen over all runs together.
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(path, one) for path, one in found])
@@ -259,26 +259,48 @@ def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Name
     return chosen
 
 
-def _runs(path: Path) -> Iterator[Path]:
-    """The path of a run, or those of all runs of a job."""
+def _runs(path: Path, on_event: OnEvent) -> list[Path]:
+    """The path of a run, or those of all runs in the folder of a job, or in any folder.
+
+    Of any folder, runs without a checkpoint are left out with a warning.
+    """
     if (path / table.NAME).is_file():
         found = table.load(path)
         if isinstance(found, PipelineReport):
-            yield from table.runs(found)
-            return
-    if not (path / "recipe.yaml").is_file() or recipes.is_stream_run(path):
-        if not (path / CELLS).is_file():  # a study's has stages too, and no table of runs
-            refuse_unfinished(path, "compare")
-        expected = "folders that aegis train wrote, or one that aegis run made of a recipe"
-        if not path.exists():
-            raise AegisError(f"nothing is at '{path}'", expected, "check the path")
-        raise AegisError(
-            f"'{path}' is no run of a policy",
-            expected,
-            "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
-            "--baseline MODEL",
-        )
-    yield path
+            return table.runs(found)
+    elif _is_run(path):
+        return [path]
+    elif not (path / CELLS).is_file():  # a study's has stages too, and no table of runs
+        refuse_unfinished(path, "compare")
+        if inside := _runs_inside(path, on_event):
+            return inside
+    expected = (
+        "folders that aegis train wrote, one that aegis run made of a recipe, or one with runs in "
+        "it"
+    )
+    if not path.exists():
+        raise AegisError(f"nothing is at '{path}'", expected, "check the path")
+    raise AegisError(
+        f"'{path}' is no run of a policy",
+        expected,
+        "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
+        "--baseline MODEL",
+    )
+
+
+def _is_run(path: Path) -> bool:
+    return (path / "recipe.yaml").is_file() and not recipes.is_stream_run(path)
+
+
+def _runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
+    """The runs right in a folder by their names, as far as they have a checkpoint."""
+    runs = sorted(saved.parent for saved in folder.glob("*/recipe.yaml"))
+    runs = [run for run in runs if _is_run(run)]
+    begun = [run for run in runs if not (run / "ledger.safetensors").is_file()]
+    if begun:
+        listed = ", ".join(str(run) for run in begun)
+        on_event(Warned("compare", f"left out, for they have no checkpoint yet: {listed}"))
+    return [run for run in runs if run not in begun]
 
 
 def _compared(

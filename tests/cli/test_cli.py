@@ -718,6 +718,21 @@ def test_misuse_of_the_command_line_exits_2_on_stderr(args, aegis):
 
 
 @pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("demos", "reach", "--format", "zip"), "'zip' is not one of 'safetensors', 'lerobot'."),
+        (("demos", "reach", "--episodes", "many"), "'many' is no whole number."),
+        (("demos", "reach", "--episodes", "2.5"), "'2.5' is no whole number."),
+        (("probe", "embedded", "--max-drop", "little"), "'little' is no number."),
+    ],
+)
+def test_an_options_value_that_is_refused_is_told(args, said: str, aegis) -> None:
+    code, out, err = aegis(*args)
+    assert (code, out) == (2, "")
+    assert f"Invalid value for '{args[2]}': {said}" in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
     ("option", "key"),
     [
         ("--backbone", "backbone"),

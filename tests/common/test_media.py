@@ -83,6 +83,17 @@ def test_letters_beyond_ascii_are_drawn_in_captions_and_notes() -> None:
         assert (notes[0] != notes[1]).any()
 
 
+def test_all_captions_of_a_sheet_are_set_in_one_font() -> None:
+    """A letter beyond ASCII in one caption decides the font of the others, too."""
+    ascii_alone, mixed, wide = (
+        np.asarray(media.tiled([(text, [GREY]), (other, [GREY])], 2, tile=64, text=10))
+        for text, other in (("pick", "place"), ("pick", "für"), ("pick", "ß"))
+    )
+    cell = ascii_alone.shape[1] // 2
+    assert (mixed[:, :cell] != ascii_alone[:, :cell]).any()
+    assert (mixed[:, :cell] == wide[:, :cell]).all()
+
+
 # --- videos ---------------------------------------------------------------------------------------
 
 

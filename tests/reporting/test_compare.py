@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,25 @@ def test_a_job_stands_for_its_runs(job: Path) -> None:
     found = compare.run([job, job / "naive"])
     assert [row.method for row in found.rows] == [*METHODS, "naive"]
     assert found.rows[0] == found.rows[2]
+
+
+def test_a_folder_stands_for_the_runs_in_it(job: Path, tmp_path: Path) -> None:
+    """As far as they have a checkpoint; a job, a stream and an artifact among them are no runs."""
+    folder = tmp_path / "runs"
+    for name in ("b", "a"):
+        shutil.copytree(job / "naive", folder / name, symlinks=True)
+    shutil.copytree(job, folder / "job", symlinks=True)
+    stream = folder / "stream" / "recipe.yaml"
+    stream.parent.mkdir()
+    files.write_text(stream, "kind: robot-stream\n")
+    begun = folder / "c"
+    shutil.copytree(job / "naive", begun, symlinks=True)
+    (begun / "ledger.safetensors").unlink()
+    events: list[Event] = []
+    found = compare.run([folder], events.append)
+    assert [row.run for row in found.rows] == [str(folder / "a"), str(folder / "b")]
+    warned = [event.text for event in events if isinstance(event, Warned)]
+    assert warned == [f"left out, for they have no checkpoint yet: {begun}"]
 
 
 def test_figures_are_those_of_the_jobs_table(job: Path) -> None:
