@@ -836,14 +836,15 @@ def _beyond(points: float, max_drop: float) -> str:
     return f"{points:.{decimals}f}"
 
 
-@app.command(short_help="Say what a file, recipe, run, study or dataset is.")
+@app.command(short_help="Say what a file, recipe, run, study, dataset or set of questions is.")
 def inspect(
     path: Annotated[
         Path,
         Argument(
             metavar="PATH",
-            help="A recipe, artifact, model (also 'embedded'), or the folder of a run, checkpoint, "
-            "study or LeRobot dataset, or such a dataset's id on the hub.",
+            help="A recipe, artifact, model (also 'embedded'), file or folder of questions, or the "
+            "folder of a run, checkpoint, study or LeRobot dataset, or such a dataset's id on the "
+            "hub.",
         ),
     ],
     plot: Annotated[
@@ -851,12 +852,16 @@ def inspect(
         Option(
             metavar="PNG",
             help="Also draw a run's course (of aegis, the energy that was shed), a stream's "
-            "routing, a study's frontier, or a dataset's frames.",
+            "routing, a study's frontier, a dataset's frames, or images with questions.",
         ),
     ] = None,
     verify: Annotated[
         bool,
-        Option("--verify", help="Read every artifact whole, and compare it with its digest."),
+        Option(
+            "--verify",
+            help="Read every artifact whole, and compare it with its digest; decode every image "
+            "that questions are about.",
+        ),
     ] = False,
     tensors: Annotated[
         bool, Option("--tensors", help="Also list the tensors of an artifact or model.")
@@ -874,14 +879,16 @@ def inspect(
 
     A recipe is shown with every key and its value: the file's own, or the default.
 
+    Of questions it tells which can be used and what is wrong with the others, how many images
+    anchors and probes get, and which answers are common.
+
     \b
     Example: aegis inspect runs/x --plot energy.png
+    Example: aegis inspect questions.jsonl --plot questions.png
     Example: aegis inspect runs/x --verify
     Example: aegis inspect recipes/quickstart.yaml
     """
-    # Before anything is shown: of a damaged file nothing else is told.
-    verified = inspecting.verify(path) if verify else None
-    inspecting.show(path, plot, as_json, tensors, wide, verified)
+    inspecting.show(path, plot, as_json, tensors, wide, verify)
 
 
 @app.command(short_help="Compare runs in one table.")

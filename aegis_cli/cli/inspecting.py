@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from rich.console import RenderableType
 
 from aegis_cli.cli import render
 from aegis_cli.common import commands
@@ -35,15 +38,17 @@ def show(
     as_json: bool,
     tensors: bool = False,
     wide: bool = False,
-    verified: VerifiedReport | None = None,
+    verify: bool = False,
 ) -> None:
     """Tell by a path's files what it is, and show that.
 
     Args:
         tensors: list each tensor of a file.
         wide: let a table's lines be wider than the terminal.
-        verified: what `verify` has found there; it may be all that there is to say of a folder.
+        verify: read every artifact there whole before, or decode every image of questions.
     """
+    # Before anything is shown: of a damaged file nothing else is told.
+    verified = _verified(path) if verify else None
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
     elif path.name.endswith(_CELLS) and path.is_file():  # NAME.cells.json too, as those that ship
@@ -51,7 +56,7 @@ def show(
     elif (path / _TABLE).is_file() or (path / _CELLS).is_file():
         _table(path, plot, as_json, wide)
     else:
-        _anything(path, plot, as_json, tensors, wide, verified)
+        _anything(path, plot, as_json, tensors, wide, verify, verified)
 
 
 @dataclass(frozen=True)
@@ -64,14 +69,18 @@ class VerifiedReport:
     without_digest: int
 
 
-def verify(path: Path) -> VerifiedReport:
-    """Read the artifacts at a path whole, and say how many have a digest.
+def _verified(path: Path) -> VerifiedReport | None:
+    """Read the artifacts at a path whole, and say how many have a digest; None of questions.
+
+    What is found may be all that there is to say of a folder.
 
     Raises:
         AegisError: one is damaged, or there is none.
     """
     from aegis_cli import inspection
 
+    if inspection.is_questions(path):  # whose images are decoded as they are counted
+        return None
     found = inspection.verify(path)
     bare = [str(file) for file, has_digest in found.items() if not has_digest]
     agreeing = len(found) - len(bare)
@@ -161,13 +170,15 @@ def _anything(
     as_json: bool,
     tensors: bool,
     wide: bool,
+    verify: bool,
     verified: VerifiedReport | None,
 ) -> None:
     """An artifact, a run, a model or a dataset, or a folder whose files were verified."""
     from aegis_cli import inspection
 
     try:
-        report = inspection.run(path)
+        with render.progress() as on_event:
+            report = inspection.run(path, on_event, images=verify)
     except inspection.UnknownFolder:
         if verified is None or plot is not None:  # a folder of files has nothing to draw
             raise
@@ -175,17 +186,30 @@ def _anything(
         return
     if plot is not None:
         _draw(report, path, plot)
-    stream = isinstance(report, inspection.StreamInspection)
-    view = render.stream_inspect if stream else partial(render.inspect, tensors=tensors)
-    render.show(report, view, as_json, wide)
+    render.show(report, _view(report, tensors), as_json, wide)
+
+
+def _view(report: Any, tensors: bool) -> Callable[[Any], RenderableType]:
+    """What shows a report of its kind."""
+    from aegis_cli import inspection
+
+    if isinstance(report, inspection.StreamInspection):
+        return render.stream_inspect
+    if report.kind == "questions":
+        return render.questions
+    return partial(render.inspect, tensors=tensors)
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:
-    """A stream's routing, a dataset's frames, the energy that a run shed, or how it trained."""
+    """A stream's routing, a dataset's frames, questions with their images, or a run's course."""
     from aegis_cli import inspection
 
     if isinstance(report, inspection.StreamInspection):
         render.routing_plot(report, plot)
+    elif report.kind == "questions":
+        from aegis_cli.data.vqa import summary
+
+        summary.save_sheet(str(path), plot)
     elif report.kind == "dataset":
         from aegis_cli.data.lerobot import dataset, download, summary
 

@@ -43,6 +43,15 @@ def check_video(path: Path) -> None:
         )
 
 
+def check_sheet(path: Path) -> None:
+    """Raise AegisError unless a contact sheet can be written to `path`; call it before the work."""
+    check_writable(path)
+    if path.suffix.lower() != ".png":
+        raise AegisError(
+            f"--plot {path}", "a file name ending in .png", f"--plot {path.with_suffix('.png')}"
+        )
+
+
 def save_sheet(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) -> None:
     """Write a PNG: each episode's frames [H, W, 3] uint8 in a row under its caption.
 

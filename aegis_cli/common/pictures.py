@@ -34,7 +34,7 @@ def decoded(data: bytes) -> np.ndarray:
         ValueError: no raster image or only a part of one, too many pixels, or grey of no known
             range.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
@@ -47,6 +47,8 @@ def decoded(data: bytes) -> np.ndarray:
                 with contextlib.suppress(Exception):
                     ImageOps.exif_transpose(image, in_place=True)
                 return rgb(image)
+    except UnidentifiedImageError as error:  # whose text is where the bytes lay
+        raise ValueError("of no raster format that is known here") from error
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise ValueError(str(error) or type(error).__name__) from error
 

@@ -9,6 +9,7 @@ import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
@@ -29,6 +30,9 @@ from aegis_cli.inspection.report import (
 )
 from aegis_cli.models import shipped
 
+if TYPE_CHECKING:
+    from aegis_cli.data.vqa.summary import QuestionsReport
+
 __all__ = [
     "BINS",
     "ENERGIES",
@@ -40,25 +44,36 @@ __all__ = [
     "StreamInspection",
     "TensorInfo",
     "UnknownFolder",
+    "is_questions",
     "run",
     "steps_taken",
     "verify",
 ]
 
 
-def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspection:
-    """Recognise `path`: an embedded model's name, an artifact file, a run or a dataset.
+def run(
+    path: Path, on_event: OnEvent = ignore, images: bool = False
+) -> InspectReport | StreamInspection | QuestionsReport:
+    """Recognise `path`: an embedded model's name, an artifact file, a run, a dataset or questions.
 
-    A dataset on the hub goes by its id, and only its meta folder is downloaded.
+    A dataset on the hub goes by its id, and only its meta folder is downloaded. A split of
+    questions follows a #.
 
     Only an artifact's header is read, unless figures need the tensors. It is done at once, so
-    `on_event` (there as in every stage) is never called.
+    `on_event` is called for images alone.
+
+    Args:
+        images: whether to decode every image that questions are about.
 
     Raises:
         AegisError: nothing there, nothing we know, damaged, a run without a ledger yet, or a stream
             that is not learned to its end.
     """
     path = _located(path)
+    if is_questions(path):
+        from aegis_cli.data.vqa import summary
+
+        return summary.of_set(str(path), images, on_event)
     # What is here goes before what the hub may have of the same name.
     if not path.exists() and not hub.is_local(str(path)):
         from aegis_cli.data.lerobot import download
@@ -70,6 +85,19 @@ def run(path: Path, on_event: OnEvent = ignore) -> InspectReport | StreamInspect
     from aegis_cli.inspection import folders
 
     return folders.inspect(path)
+
+
+def is_questions(path: Path) -> bool:
+    """Whether a path is a file or folder of questions, or easy-VQA's name; of a hub's set not."""
+    if path.is_dir():
+        from aegis_cli.inspection import folders
+
+        return folders.is_questions(path)
+    if path.exists() and path.suffix not in file.OF_QUESTIONS:  # told without torch
+        return False
+    from aegis_cli.data.vqa import summary
+
+    return summary.is_set(str(path))
 
 
 def verify(path: Path) -> dict[Path, bool]:

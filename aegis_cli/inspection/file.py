@@ -10,7 +10,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.inspection.report import InspectReport, TensorInfo
 
 _WITH_FIGURES = ("anchor", "ledger")
-_OF_QUESTIONS = (".jsonl", ".json", ".parquet")  # how files of questions end
+OF_QUESTIONS = (".jsonl", ".json", ".parquet")  # how files of questions end
 
 
 def inspect(path: Path) -> InspectReport:
@@ -22,7 +22,7 @@ def inspect(path: Path) -> InspectReport:
     if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
         what = f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
         fix = "give the artifact itself, or the folder that it lies in; a recipe ends in .yaml"
-        if path.suffix in _OF_QUESTIONS:
+        if path.suffix in OF_QUESTIONS:
             fix += f"; {asked_by(path)}"
         expected = "a .safetensors file, or the folder of a run, study, dataset or model"
         raise AegisError(f"'{path}' is {what}", expected, fix)

@@ -79,10 +79,14 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
     example = next(iter(runs), "runs/<recipe>/<method>")
     fix = commands.aegis("inspect", example)
-    if sets.is_folder(path):
-        fix += f"; {file.asked_by(path)}"
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
     raise UnknownFolder(f"{path} is neither a run nor an artifact", expected, fix)
+
+
+def is_questions(path: Path) -> bool:
+    """Whether a folder holds questions, and is neither a run nor a dataset nor a model."""
+    others = (path / "recipe.yaml", path / "meta", path / "config.json", path / "model.safetensors")
+    return sets.is_folder(path) and not any(other.exists() for other in others)
 
 
 def _policy_folder(path: Path) -> InspectReport:

@@ -127,7 +127,7 @@ def test_a_picture_that_is_a_program_is_never_run(
     """Whatever its name says, Pillow would have Ghostscript run the first."""
     monkeypatch.setattr(subprocess, "check_call", lambda *_, **__: pytest.fail("it was run"))
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("it was run"))
-    with pytest.raises(AegisError, match="cannot identify image file"):
+    with pytest.raises(AegisError, match="of no raster format"):
         decode(data)
 
 

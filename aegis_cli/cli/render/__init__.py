@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
-from aegis_cli.cli.render.inspected import compared, inspect
+from aegis_cli.cli.render.inspected import compared, inspect, questions
 from aegis_cli.cli.render.markdown import save_table
 from aegis_cli.cli.render.merges import merge, merge_plot
 from aegis_cli.cli.render.open_loops import open_loop, open_loop_plot
@@ -44,9 +44,9 @@ __all__ = [
     "bench_shape",
     "check_plot",
     "compared",
+    "curves_plot",
     "doctor",
     "dual",
-    "curves_plot",
     "energy_plot",
     "error",
     "facts",
@@ -65,7 +65,9 @@ __all__ = [
     "pretrain",
     "probe",
     "progress",
+    "questions",
     "recipe_list",
+    "robot_stream_study",
     "routing_plot",
     "save_table",
     "scores",
@@ -73,7 +75,6 @@ __all__ = [
     "show",
     "stream",
     "stream_inspect",
-    "robot_stream_study",
     "stream_probe",
     "stream_study",
     "study",

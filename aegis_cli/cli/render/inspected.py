@@ -62,6 +62,38 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
     return Group(*parts)
 
 
+def questions(report: Any) -> RenderableType:
+    """What a set of questions holds: what can be used, what cannot, and which answers there are."""
+    words, given = report.words, report.answers_a_question
+    facts = {
+        "kind": report.kind,
+        "path": report.path,
+        "questions": report.questions,
+        "images": report.images,
+        "bad questions": report.bad,
+        "asked twice of their image": report.repeated,
+        "words of a question": f"{words['median']:g} in the median, {words['most']} at most",
+        "answers to a question": _from_to(given["least"], given["most"]),
+        "distinct answers": report.distinct_answers,
+    }
+    parts: list[RenderableType] = [pairs(facts)]
+    of = [(part.name, f"{part.questions:,}", f"{part.images:,}") for part in report.parts]
+    parts.append(plain_table(("Part", "Questions", "Images"), of))
+    if len(report.families) > 1:
+        rows = [(family.name, f"{family.questions:,}") for family in report.families]
+        parts.append(plain_table(("Family", "Questions"), rows))
+    rows = [(x.answer, f"{x.questions:,}", percent(x.share)) for x in report.answers]
+    parts.append(plain_table(("Commonest answer", "Questions", "Of all %"), rows))
+    if report.problems:
+        first = "\n".join(f"- {problem}" for problem in report.problems)
+        parts.append(Text(f"what is bad first, and --skip-bad leaves out:\n{first}\n"))
+    return Group(*parts)
+
+
+def _from_to(least: int, most: int) -> str:
+    return str(most) if least == most else f"{least} to {most}"
+
+
 def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts with one line on a run's steps, of how many where some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from aegis_cli.common import files, media
+from aegis_cli.common import media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import dataset, frames, layout, rows, source
 from aegis_cli.data.lerobot.dataset import Dataset
@@ -84,11 +84,7 @@ def save_sheet(folder: Path, out: Path) -> None:
     Raises:
         AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
     """
-    files.check_writable(out)
-    if out.suffix.lower() != ".png":
-        raise AegisError(
-            f"--plot {out}", "a file name ending in .png", f"--plot {out.with_suffix('.png')}"
-        )
+    media.check_sheet(out)
     found = dataset.load(folder)
     if not found.info.cameras:
         raise AegisError(f"no camera in '{folder}'", "a dataset with pictures", "leave out --plot")

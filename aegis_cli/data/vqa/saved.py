@@ -8,6 +8,7 @@ are read too.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -166,6 +167,9 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
     import datasets
 
     datasets.disable_progress_bars()  # ours are enough
+    log = logging.getLogger("datasets")
+    before = log.level
+    log.setLevel(logging.CRITICAL)  # what it would log of a damaged file, the error says
     try:
         if files and files[0].suffix == ".parquet":
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
@@ -177,6 +181,8 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = rows.cast_column("image", datasets.Image(decode=False))
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
         raise _unreadable(path, error) from error
+    finally:
+        log.setLevel(before)
     if several:
         raise AegisError(
             f"lists of images in the column image of '{path}'",
@@ -211,7 +217,7 @@ def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
 def _unreadable(path: Path, error: Exception) -> AegisError:
     # `datasets` says that a file could not be read, and its cause says why.
     why = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
-    expected = "a folder that datasets saved, or whole parquet files"
+    expected = "questions in a folder that datasets saved, or in whole parquet files"
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
 
 

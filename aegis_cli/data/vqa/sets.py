@@ -95,7 +95,7 @@ class Listed:
         files: the files that hold the questions.
         entries: the sound questions.
         skip_bad: whether bad questions are left out; else they are an error.
-        skipped: how many have been left out.
+        problems: what is wrong with those that have been left out.
         ask: what a question becomes before a model reads it, with {} for it.
     """
 
@@ -103,8 +103,13 @@ class Listed:
     files: tuple[Path, ...]
     entries: tuple[Entry, ...]
     skip_bad: bool
-    skipped: int
+    problems: tuple[AegisError, ...] = ()
     ask: str = PLAIN
+
+    @property
+    def skipped(self) -> int:
+        """How many questions have been left out."""
+        return len(self.problems)
 
     def choose(
         self,
@@ -275,26 +280,26 @@ def read(
         return Scenes(ask=ask)
     source = easy.reader() if vqa == easy.NAME else _reader(*_located(vqa))
     entries: list[Entry] = []
-    skipped: list[AegisError] = []
+    problems: list[AegisError] = []
     for entry in unique(source.read()):
         if isinstance(entry, Entry):
             entries.append(entry)
         elif skip_bad:
-            skipped.append(entry)
+            problems.append(entry)
         else:
             raise entry
     on_event(Progress("read", len(entries), len(entries), "questions"))
     if not entries:
-        first = f": {len(skipped)} are bad, the first: {skipped[0].found}" if skipped else ""
+        first = f": {len(problems)} are bad, the first: {problems[0].found}" if problems else ""
         raise AegisError(
             f"no usable question in '{vqa}'{first}",
             "one or more",
-            "correct the file, or give another --vqa",
+            "correct the file, or name another set",
         )
     kind = EasyVqa if vqa == easy.NAME else Listed
     # The set has one name wherever it is named from: `.` is its folder.
     name = os.path.basename(os.path.abspath(vqa)).replace("#", "-")
-    return kind(name, source.files, tuple(entries), skip_bad, len(skipped), ask)
+    return kind(name, source.files, tuple(entries), skip_bad, tuple(problems), ask)
 
 
 def _located(vqa: str) -> tuple[Path, str | None]:
@@ -337,6 +342,12 @@ def _reader(path: Path, split: str | None) -> Reader:
     if path.is_file() and path.suffix == ".json":
         raise official.misnamed(path)
     raise _unknown(f"question set '{path}'")
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is named as one of questions is."""
+    named = path.suffix in (".jsonl", ".parquet") or path.name.endswith(official.SUFFIX)
+    return named and path.is_file()
 
 
 def is_folder(path: Path) -> bool:
