@@ -117,8 +117,8 @@ LINES = {
         ("a list of 2 images", "one image of"),
     ),
     "several images by another key": (
-        json.dumps({"images": ["images/0.png"], "question": "what?", "answers": ["a"]}),
-        ("a list of 1 images", "one image of each"),
+        json.dumps({"images": ["a.png", "b.png", "c.png"], "question": "?", "answers": ["a"]}),
+        ("a list of 3 images", "one image of each"),
     ),
     "an image that is no path": (line(image=7), ("image 7", "relative")),
     "an id that is no name": (line(id=[1]), ("id [1]",)),
@@ -435,7 +435,35 @@ def test_a_bad_row(
 def test_rows_of_several_images(bad: Callable[..., str], place: Path) -> None:
     several = [[picture(i), picture(i + 1)] for i in range(48)]
     datasets.Dataset.from_dict(hub_rows(IMAGES, image=several)).save_to_disk("data")
-    bad("data", "lists of images", "one image of each question")
+    bad("data", "row 0 of 'data': a list of 2 images", "one image of each question")
+
+
+@pytest.mark.parametrize(
+    ("turns", "says"),
+    [
+        ("red", "no conversation"),
+        ([], "no conversation"),
+        (["red"], "no conversation"),
+        ([{"user": "what color is it"}], "a turn with user"),
+        ([{"from": "human", "value": "what color is it"}], "a conversation of human"),
+        ([{"from": "gpt", "value": "red"}], "a conversation of gpt"),
+        ([{"role": "system", "content": "be brief"}], "a conversation of no turn"),
+        (
+            [{"role": name, "content": "red"} for name in ("user", "user", "assistant")],
+            "a conversation of user, user, assistant",
+        ),
+        ([{"user": " <image> ", "assistant": "red"}], "question ''"),
+        ([{"user": "what color is it", "assistant": " "}], "answers ['']"),
+    ],
+)
+def test_a_conversation_that_is_none(
+    turns: object, says: str, bad: Callable[..., str], place: Path
+) -> None:
+    bad(
+        write_jsonl(place, 3, extra=[json.dumps({"image": "images/0.png", "messages": turns})]),
+        "line 7",
+        says,
+    )
 
 
 @pytest.mark.parametrize("missing", ["image", "question", "answers"])

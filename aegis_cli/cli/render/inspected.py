@@ -64,7 +64,7 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
 
 def questions(report: Any) -> RenderableType:
     """What a set of questions holds: what can be used, what cannot, and which answers there are."""
-    words, given = report.words, report.answers_a_question
+    given = report.answers_a_question
     facts = {
         "kind": report.kind,
         "path": report.path,
@@ -72,7 +72,8 @@ def questions(report: Any) -> RenderableType:
         "images": report.images,
         "bad questions": report.bad,
         "asked twice of their image": report.repeated,
-        "words of a question": f"{words['median']:g} in the median, {words['most']} at most",
+        "words of a question": _words(report.words),
+        "words of an answer": _words(report.answer_words),
         "answers to a question": _from_to(given["least"], given["most"]),
         "distinct answers": report.distinct_answers,
     }
@@ -88,6 +89,10 @@ def questions(report: Any) -> RenderableType:
         first = "\n".join(f"- {problem}" for problem in report.problems)
         parts.append(Text(f"what is bad first, and --skip-bad leaves out:\n{first}\n"))
     return Group(*parts)
+
+
+def _words(counts: Mapping[str, float]) -> str:
+    return f"{counts['median']:g} in the median, {counts['most']} at most"
 
 
 def _from_to(least: int, most: int) -> str:

@@ -1,18 +1,24 @@
-"""`--vqa FILE.jsonl`: a question per line.
+"""`--vqa FILE.jsonl`, a question or a conversation per line; `FILE.json`, a list of such.
 
 A line is `{"image": "a/b.jpg", "question": "...", "answers": ["..."]}`, with an optional `"id"`.
-The answers may be called `answer` or `multiple_choice_answer`, too.
+The answers may be called `answer` or `multiple_choice_answer`, too. Of a conversation each turn is
+a question (`conversations.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.vqa import conversations
 from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.data.vqa.images import Picture
+from aegis_cli.data.vqa.questions import Question
+
+_LINE = 'a line such as {"image": "a.jpg", "question": "...", "answers": ["..."]}'
 
 
 def reader(path: Path) -> Reader:
@@ -20,65 +26,95 @@ def reader(path: Path) -> Reader:
 
     Image paths are relative to its folder; other keys are ignored.
     """
-    return Reader(lambda: _read(path), (path,))
+    read = _lines if path.suffix == ".jsonl" else _items
+    return Reader(lambda: read(path), (path,))
 
 
-def _read(path: Path) -> Iterator[Read]:
+def is_list(path: Path) -> bool:
+    """Whether a file of JSON begins as a list does."""
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        return file.read(1024).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"["
+
+
+def _lines(path: Path) -> Iterator[Read]:
     images = Inside(path.parent)
     with files.reading(path, "check the path"), open(path, "rb") as file:
         for number, line in enumerate(file, start=1):
-            if line.strip():
-                try:
-                    yield _entry(f"line {number} of '{path}'", number, line, images)
-                except AegisError as error:
-                    yield error
+            if not line.strip():
+                continue
+            where = f"line {number} of '{path}'"
+            try:
+                # Some editors put a mark at the start.
+                raw = files.parse_json(line.decode("utf-8-sig"))
+            except ValueError as error:
+                yield bad(where, f"not JSON ({error})", _LINE, "correct that line")
+            else:
+                yield from _asked(where, f"line {number}", raw, images)
 
 
-def _entry(where: str, number: int, line: bytes, images: Inside) -> Entry:
+def _items(path: Path) -> Iterator[Read]:
+    images = Inside(path.parent)
+    listed = files.load_json(path)
+    if not isinstance(listed, list):
+        raise AegisError(f"no list in '{path}'", "a list of questions", "check the path")
+    for number, raw in enumerate(listed, start=1):
+        yield from _asked(f"item {number} of '{path}'", f"item {number}", raw, images)
+
+
+def _asked(where: str, place: str, raw: Any, images: Inside) -> Iterator[Read]:
+    """The questions of a line, or what is wrong with it.
+
+    Args:
+        place: by which predictions tell a question without an id.
+    """
     try:
-        raw = files.parse_json(line.decode("utf-8-sig"))  # some editors put a mark at the start
-    except ValueError as error:
-        raise bad(
-            where,
-            f"not JSON ({error})",
-            'a line such as {"image": "a.jpg", "question": "...", "answers": ["..."]}',
-            "correct that line",
-        ) from error
-    if not isinstance(raw, dict):
-        raise bad(
-            where,
-            f"a JSON {type(raw).__name__}",
-            "an object with image, question and answers",
-            "correct that line",
-        )
-    several = raw.get("image", raw.get("images"))
-    if isinstance(several, list):
-        raise bad(
-            where,
-            f"a list of {len(several)} images",
-            "one image of each question, as a path",
-            "name the one that is asked about, or join them into one picture",
-        )
-    answers = next((key for key in ANSWERS if key in raw), ANSWERS[0])
-    missing = [key for key in ("image", "question", answers) if key not in raw]
+        if not isinstance(raw, dict):
+            raise bad(
+                where,
+                f"a JSON {type(raw).__name__}",
+                "an object with image, question and answers",
+                "correct that line",
+            )
+        _check_keys(where, raw)
+        picture = _picture(where, raw, images)
+        name = raw.get("id")
+        for question in _questions(where, raw, place if name is None else name):
+            yield Entry(where, question, picture)
+    except AegisError as error:
+        yield error
+
+
+def _questions(where: str, raw: dict[str, Any], name: Any) -> list[Question]:
+    """The one that it asks, or those of its conversation."""
+    if (key := conversations.key_of(raw)) is not None:
+        return conversations.questions(where, raw[key], name, raw.get("source"))
+    answers = next(key for key in ANSWERS if key in raw)
+    return [make_question(where, raw["question"], raw[answers], name, "all")]
+
+
+def _check_keys(where: str, raw: dict[str, Any]) -> None:
+    """Raise AegisError unless it has an image, and a question with answers or a conversation."""
+    needed = ["image"]
+    if conversations.key_of(raw) is None:
+        needed += ["question", next((key for key in ANSWERS if key in raw), ANSWERS[0])]
+    present = {"image"} if "images" in raw else set()
+    missing = [key for key in needed if key not in raw and key not in present]
     if missing:
         raise bad(
             where,
             f"no {' and no '.join(missing)}",
-            "the keys image, question and answers",
+            "the keys image, question and answers, or image and a conversation",
             "add what is missing",
         )
-    if not isinstance(raw["image"], str):
+
+
+def _picture(where: str, raw: dict[str, Any], images: Inside) -> Picture:
+    """The one image that it asks about."""
+    shown = conversations.one_picture(where, raw.get("image", raw.get("images")))
+    if not isinstance(shown, str):
         raise bad(
-            where,
-            f"image {raw['image']!r}",
-            "a path relative to the file's folder",
-            "correct the path",
+            where, f"image {shown!r}", "a path relative to the file's folder", "correct the path"
         )
-    name = raw.get("id")
-    # Without an id the line is the name by which predictions tell the question.
-    own = f"line {number}" if name is None else name
-    question = make_question(where, raw["question"], raw[answers], own, "all")
-    path = images.find(where, raw["image"])
+    path = images.find(where, shown)
     # Not as it is spelt: two spellings of one image would put it into two parts.
-    return Entry(where, question, Picture(images.name(path), where, path))
+    return Picture(images.name(path), where, path)

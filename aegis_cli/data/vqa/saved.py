@@ -1,8 +1,9 @@
 """`--vqa FOLDER[#SPLIT]`: a Hugging Face dataset as `save_to_disk` wrote it, or as parquet.
 
-Columns: `image`, `question`, and `answers` (texts, or objects with the key `answer`), else `answer`
-or `multiple_choice_answer`; where they exist, `question_id` or `id`, `image_id` and `answer_type`
-are read too.
+Columns: `image` or `images`, `question`, and `answers` (texts, or objects with the key `answer`),
+else `answer` or `multiple_choice_answer`; or a conversation in place of questions and answers
+(`conversations.py`). Where they exist, `question_id` or `id`, `image_id`, `answer_type` and
+`source` are read too.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.files import refuse_special, sha256_file
+from aegis_cli.data.vqa import conversations
 from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
 from aegis_cli.data.vqa.images import Picture
+from aegis_cli.data.vqa.questions import Question
 
 _NAMES = ("question_id", "id")
 # Files that save_to_disk writes for one split, and for several.
@@ -131,35 +134,57 @@ def _no_split(where: str | Path, split: str, splits: Sequence[str]) -> AegisErro
 
 def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
     rows = _open(path, files)
-    stored = _Stored(path, files, rows)
     columns = rows.column_names
-    answers = next((c for c in ANSWERS if c in columns), None)
-    if "image" not in columns or "question" not in columns or answers is None:
-        raise AegisError(
-            f"the columns {', '.join(columns)} in '{path}'",
-            f"image, question and one of {', '.join(ANSWERS)}",
-            "rename the columns (datasets: rename_column)",
-        )
-    keyed = "image_id" in columns  # then no image has to be read to tell which images are the same
+    _check_columns(path, columns)
+    stored = _Stored(path, files, rows)
     name = next((c for c in _NAMES if c in columns), None)
-    folder, outside = Inside(path if path.is_dir() else path.parent), _outside(rows)
-    told = rows.remove_columns("image") if keyed else rows
+    folder = Inside(path if path.is_dir() else path.parent)
+    outside = _outside(rows)
+    told = rows.remove_columns(_pictures(columns))
     for number, row in enumerate(_each(told, path)):
         where = f"row {number} of '{path}'"
         try:
             apart = outside[number]
-            file = folder.find(where, apart) if apart else None
-            own = number if name is None else row[name]
-            kind = row.get("answer_type")
-            family = kind if isinstance(kind, str) and kind else "all"
-            question = make_question(where, row["question"], row[answers], own, family)
+            if isinstance(apart, int):  # raises
+                conversations.one_picture(where, [None] * apart)
+            file = folder.find(where, apart) if isinstance(apart, str) and apart else None
             source = file or _InRow(stored, number, where)
             image_id = row.get("image_id")
-            # Rows repeat their images: equal bytes are one image, which belongs to one part.
+            # Rows repeat their images: equal bytes are one image, which belongs to one part. Where
+            # it has a name, no image has to be read to tell that.
             key = _digest(source) if image_id is None else f"image {image_id}"
-            yield Entry(where, question, Picture(key, where, source))
+            for question in _questions(where, row, number if name is None else row[name]):
+                yield Entry(where, question, Picture(key, where, source))
         except AegisError as error:
             yield error
+
+
+def _pictures(columns: Sequence[str]) -> str:
+    """The column of images, or of lists of them."""
+    return "images" if "image" not in columns and "images" in columns else "image"
+
+
+def _check_columns(path: Path, columns: Sequence[str]) -> None:
+    """Raise AegisError unless there are images, and questions with answers or conversations."""
+    asks = "question" in columns and any(answers in columns for answers in ANSWERS)
+    if _pictures(columns) in columns and (asks or conversations.key_of(columns) is not None):
+        return
+    raise AegisError(
+        f"the columns {', '.join(columns)} in '{path}'",
+        f"image, question and one of {', '.join(ANSWERS)}; or image or images and one of "
+        f"{', '.join(conversations.KEYS)}",
+        "rename the columns (datasets: rename_column)",
+    )
+
+
+def _questions(where: str, row: dict[str, Any], name: Any) -> list[Question]:
+    """The one that a row asks, or those of its conversation."""
+    if (key := conversations.key_of(row)) is not None:
+        return conversations.questions(where, row[key], name, row.get("source"))
+    answers = next(c for c in ANSWERS if c in row)
+    kind = row.get("answer_type")
+    family = kind if isinstance(kind, str) and kind else "all"
+    return [make_question(where, row["question"], row[answers], name, family)]
 
 
 def _open(path: Path, files: tuple[Path, ...]) -> Any:
@@ -175,30 +200,28 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
         else:
             rows = datasets.load_from_disk(str(path))
-        several = _has_lists_of_images(rows)
-        # As bytes: to decode every image would take hours before the first question.
-        if "image" in rows.column_names and not several:
-            rows = rows.cast_column("image", datasets.Image(decode=False))
+        columns = list(rows.column_names)
+        column = _pictures(columns)
+        # As bytes: to decode every image would take hours before the first question. A column of
+        # lists would be written anew for that, beside the set; it is read by pyarrow instead.
+        if column in columns and not _is_listed(rows, column):
+            rows = rows.cast_column(column, datasets.Image(decode=False))
     except Exception as error:  # a damaged file makes pyarrow raise nearly anything
         raise _unreadable(path, error) from error
     finally:
         log.setLevel(before)
-    if several:
-        raise AegisError(
-            f"lists of images in the column image of '{path}'",
-            "one image of each question",
-            "keep the one that is asked about, or join them into one picture (datasets: map)",
-        )
     return rows
 
 
-def _has_lists_of_images(rows: Any) -> bool:
+def _is_listed(rows: Any, column: str) -> bool:
+    """Whether each row has a list of images."""
     import pyarrow as pa
 
-    if "image" not in rows.column_names:
-        return False
-    kind = rows.data.schema.field("image").type
-    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind))
+    kind = rows.data.schema.field(column).type
+    listed = bool(pa.types.is_list(kind) or pa.types.is_large_list(kind))
+    if listed and not pa.types.is_struct(kind.value_type):
+        raise ValueError(f"lists of {kind.value_type} in the column {column}")
+    return listed
 
 
 def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
@@ -221,16 +244,30 @@ def _unreadable(path: Path, error: Exception) -> AegisError:
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
 
 
-def _outside(rows: Any) -> list[str | None]:
-    """The path of each row's image that the row does not hold itself; no image is read for that."""
+def _outside(rows: Any) -> list[str | int | None]:
+    """The path of each row's image that the row does not hold itself; no image is read for that.
+
+    A number says how many images a row has that has not one.
+    """
+    import pyarrow as pa
     import pyarrow.compute as pc
 
-    images = rows.data.column("image")
+    column = _pictures(rows.column_names)
+    images = rows.data.column(column)
+    counts = None
+    if _is_listed(rows, column):
+        counts = pc.fill_null(pc.list_value_length(images), 0)
+        images = pa.chunked_array([pc.list_flatten(images)])
     stored, paths = pc.struct_field(images, "bytes"), pc.struct_field(images, "path")
     size = pc.fill_null(pc.binary_length(stored), 0)
     # Where a row has both, its path is the one that the image had on somebody's disk.
     missing = pc.equal(size, 0)
-    return pc.if_else(missing, paths, None).to_pylist()
+    apart = pc.if_else(missing, paths, None).to_pylist()
+    if counts is None:
+        return apart
+    each = iter(apart)
+    rows_of = [[next(each) for _ in range(count)] for count in counts.to_pylist()]
+    return [own[0] if len(own) == 1 else len(own) for own in rows_of]
 
 
 @dataclass
@@ -258,8 +295,11 @@ class _InRow:
     where: str
 
     def __call__(self) -> bytes:
-        image = self.stored.rows[self.number]["image"] or {}
-        if not image.get("bytes"):
+        rows = self.stored.rows
+        image = rows.data.column(_pictures(rows.column_names))[self.number].as_py()
+        if isinstance(image, list):
+            image = image[0]
+        if not image or not image.get("bytes"):
             raise bad(self.where, "no image", "an image per row", "add it")
         return bytes(image["bytes"])
 

@@ -340,14 +340,19 @@ def _reader(path: Path, split: str | None) -> Reader:
     if saved.is_dataset(path):
         return saved.reader(path, split)
     if path.is_file() and path.suffix == ".json":
+        if jsonl.is_list(path):
+            return jsonl.reader(path)
         raise official.misnamed(path)
     raise _unknown(f"question set '{path}'")
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is named as one of questions is."""
-    named = path.suffix in (".jsonl", ".parquet") or path.name.endswith(official.SUFFIX)
-    return named and path.is_file()
+    """Whether a file is named as one of questions is, or is a list in JSON."""
+    if not path.is_file():
+        return False
+    if path.suffix in (".jsonl", ".parquet") or path.name.endswith(official.SUFFIX):
+        return True
+    return path.suffix == ".json" and jsonl.is_list(path)
 
 
 def is_folder(path: Path) -> bool:
@@ -357,8 +362,8 @@ def is_folder(path: Path) -> bool:
 
 def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> AegisError:
     expected = (
-        "'scenes', 'easy-vqa', a .jsonl file, the questions file of VQAv2 or OK-VQA, a folder of a "
-        "Hugging Face data set, or its id on the hub"
+        "'scenes', 'easy-vqa', a .jsonl file, a list in a .json file, the questions file of VQAv2 "
+        "or OK-VQA, a folder of a Hugging Face data set, or its id on the hub"
     )
     return AegisError(found, expected, fix)
 

@@ -61,7 +61,7 @@ class QuestionsReport:
         questions, images: that can be used, as far as their files tell, or the images too.
         bad: how many questions cannot; `problems` are the first `PROBLEMS` that they have.
         repeated: how many are asked of their image a second time.
-        words: of a question, in the median and at most.
+        words, answer_words: of a question and of an answer, in the median and at most.
         answers_a_question: the fewest and the most that people gave to one.
         parts: what anchors, tuning studies and probes get of them.
         answers: the `ANSWERS` commonest of `distinct_answers`.
@@ -75,6 +75,7 @@ class QuestionsReport:
     problems: tuple[str, ...]
     repeated: int
     words: dict[str, float]
+    answer_words: dict[str, float]
     answers_a_question: dict[str, int]
     parts: tuple[Part, ...]
     families: tuple[Family, ...]
@@ -113,7 +114,6 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     entries = found.entries
     asked = [entry.question for entry in entries]
     distinct = {(entry.picture.key, entry.question.text) for entry in entries}
-    words = [len(question.text.split()) for question in asked]
     given = [max(len(question.answers), 1) for question in asked]
     answers = Counter(normalise(question.answer) for question in asked)
     families = Counter(question.family for question in asked)
@@ -125,7 +125,8 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
         bad=found.skipped,
         problems=_first(found.problems),
         repeated=len(entries) - len(distinct),
-        words={"median": statistics.median(words), "most": max(words)},
+        words=_words([question.text for question in asked]),
+        answer_words=_words([question.answer for question in asked]),
         answers_a_question={"least": min(given), "most": max(given)},
         parts=tuple(_part(found, part) for part in _PARTS),
         families=tuple(Family(*each) for each in families.most_common()),
@@ -157,6 +158,12 @@ def save_sheet(name: str, out: Path) -> None:
 
 def _caption(entry: Entry) -> str:
     return f"{entry.question.text}  {entry.question.answer}"
+
+
+def _words(texts: Sequence[str]) -> dict[str, float]:
+    """How many words texts have."""
+    counts = [len(text.split()) for text in texts]
+    return {"median": statistics.median(counts), "most": max(counts)}
 
 
 def _first(problems: Sequence[AegisError]) -> tuple[str, ...]:

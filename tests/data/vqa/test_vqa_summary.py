@@ -23,6 +23,7 @@ def test_questions_images_and_answers_are_counted(tmp_path: Path) -> None:
     assert (found.questions, found.images, found.bad, found.repeated) == (48, 24, 0, 0)
     assert found.problems == ()
     assert found.words == {"median": 5, "most": max(len(text.split()) for text, _ in ASKED)}
+    assert found.answer_words == {"median": 1, "most": 1}
     assert found.answers_a_question == {"least": 1, "most": 3}
     told = [(each.answer, each.questions, each.share) for each in found.answers]
     assert sorted(told) == [("2", 24, 0.5), ("red", 24, 0.5)] and found.distinct_answers == 2
@@ -79,7 +80,8 @@ def test_families_are_those_of_the_annotations(tmp_path: Path) -> None:
         found = summary.of_set(str(named))
         families = Counter({each.name: each.questions for each in found.families})
         assert families == {"number": 24, "other": 24}
-        assert found.answers_a_question == {"least": 10, "most": 10}
+        assert found.answer_words == {"median": 1, "most": 1}
+    assert found.answers_a_question == {"least": 10, "most": 10}
 
 
 def test_the_command_tells_and_draws_them(tmp_path: Path, aegis) -> None:

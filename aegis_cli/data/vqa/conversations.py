@@ -1,0 +1,110 @@
+"""Conversations about a picture, as VLMs are instructed with: each turn of them is a question.
+
+Three forms are read, by what a turn has: `user` and `assistant` (The Cauldron, FineVision), `from`
+and `value` (LLaVA), or `role` and `content` (chat messages, as TRL takes them).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from aegis_cli.data.vqa.entries import ANSWERS, bad, make_question
+from aegis_cli.data.vqa.questions import Question
+
+# What a conversation is called, the first that is there.
+KEYS = ("texts", "conversations", "messages")
+_PLACE = re.compile(r"\s*<image>\s*")  # where the picture stands in a text
+_ASKS, _ANSWERS = ("human", "user"), ("gpt", "assistant")
+_EXPECTED = (
+    "turns such as {user, assistant}, {from: human, value} or {role: user, content}, each question "
+    "with its answer"
+)
+
+
+def key_of(names: Sequence[str] | Mapping[str, Any]) -> str | None:
+    """What a row or a line calls its conversation; None of one that asks a question itself."""
+    if any(answers in names for answers in ANSWERS):
+        return None
+    return next((key for key in KEYS if key in names), None)
+
+
+def questions(where: str, turns: Any, name: str | int, source: Any) -> list[Question]:
+    """A question for each turn, asked alone: what was said before is not repeated.
+
+    Args:
+        turns: the conversation.
+        name: of its row; of several questions each has a number behind it.
+        source: what the row says it was taken from, by which families are told; None without.
+
+    Raises:
+        AegisError: no conversation, or a turn without its answer.
+    """
+    pairs = _pairs(where, turns)
+    several = len(pairs) > 1
+    asked = []
+    for number, (text, answer, own) in enumerate(pairs, start=1):
+        taken = own if _is_name(own) else source
+        family = taken if _is_name(taken) else "all"
+        named = f"{name}.{number}" if several else name
+        asked.append(make_question(where, text, answer, named, family))
+    return asked
+
+
+def one_picture(where: str, pictures: Any) -> Any:
+    """The picture of a row that lists its pictures.
+
+    Raises:
+        AegisError: none, or several.
+    """
+    if not isinstance(pictures, list):
+        return pictures
+    if len(pictures) != 1:
+        raise bad(
+            where,
+            f"a list of {len(pictures)} images",
+            "one image of each question",
+            "name the one that is asked about, or join them into one picture",
+        )
+    return pictures[0]
+
+
+def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
+    """Question, answer and source of each turn."""
+    if not isinstance(turns, list) or not turns or not all(isinstance(t, dict) for t in turns):
+        raise bad(where, "no conversation", _EXPECTED, "correct the row")
+    if all("user" in turn and "assistant" in turn for turn in turns):
+        return [(_text(t["user"]), _text(t["assistant"]), t.get("source")) for t in turns]
+    said = [_said(where, turn) for turn in turns]
+    said = [each for each in said if each[0] != "system"]
+    asks, answers = said[::2], said[1::2]
+    in_turn = all(speaker in _ASKS for speaker, _ in asks)
+    answered = all(speaker in _ANSWERS for speaker, _ in answers)
+    if not asks or len(asks) != len(answers) or not in_turn or not answered:
+        order = ", ".join(speaker for speaker, _ in said) or "no turn"
+        raise bad(where, f"a conversation of {order}", _EXPECTED, "correct the row")
+    return [(ask, answer, None) for (_, ask), (_, answer) in zip(asks, answers, strict=True)]
+
+
+def _said(where: str, turn: dict[str, Any]) -> tuple[str, Any]:
+    """Who speaks in a turn, and what is said."""
+    speaker, content = turn.get("from", turn.get("role")), turn.get("value", turn.get("content"))
+    if not isinstance(speaker, str):
+        raise bad(
+            where, f"a turn with {', '.join(turn) or 'nothing'}", _EXPECTED, "correct the row"
+        )
+    if isinstance(content, list):  # pieces of text and of pictures
+        content = " ".join(
+            str(piece.get("text") or "") for piece in content if isinstance(piece, dict)
+        )
+    return speaker, _text(content)
+
+
+def _text(said: Any) -> Any:
+    """A text without the places of pictures in it."""
+    return _PLACE.sub(" ", said).strip() if isinstance(said, str) else said
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
