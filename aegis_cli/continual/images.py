@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import devices
+from aegis_cli.common import cache, devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import sha256_value
@@ -29,7 +29,6 @@ from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.core.gaussians import NONE, Gaussian, fit, infer
 from aegis_cli.core.routing import Routed, activate
 from aegis_cli.data import spread, streams
-from aegis_cli.data.lerobot import frames
 from aegis_cli.data.streams import folders, mtil
 from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.models import backbones
@@ -257,8 +256,8 @@ def tasks(
     """
     if recipe.path is not None:
         return tuple(_folder_tasks(Path(recipe.path), recipe, image_size))
-    cache = frames.cache_folder().with_name("streams")
-    return ordered(streams.load(recipe.stream, image_size, cache, on_event=on_event), recipe.order)
+    kept = cache.folder("streams")
+    return ordered(streams.load(recipe.stream, image_size, kept, on_event=on_event), recipe.order)
 
 
 def image_set(recipe: StreamRecipe) -> str:

@@ -473,7 +473,7 @@ def _load_folder(
     index = rows.read_index(source)
     proprio, proprio_names = _vectors(source, selection.state)
     actions, action_names = _vectors(source, selection.action)
-    digests = sources.digests(source, cameras)
+    digests = sources.digests(source, cameras, on_event)
     if check_text is not None:
         # Frames that are not read have the task 0, whose text may be another episode's.
         read = torch.cat([train, validation]).numpy()

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from aegis_cli.common import files
+from aegis_cli.common import cache, files
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress
@@ -176,10 +176,10 @@ def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:
     # Another decoder or filter makes other pixels of the same files.
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
     key = {"dataset": digest, "camera": camera, "side": side, **made}
-    whole = cache_folder() / _name(key)
+    whole = cache.folder("frames") / _name(key)
     if len(source.episodes) == len(source.dataset.episodes) or whole.exists():
         return whole
-    return cache_folder() / _name({**key, "episodes": source.episodes})
+    return cache.folder("frames") / _name({**key, "episodes": source.episodes})
 
 
 def _name(key: Mapping[str, Any]) -> str:
@@ -193,13 +193,6 @@ def pick(source: Source, index: Index, camera: str, numbers: Sequence[int]) -> l
         of_part = range(part.first_frame, part.first_frame + part.count)
         found += [part.at(number - part.first_frame) for number in numbers if number in of_part]
     return found
-
-
-def cache_folder() -> Path:
-    """Where decoded frames are kept."""
-    if own := os.environ.get("AEGIS_CACHE"):
-        return Path(own) / "frames"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aegis" / "frames"
 
 
 def split(source: Source, index: Index, camera: str) -> Iterator[Part]:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from aegis_cli.common import files
+from aegis_cli.common import files, kept_digests
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.dataset import Dataset
 
@@ -214,41 +215,25 @@ def _missing(dataset: Dataset, number: int) -> AegisError:
 # --- digests --------------------------------------------------------------------------------------
 
 
-def digests(source: Source, cameras: Sequence[str]) -> list[str]:
+def digests(source: Source, cameras: Sequence[str], on_event: OnEvent = ignore) -> list[str]:
     """A digest per camera: sha256 over its name and every file that training on it reads."""
     dataset = source.dataset
     read = [dataset.episodes[number] for number in source.episodes]
     shared = {layout.INFO}
     for path in [*dataset.table_files, *(file.path for file in source.data)]:
         shared.add(path.relative_to(dataset.folder))
-    hashes = {path: _sha256(dataset.folder / path) for path in shared}
+    # A camera of embedded images has no clips: its pictures are in the files of rows.
+    clips = {
+        camera: {episode.clips[camera].file for episode in read if camera in episode.clips}
+        for camera in cameras
+    }
+    wanted = {path: dataset.folder / path for path in sorted(shared.union(*clips.values()))}
+    hashes = kept_digests.of_files(wanted.values(), dataset.folder, on_event, layout.AGAIN)
     found = []
     for camera in cameras:
-        # A camera of embedded images has no clips: its pictures are in the files of rows.
-        clips = {episode.clips[camera].file for episode in read if camera in episode.clips}
-        hashes |= {path: _sha256(dataset.folder / path) for path in clips if path not in hashes}
-        own = {str(path): hashes[path] for path in shared | clips}
+        own = {str(path): hashes[wanted[path]] for path in shared | clips[camera]}
         found.append(files.sha256_value({"camera": camera, "files": own}))
     return found
-
-
-def _sha256(path: Path) -> str:
-    """The file's digest, which is taken once as long as nobody writes to it.
-
-    A job with several methods asks anew for each, and videos are many gigabytes.
-    """
-    if not path.is_file():
-        return files.sha256_file(path, layout.AGAIN)  # which says what is wrong
-    state = path.stat()
-    # Size and time alone would miss a file that took another's place with its time.
-    changes = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
-    return _hashed(path.resolve(), changes)
-
-
-@cache
-def _hashed(path: Path, changes: tuple[int, ...]) -> str:
-    """`changes` is what would differ if somebody had written to the file."""
-    return files.sha256_file(path)
 
 
 def joined_digest(digests: Sequence[str], of: str) -> str:

@@ -17,6 +17,7 @@ from PIL import Image
 from pyarrow import parquet
 from samples.lerobot import edit_table, episodes, frames, read, replaced, save
 
+from aegis_cli.common import cache
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import GREY
 from aegis_cli.data.lerobot import dataset, rows, source, video
@@ -75,7 +76,7 @@ def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path)
 
 def test_what_a_killed_decoding_left_is_removed_by_the_next(tmp_path: Path) -> None:
     """Of another dataset too: it might never be decoded again, and is as large as its frames."""
-    folder = camera_frames.cache_folder()
+    folder = cache.folder("frames")
     folder.mkdir(parents=True)
     left, own = folder / ".0123456789abcdef.npy.12345.tmp", folder / "mine.tmp"
     left.write_bytes(b"half")

@@ -127,7 +127,7 @@ def test_a_file_is_read_once_for_its_digest_until_it_changes(
 ) -> None:
     first = demonstrations.digest(folder)
     with monkeypatch.context() as patch:
-        patch.setattr(source.files, "sha256_file", lambda path: pytest.fail(f"reads {path}"))
+        patch.setattr(source.files, "sha256_file", lambda path, *_: pytest.fail(f"reads {path}"))
         assert demonstrations.digest(folder) == first
     path = data_files(folder)[0]
     edit_table(path, lambda table: replaced(table, "timestamp", table["timestamp"]))

@@ -1,0 +1,155 @@
+"""Digests of files as large as videos, which are kept until somebody writes to a file.
+
+A data set of many gigabytes is read whole for its digest. That is done once, by as many threads as
+there are cores, and not again each time that something of it is read, by whichever process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import time
+from collections.abc import Generator, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common import cache, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.processes import worker_count
+
+LARGE = 2**20  # bytes; what is smaller is read in no time
+# A file that was written to so lately may be written to again within the clock's resolution, and
+# its times would not show it.
+_SETTLED_S = 2.0
+_MB = 10**6
+
+# What changes where somebody writes to a file: size and time alone would miss one that took
+# another's place with its time.
+Stamp = tuple[int, int, int, int]
+_known: dict[tuple[Path, Stamp], str] = {}
+
+
+def of_files(
+    paths: Iterable[Path], home: Path, on_event: OnEvent = ignore, fix: str = "check the path"
+) -> dict[Path, str]:
+    """Hex sha256 of each file's bytes.
+
+    Args:
+        home: the folder of the data set that they belong to, for which digests are kept together.
+        fix: what to do about a missing one.
+
+    Raises:
+        AegisError: one that cannot be read.
+    """
+    keys = {path: _key(path, fix) for path in paths}
+    unknown = {path: key for path, key in keys.items() if key not in _known}
+    large = {path: key for path, key in unknown.items() if key[1][1] >= LARGE}
+    for path, key in unknown.items():
+        if path not in large:
+            _known[key] = files.sha256_file(path, fix)
+    if large:
+        _know(large, home, on_event)
+    return {path: _known[key] for path, key in keys.items()}
+
+
+def _key(path: Path, fix: str) -> tuple[Path, Stamp]:
+    """The file that a path leads to, as it is now."""
+    with files.reading(path, fix):
+        state = path.stat()
+    stamp = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+    return path.resolve(), stamp
+
+
+def _know(large: Mapping[Path, tuple[Path, Stamp]], home: Path, on_event: OnEvent) -> None:
+    """Learn the digests of large files, from those that are kept or by reading them."""
+    store = cache.folder("digests") / f"{files.sha256_value(str(home.resolve()))[:32]}.json"
+    try:
+        with _locked(store):  # others who begin with the same data set wait for what this one reads
+            kept = _kept(store)
+            _known.update({key: kept[key] for key in large.values() if key in kept})
+            fresh = _read({p: key for p, key in large.items() if key not in kept}, on_event)
+            if fresh:
+                _keep(store, kept | fresh)
+    except _Unkept as error:
+        if left := {path: key for path, key in large.items() if key not in _known}:
+            _read(left, on_event)
+        text = f"digests of '{home}' are not kept, so that each start reads it whole ({error})"
+        on_event(Warned("checksums", f"{text}: set AEGIS_CACHE to a folder that can be written"))
+
+
+class _Unkept(Exception):
+    """The cache cannot be written."""
+
+
+@contextlib.contextmanager
+def _locked(store: Path) -> Generator[None]:
+    """Wait until no other process reads the files of this data set for their digests."""
+    try:
+        files.make_folder(store.parent)
+        lock = os.open(store.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    except AegisError as error:
+        raise _Unkept(error.found) from error
+    except OSError as error:
+        raise _Unkept(error.strerror or str(error)) from error
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks: each reads for itself
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _read(unread: Mapping[Path, tuple[Path, Stamp]], on_event: OnEvent) -> dict[Any, str]:
+    """Read files whole; those that may not change unseen are to be kept.
+
+    Returns:
+        Their digests by their keys, of the ones to keep.
+    """
+    if not unread:
+        return {}
+    total = sum(stamp[1] for _, stamp in unread.values())
+    done = 0
+    pool = ThreadPoolExecutor(worker_count(len(unread)))
+    began_ns = time.time_ns()
+    settled: dict[Any, str] = {}
+    try:
+        running = {pool.submit(files.sha256_file, path): path for path in unread}
+        for each in as_completed(running):
+            key = unread[running[each]]
+            _known[key] = each.result()
+            if began_ns - max(key[1][2:]) > _SETTLED_S * 1e9 and key == _key(
+                running[each], "check the path"
+            ):
+                settled[key] = _known[key]
+            done += key[1][1]
+            on_event(Progress("checksums", done // _MB, max(total // _MB, 1), "MB"))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return settled
+
+
+def _kept(store: Path) -> dict[tuple[Path, Stamp], str]:
+    """What is kept; of a damaged file nothing, for all of it can be read again."""
+    try:
+        listed = json.loads(store.read_bytes())
+        return {
+            (Path(path), (ino, size, mtime, ctime)): digest
+            for path, (ino, size, mtime, ctime, digest) in listed.items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _keep(store: Path, digests: Mapping[tuple[Path, Stamp], str]) -> None:
+    """Write them down, of each file that is still there the newest."""
+    listed = {
+        str(path): (*stamp, digest) for (path, stamp), digest in digests.items() if path.exists()
+    }
+    try:
+        files.save_json(store, listed)
+    except AegisError as error:
+        raise _Unkept(error.found) from error
