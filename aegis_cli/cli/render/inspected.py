@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
 from shlex import quote
@@ -15,6 +16,8 @@ from rich.text import Text
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
 from aegis_cli.cli.render.tables import pairs, watched
 from aegis_cli.data.episodes import as_text
+
+_ANSWER = 60  # letters of one that a table shows
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
@@ -83,7 +86,14 @@ def questions(report: Any) -> RenderableType:
     if len(report.families) > 1:
         rows = [(family.name, f"{family.questions:,}") for family in report.families]
         parts.append(plain_table(("Family", "Questions"), rows))
-    rows = [(x.answer, f"{x.questions:,}", percent(x.share)) for x in report.answers]
+    rows = [
+        (
+            textwrap.shorten(x.answer, _ANSWER, placeholder=" ..."),
+            f"{x.questions:,}",
+            percent(x.share),
+        )
+        for x in report.answers
+    ]
     parts.append(plain_table(("Commonest answer", "Questions", "Of all %"), rows))
     if report.problems:
         first = "\n".join(f"- {problem}" for problem in report.problems)
