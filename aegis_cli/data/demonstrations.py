@@ -300,7 +300,7 @@ def load(
     image_size: int | None = None,
     workers: int | None = None,
     on_event: OnEvent = ignore,
-    cache: bool = True,
+    cache: bool | None = True,
     check_text: Callable[[str], None] | None = None,
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot dataset, and split them by episode.
@@ -314,7 +314,8 @@ def load(
             None: as they are.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
         cache: whether all frames of a LeRobot folder's videos are decoded first, into a cache.
-            Otherwise each is decoded when it is asked for, unless the cache has them already.
+            Otherwise each is decoded when it is asked for, unless the cache has them already. None:
+            where the disk has room enough.
         check_text: is called with each instruction of a LeRobot folder before its videos are
             decoded, which may take hours, and raises AegisError for one that cannot be read.
 
@@ -456,7 +457,7 @@ def _load_folder(
     selection: Selection,
     image_size: int | None,
     workers: int | None,
-    cache: bool,
+    cache: bool | None,
     on_event: OnEvent,
     check_text: Callable[[str], None] | None,
 ) -> Demonstrations:
@@ -479,6 +480,10 @@ def _load_folder(
         read = torch.cat([train, validation]).numpy()
         for number in np.unique(index.task[read]).tolist():
             check_text(found.tasks[number])
+    if cache is None:
+        cache = camera_frames.have_room(
+            source, dict(zip(cameras, digests, strict=True)), image_size, on_event
+        )
     frames: list[Frames] = []
     mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):

@@ -54,7 +54,7 @@ def load(
     image_size: int | None = None,
     workers: int | None = None,
     on_event: OnEvent = ignore,
-    cache: bool = True,
+    cache: bool | None = True,
     check_text: Callable[[str], None] | None = None,
 ) -> Demonstrations:
     """Read one set of demonstrations as `demonstrations.load` does, or several and join them.

@@ -162,12 +162,14 @@ class Demos:
         "info.json, or a task of LIBERO's, such as libero/spatial, for those with its "
         "instructions.",
     )
-    cache: bool = key(
-        default=True,
+    cache: bool | None = key(
+        default=None,
         later=True,
-        doc="Decode all frames of a LeRobot dataset's videos before training, into a cache on the "
-        "disk. Without it each is decoded whenever a batch has it, as a dataset needs whose frames "
-        "are larger than the disk. Pictures in data files are always decoded first.",
+        shapes=False,
+        doc="Whether all frames of a LeRobot dataset's videos are decoded before training, into a "
+        "cache on the disk, or each whenever a batch has it; the weights are the same. Null "
+        "decodes them before where they take at most a quarter of the free disk. Pictures in data "
+        "files always are.",
     )
     drop_below: float | None = key(
         BELOW_ONE,

@@ -215,11 +215,12 @@ class RobotDemos:
         doc="Names of cameras, features or joints in the demonstrations, each with the policy's, "
         "as in a policy's recipe. Each is renamed in every one of `paths` where it occurs.",
     )
-    cache: bool = key(
-        default=True,
+    cache: bool | None = key(
+        default=None,
         later=True,
-        doc="Decode all frames of a LeRobot dataset's videos before training, into a cache on the "
-        "disk. Without it each is decoded whenever a batch has it.",
+        shapes=False,
+        doc="Whether all frames of a LeRobot dataset's videos are decoded before training, into a "
+        "cache on the disk, or each whenever a batch has it, as in a policy's recipe.",
     )
 
     @property

@@ -27,7 +27,7 @@ from numpy.lib import format as npy
 from aegis_cli.common import cache, files
 from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import OnEvent, Progress, Warned
 from aegis_cli.common.processes import mapped, worker_count
 from aegis_cli.data.lerobot import layout, pictures, video
 from aegis_cli.data.lerobot.dataset import Dataset
@@ -38,6 +38,7 @@ _PART = 256  # frames that one call decodes, or a little more
 _PER_WORKER = 8  # parts that repay a worker's start
 # Python names it since 3.13. Linux then charges no memory for a private mapping as a whole.
 _NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
+_SHARE = 0.25  # of the free disk, which decoded frames may take unasked
 _SAME = 2.0  # of 255: by how much decoders of several machines may differ in the mean
 
 
@@ -166,6 +167,38 @@ def _without(parts: Sequence[Part]) -> str:
 def are_kept(source: Source, camera: str, side: int | None, digest: str) -> bool:
     """Whether `load` would find the frames, and decode none."""
     return _file(source, camera, side, digest).exists()
+
+
+def have_room(
+    source: Source, cameras: Mapping[str, str], side: int | None, on_event: OnEvent
+) -> bool:
+    """Whether the frames that are to be decoded take at most `_SHARE` of the free disk.
+
+    A warning says where they do not.
+
+    Args:
+        cameras: the digest of each camera that is read, as `load` takes it.
+    """
+    features = source.dataset.info.features
+    count = sum(source.dataset.episodes[number].length for number in source.episodes)
+    needed = 0
+    for camera, digest in cameras.items():
+        if features[camera].dtype != "image" and not are_kept(source, camera, side, digest):
+            values = math.prod(features[camera].shape) if side is None else 3 * side**2
+            needed += count * values
+    folder = cache.folder("frames")
+    there = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(there).free
+    if needed <= _SHARE * free:
+        return True
+    text = (
+        f"the frames of '{source.dataset.folder}' stay in its videos, and each is decoded when a "
+        f"batch has it: all of them would take {needed / 1e9:,.1f} of the {free / 1e9:,.1f} GB "
+        f"that are free for '{folder}'. data_s tells what a step waits for them; --set "
+        "demos.cache=true decodes them before all the same"
+    )
+    on_event(Warned("demos", text))
+    return False
 
 
 def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:

@@ -36,13 +36,15 @@ from samples.training_runs import (
     stop_at,
 )
 
-from aegis_cli.common import artifacts, prefetch
+from aegis_cli.common import artifacts, cache, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.data import demonstrations, record
 from aegis_cli.data.batch import Normalizer
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import frames as camera_frames
 from aegis_cli.data.lerobot import video
+from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 from aegis_cli.data.lerobot.write import Limits
 from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import open_loop, results
@@ -368,6 +370,38 @@ def test_a_full_disk_is_told_of_frames_on_demand(
     monkeypatch.setattr(camera_frames.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(AegisError, match="--set demos.cache=false"):
         demonstrations.load(filmed, 0.3, 0, Selection("top"))
+
+
+def test_frames_stay_in_their_videos_where_the_disk_has_little_room(
+    filmed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless they are kept already; unasked, they take a quarter of what is free."""
+    selection, events = Selection("top"), list[Event]()
+
+    def loaded(free: int) -> Demonstrations:
+        del events[:]
+        usage = shutil.disk_usage(filmed)._replace(free=free)
+        with monkeypatch.context() as patch:
+            patch.setattr(camera_frames.shutil, "disk_usage", lambda _: usage)
+            return demonstrations.load(
+                filmed, 0.3, 0, selection, cache=None, on_event=events.append
+            )
+
+    first = loaded(10**9)
+    needed = first.frames[0].numel()
+    shutil.rmtree(cache.folder("frames"))
+    asked = loaded(4 * needed - 4)
+    (warned,) = [event for event in events if isinstance(event, Warned)]
+    assert "stay in its videos" in warned.text and "--set demos.cache=true" in warned.text
+    assert isinstance(asked.frames[0], FramesOnDemand)
+    decoded = loaded(4 * needed)
+    assert isinstance(decoded.frames[0], torch.Tensor)
+    kept = loaded(10)
+    assert isinstance(kept.frames[0], torch.Tensor)
+    assert not [event for event in events if isinstance(event, Warned)]
+    rows = torch.arange(3)
+    for one, other in zip(asked.images(rows), kept.images(rows), strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_a_run_of_frames_on_demand_has_the_weights_of_one_of_kept_ones(
