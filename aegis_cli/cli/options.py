@@ -304,8 +304,8 @@ BackboneName = Annotated[
     ),
 ]
 _SETS = (
-    "'scenes', 'easy-vqa', a .jsonl file, VQAv2's or OK-VQA's questions file, or a Hugging Face "
-    "data set's folder or hub id, its split after a #"
+    "'scenes', 'easy-vqa', a .jsonl or .json file, VQAv2's or OK-VQA's questions file, or a "
+    "Hugging Face data set's folder or hub id, its split after a #"
 )
 Vqa = Annotated[str, Option(metavar="SET", help=f"{_SETS}.")]
 OwnVqa = Annotated[
