@@ -76,8 +76,10 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     model_folder.refuse_adapter(path)
     model_folder.refuse_gguf(path)
     refuse_unfinished(path, "inspect")  # a job that has no table yet
-    runs = sorted(p.parent for p in path.glob("*/recipe.yaml")) + sorted(path.glob("*.safetensors"))
-    example = next(iter(runs), "runs/<recipe>/<method>")
+    inside = sorted(p.parent for p in path.glob("*/recipe.yaml"))
+    for pattern in ("*.safetensors", "*.jsonl"):
+        inside += sorted(path.glob(pattern))
+    example = next(iter(inside), "runs/<recipe>/<method>")
     fix = commands.aegis("inspect", example)
     expected = "a run, a LeRobot dataset, a model or a .safetensors file"
     raise UnknownFolder(f"{path} is neither a run nor an artifact", expected, fix)
