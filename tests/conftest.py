@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import itertools
 import os
 import signal
 import sys
@@ -30,7 +31,7 @@ from samples.command import command
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
-from aegis_cli.common import garbage
+from aegis_cli.common import garbage, kept_lines
 from aegis_cli.data import record
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
@@ -39,6 +40,8 @@ from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 TESTS = Path(__file__).parent
 # How many modules were there when garbage was last collected, and how many more are worth another.
 MODULES, MANY_MODULES = pytest.StashKey[int](), 100
+
+_TESTS_BEGUN = itertools.count()
 
 # An example may take longer on a machine that does something else, too.
 settings.register_profile("unhurried", deadline=None)
@@ -123,6 +126,25 @@ def nothing_waits_for_the_disk() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def what_is_measured_is_kept_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What fixtures measure is none of the user's, nor of an earlier session."""
+    folder = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_lines, "home", lambda kind: folder / kind)
+        yield folder
+
+
+@pytest.fixture(autouse=True)
+def every_test_measures(
+    what_is_measured_is_kept_apart: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a test measures, maybe of a model that it has changed, no other one finds."""
+    number = next(_TESTS_BEGUN)
+    folder = what_is_measured_is_kept_apart / str(number)
+    monkeypatch.setattr(kept_lines, "home", lambda kind: folder / kind)
 
 
 @pytest.fixture

@@ -30,8 +30,15 @@ from aegis_cli.common.home import word_at_home
 from aegis_cli.recipes import Recipe
 from aegis_cli.recipes.decoding import below
 
-# What a command that goes on needs beside its own words; `run` skips what is up to date.
-_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
+# What a command that goes on needs beside its own words. `run` skips what is up to date, and the
+# last two what they have answered or played.
+_WITH_RESUME = {
+    "train": " --resume",
+    "pretrain": " --resume",
+    "run": "",
+    "probe": "",
+    "rollout": "",
+}
 # What pydantic calls a value of the wrong type, and what it is then.
 _NO_NUMBER = {
     "int_parsing": "no whole number",

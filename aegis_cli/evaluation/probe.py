@@ -21,7 +21,7 @@ from aegis_cli.data.vqa import easy, knowledge, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.gate import MEAN, passes
 from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, prediction, score
-from aegis_cli.evaluation import results, wrong_answers
+from aegis_cli.evaluation import kept_answers, results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import Backbone
@@ -142,11 +142,12 @@ def run(
     asked = source.choose("probe", questions, seed, checks, on_event)
     with joined() as ranks:
         # One model after the other: each is on the device only while it answers.
-        after, now = _answered(model, asked, measured, batch_size, ranks, on_event)
+        after, now = _answered(model, target, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
-        if before is not None:
-            of_baseline = _of_baseline(on_event)
-            reference, then = _answered(before, asked, measured, batch_size, ranks, of_baseline)
+        if before is not None and baseline is not None:
+            reference, then = _answered(
+                before, baseline, asked, measured, batch_size, ranks, _of_baseline(on_event)
+            )
     layers = _layers(now, then)
     between = None if anchor is None else two_sets(anchor, source.name, ask)
     if between is not None and anchor is not None and layers:
@@ -204,6 +205,7 @@ def _of_baseline(on_event: OnEvent) -> OnEvent:
 
 def _answered(
     model: Backbone,
+    name: str,
     asked: VQASet,
     anchor: Anchor | None,
     batch_size: int,
@@ -215,7 +217,7 @@ def _answered(
     It is on the device meanwhile, and on the CPU again afterwards: two models may not fit.
     """
     model.to(devices.pick())
-    graded = ask(model, asked, batch_size, on_event, ranks)
+    graded = kept_answers.ask(model, name, asked, batch_size, ranks, on_event)
     found = [] if anchor is None else _distances(model, asked, anchor, batch_size, ranks)
     model.to("cpu")
     return graded, found

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from aegis_cli import sim
 from aegis_cli.common import devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
+from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.core import ensemble as temporal
-from aegis_cli.evaluation import results
+from aegis_cli.evaluation import circumstances, results
 from aegis_cli.models.acting import DEFAULT, EVALUATION_SEED, Acting, RolloutReport, play
 from aegis_cli.models.policy import Policy
 from aegis_cli.sim import libero_table
@@ -95,9 +97,11 @@ def run(
     executed = replan or acting.replan
     if delay is not None:
         _check_delay(delay, executed, acting.policy.expert.shape.chunk, decay)
+    about = _circumstances(acting, colors, stream, seed, delay, guided, executed, decay)
     policy = acting.policy.to(devices.pick())
     acting = acting._replace(policy=policy, replan=executed, ensemble=decay)
-    report = play(acting, episodes, colors, stream, video_out, on_event, seed, delay, guided)
+    kept = KeptLines("episodes", about, on_event)
+    report = play(acting, episodes, colors, stream, video_out, on_event, seed, delay, guided, kept)
     if keep:
         name = "-".join(["rollout", *([] if task is None else [task]), colors])
         settings = {"task": acting.task, "episodes": episodes, "colors": colors, "seed": seed}
@@ -106,6 +110,13 @@ def run(
         settings |= {} if delay is None else {"delay": delay, "guided": guided}
         results.keep_if_possible(Path(run_path), name, report.to_json(), settings, on_event)
     return report
+
+
+def _circumstances(acting: Acting, *settings: Any) -> dict[str, Any]:
+    """What the episodes depend on: the policy, where and how it acts, and what plays them."""
+    policy = acting.policy.fingerprint()
+    place = [acting.task, list(acting.cameras), [list(size) for size in acting.sizes]]
+    return {"policy": policy, "place": place, "how": list(settings), **circumstances.found()}
 
 
 def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) -> None:

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from aegis_cli import sim
 from aegis_cli.common import media
 from aegis_cli.common.estimates import estimate
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.palette import COLORS, HELD_OUT, SEEN
 from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
@@ -30,7 +31,6 @@ from aegis_cli.sim.simulators import Simulators, Wanted, opened
 
 EVALUATION_SEED = 0
 PLACING = "rollout (placing)"  # the stage in which large simulators start
-_NO_PICTURE = np.zeros((0, 0, 3), np.uint8)
 TARGET_COLORS: dict[str, tuple[str, ...]] = {"seen": SEEN, "held-out": HELD_OUT, "all": COLORS}
 DEFAULT = "seen"  # the default, and the only choice for a task without colours
 
@@ -109,16 +109,33 @@ class _PlayedEpisode:
     def done(self) -> bool:
         return self.last is not None and self.last.done
 
-    def forget_pictures(self) -> None:
-        """Let go of the last ones, which nobody looks at when the episode is over."""
-        self.observation = replace(self.observation, image=_NO_PICTURE, more=())
-        self.last = replace(self.end, observation=None)
-
     @property
     def end(self) -> Step:
         """The last step of an episode that has been played."""
         assert self.last is not None
         return self.last
+
+
+@dataclass(frozen=True)
+class _Played:
+    """What has become of an episode, as plain JSON: it can be kept.
+
+    Attributes:
+        distance_m: from the effector to the target at the end, in a task with coloured ones.
+        longest: how many steps the episode could have had.
+        jerks, jerked: the sum of the mean squares by which one executed action differs from the
+            next, and how many there are.
+    """
+
+    success: bool
+    wrong_target: bool
+    distance_m: float | None
+    target_color: str | None
+    instruction: str
+    total_reward: float
+    longest: int
+    jerks: float
+    jerked: int
 
 
 @dataclass(frozen=True)
@@ -168,6 +185,7 @@ def play(
     seed: int = EVALUATION_SEED,
     delay: int | None = None,
     guided: bool = False,
+    kept: KeptLines | None = None,
 ) -> RolloutReport:
     """Let a policy act in `episodes` episodes of its task.
 
@@ -180,30 +198,44 @@ def play(
         delay: steps that a prediction takes, in which the robot goes on with the chunk before;
             None: it waits.
         guided: whether a delayed chunk continues the one before.
+        kept: what was played before under the same circumstances, and is not played again; what is
+            played is added. None keeps nothing.
     """
     task, pace = acting.task, _Pace(acting.replan, delay, guided)
     started = time.perf_counter()
-    finished: list[_PlayedEpisode] = []
+    before, before_s = {} if kept is None else _kept(kept), 0.0
+    finished: list[_Played] = []
+    films: list[media.Clip] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
     clips = 0 if video_out is None else media.CLIPS
     at_once = sim.lockstep(task)  # episodes that share a forward pass
     with _simulators(acting, episodes) as simulators:
         for first in range(0, episodes, at_once):
             numbers = range(first, min(episodes, first + at_once))
+            known = before.get((first, len(numbers)))
+            if known is not None and first >= clips:
+                finished += known.episodes
+                before_s += known.seconds
+                longest = known.episodes[0].longest
+                on_event(Progress(stage, numbers.stop * longest, episodes * longest, "steps"))
+                continue
+            began = time.perf_counter()
             # The first episodes are filmed.
             group = _begun(acting, simulators, seed, stream, numbers, colors, clips, on_event)
+            longest = group[0].env.spec.max_steps
             for _ in _play(acting, simulators, group, pace, first, seed):
-                longest = group[0].env.spec.max_steps
                 # An episode that ended early counts in full, so that the progress reaches its end.
                 in_group = sum(longest if e.done else e.steps for e in group)
                 done = first * longest + in_group
                 on_event(Progress(stage, done, episodes * longest, "steps"))
-            for episode in group:
-                episode.forget_pictures()
-            finished += group
-        seconds = time.perf_counter() - started
+            films += [_clip(episode) for episode in group[: max(0, clips - first)]]
+            played = [_played(episode) for episode in group]
+            if kept is not None:
+                kept.add([_line(first, _Group(played, time.perf_counter() - began))])
+            finished += played
+        seconds = before_s + time.perf_counter() - started
         if video_out is not None:
-            media.save_video([_clip(e) for e in finished[:clips]], video_out)
+            media.save_video(films, video_out)
         return RolloutReport(
             task=task,
             episodes=episodes,
@@ -212,6 +244,46 @@ def play(
             action_change=_action_change(finished),
             **_measured(task, colors, finished),
         )
+
+
+def _played(episode: _PlayedEpisode) -> _Played:
+    """What an episode that is over leaves."""
+    return _Played(
+        success=bool(episode.end.success),
+        wrong_target=bool(episode.end.wrong_target),
+        distance_m=episode.env.distance(),
+        target_color=episode.env.target_color,
+        instruction=episode.observation.instruction,
+        total_reward=float(episode.total_reward),
+        longest=episode.env.spec.max_steps,
+        jerks=sum(episode.changes),
+        jerked=len(episode.changes),
+    )
+
+
+class _Group(NamedTuple):
+    """Episodes that were played together, and how many seconds they took."""
+
+    episodes: list[_Played]
+    seconds: float
+
+
+def _line(first: int, group: _Group) -> dict[str, Any]:
+    """A group as it is kept: an episode's noise depends on how many are played with it."""
+    episodes = [asdict(episode) for episode in group.episodes]
+    return {"first": first, "seconds": group.seconds, "episodes": episodes}
+
+
+def _kept(kept: KeptLines) -> dict[tuple[int, int], _Group]:
+    """The groups that are kept, by their first episode and how many there are."""
+    found = {}
+    for line in kept.read():
+        try:
+            episodes = [_Played(**episode) for episode in line["episodes"]]
+            found[line["first"], len(episodes)] = _Group(episodes, float(line["seconds"]))
+        except (KeyError, TypeError, ValueError):  # a foreign line: that group is played
+            continue
+    return found
 
 
 def _simulators(acting: Acting, episodes: int) -> AbstractContextManager[Simulators]:
@@ -245,22 +317,22 @@ def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int
     return begun_s + seconds * episodes * group[0].env.spec.max_steps / taken
 
 
-def _action_change(finished: Sequence[_PlayedEpisode]) -> float | None:
+def _action_change(finished: Sequence[_Played]) -> float | None:
     """The root mean square over the steps of all episodes; None where all had one."""
-    changes = [change for episode in finished for change in episode.changes]
-    return math.sqrt(sum(changes) / len(changes)) if changes else None
+    count = sum(episode.jerked for episode in finished)
+    return math.sqrt(sum(episode.jerks for episode in finished) / count) if count else None
 
 
-def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+def _measured(task: str, colors: str, finished: Sequence[_Played]) -> dict[str, Any]:
     """The report's figures that a task of this kind has."""
     if sim.is_suite(task):
         return _returns(finished)
     found: dict[str, Any] = {**vars(_success(finished))}
     del found["episodes"]  # which every report has, also one of returns
-    found["outcomes"] = "".join(str(int(bool(e.end.success))) for e in finished)
+    found["outcomes"] = "".join(str(int(e.success)) for e in finished)
     if sim.has_colors(task):
-        wrong = sum(bool(e.end.wrong_target) for e in finished) / len(finished)
-        distance = float(np.mean([_distance(e) for e in finished]))
+        wrong = sum(e.wrong_target for e in finished) / len(finished)
+        distance = float(np.mean([e.distance_m for e in finished if e.distance_m is not None]))
         found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
     tasks = sim.members(task)
     if tasks != (task,):
@@ -269,14 +341,12 @@ def _measured(task: str, colors: str, finished: Sequence[_PlayedEpisode]) -> dic
         turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
         found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
         found["suites"] = _by_suite(task, turns)
-    found["target_colors"] = _apart(finished, lambda e: e.env.target_color)
+    found["target_colors"] = _apart(finished, lambda e: e.target_color)
     found["instructions"] = _apart(finished, _instruction)
     return found
 
 
-def _by_suite(
-    task: str, turns: Mapping[str, Sequence[_PlayedEpisode]]
-) -> dict[str, PartSuccess] | None:
+def _by_suite(task: str, turns: Mapping[str, Sequence[_Played]]) -> dict[str, PartSuccess] | None:
     """The success in each suite of a set, of the episodes by their tasks; None for one suite."""
     found = {}
     for suite in sim.suites(task):
@@ -286,39 +356,32 @@ def _by_suite(
     return found or None
 
 
-def _distance(episode: _PlayedEpisode) -> float:
-    """Metres from the effector to the target, in a task with coloured ones."""
-    distance = episode.env.distance()
-    assert distance is not None
-    return distance
-
-
 def _apart(
-    finished: Sequence[_PlayedEpisode], part_of: Callable[[_PlayedEpisode], str | None]
+    finished: Sequence[_Played], part_of: Callable[[_Played], str | None]
 ) -> dict[str, PartSuccess] | None:
     """The success in each part of the episodes; None where they are all of one."""
-    parts: dict[str, list[_PlayedEpisode]] = {}
+    parts: dict[str, list[_Played]] = {}
     for episode in finished:
         if (name := part_of(episode)) is not None:
             parts.setdefault(name, []).append(episode)
     return {name: _success(parts[name]) for name in sorted(parts)} if len(parts) > 1 else None
 
 
-def _instruction(episode: _PlayedEpisode) -> str:
+def _instruction(episode: _Played) -> str:
     """The instruction of an episode, without the colour of its target."""
-    color, said = episode.env.target_color, episode.observation.instruction
+    color, said = episode.target_color, episode.instruction
     return said if color is None else said.replace(color, "{color}")
 
 
-def _success(finished: Sequence[_PlayedEpisode]) -> PartSuccess:
-    successes = sum(bool(e.end.success) for e in finished)
+def _success(finished: Sequence[_Played]) -> PartSuccess:
+    successes = sum(e.success for e in finished)
     interval = wilson_interval(successes, len(finished))
     return PartSuccess(successes / len(finished), interval, len(finished))
 
 
-def _returns(finished: Sequence[_PlayedEpisode]) -> dict[str, Any]:
+def _returns(finished: Sequence[_Played]) -> dict[str, Any]:
     found = estimate([e.total_reward for e in finished])
-    share = found.mean / finished[0].env.spec.max_steps
+    share = found.mean / finished[0].longest
     return {"mean_return": found.mean, "return_interval": found.interval, "return_share": share}
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from aegis_cli.common.devices import autocast, send
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.files import sha256_value
 from aegis_cli.core import continuation
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.core.continuation import Continued
@@ -18,6 +19,7 @@ from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
 from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
+from aegis_cli.models.structure import digest
 
 
 def check_actions(actions: Tensor) -> Tensor:
@@ -142,6 +144,11 @@ class Policy(nn.Module):
         suffix = self.backbone.suffix(encoding, noise.shape[2])
         velocity = self._velocity(noisy, times, proprio, prefix, suffix)
         return flow.masked_mse(velocity, target, send(batch.is_pad, device), shown)
+
+    def fingerprint(self) -> str:
+        """sha256 of all weights, of the precision, and of what decides what the backbone reads."""
+        settings = {"acts_in": str(self.acts_in), **self.backbone.settings()}
+        return sha256_value({"weights": digest(self.state_dict()), **settings})
 
     def act(
         self,

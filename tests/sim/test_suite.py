@@ -502,6 +502,9 @@ class Puppet:
     def to(self, _: torch.device) -> Puppet:
         return self
 
+    def fingerprint(self) -> str:
+        return f"always {self.action}"
+
     def act(self, images: torch.Tensor, *_: Any) -> torch.Tensor:
         return torch.full((len(images), 4, 1), self.action)
 

@@ -81,9 +81,13 @@ class VQASet:
         questions = (replace(q, text=ask.replace("{}", q.text)) for q in self.questions)
         return replace(self, questions=tuple(questions))
 
-    def part(self, rows: slice) -> VQASet:
-        """The same images with some of the questions."""
-        return replace(self, image_of=self.image_of[rows], questions=self.questions[rows])
+    def part(self, rows: slice | Sequence[int]) -> VQASet:
+        """The same images with some of the questions, by a slice or by their numbers."""
+        if isinstance(rows, slice):
+            chosen = self.questions[rows]
+        else:
+            chosen = tuple(self.questions[row] for row in rows)
+        return replace(self, image_of=self.image_of[rows], questions=chosen)
 
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
         """Images [B, H, W, 3] and their questions, `size` pairs at a time.

@@ -211,6 +211,7 @@ def grade(
     questions: VQASet,
     batch_size: int,
     on_event: OnEvent = ignore,
+    on_graded: Callable[[Sequence[Graded]], None] | None = None,
 ) -> list[Graded]:
     """Ask every question of a set, and grade the answers.
 
@@ -219,6 +220,7 @@ def grade(
     Args:
         answers: what is said to batches of images with questions, and log p(reference answer) of
             each in nats, as a backbone's own `answers` tells.
+        on_graded: is given each batch's graded answers when they have come.
     """
     graded: list[Graded] = []
     on_event(Progress("probe", 0, len(questions.questions), "questions"))
@@ -227,7 +229,9 @@ def grade(
         # Answers come in the questions' order, and a batch of them at a time.
         surprise, numbers = (-likelihood).tolist(), questions.image_of[rows].tolist()
         for row in zip(questions.questions[rows], said, surprise, numbers, strict=True):
-            graded.append(_graded(*row))
+            graded.append(graded_answer(*row))
+        if on_graded is not None:
+            on_graded(graded[rows])
         on_event(Progress("probe", len(graded), len(questions.questions), "questions"))
     return graded
 
@@ -237,7 +241,8 @@ def _asked(questions: VQASet, batch_size: int) -> Iterator[Asked]:
         yield tensors(images), [q.text for q in asked], [q.answer for q in asked]
 
 
-def _graded(question: Question, said: str, cross_entropy: float, image: int) -> Graded:
+def graded_answer(question: Question, said: str, cross_entropy: float, image: int) -> Graded:
+    """What was said to a question about an image of this number, graded."""
     soft = soft_accuracy(said, question.answers) if question.answers else None
     return Graded(question, said, question.is_answered_by(said), cross_entropy, image, soft)
 

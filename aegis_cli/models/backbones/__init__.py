@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import artifacts, files, hub
+from aegis_cli.common import artifacts, files, hub, kept_digests
 from aegis_cli.common.errors import AegisError
 from aegis_cli.models import shipped
 from aegis_cli.models.backbones import model_folder, shapes
@@ -166,10 +166,11 @@ def sha256(name: str) -> str:
     """sha256 over the model's file, or all files of its folder that make a model or processor."""
     path = locate(name)
     if path.is_file():
-        return files.sha256_file(path)
+        return kept_digests.of_files([path], path.parent)[path]
     digest = hashlib.sha256()
-    for file in [*model_folder.weights(path), path / "config.json"]:
-        digest.update(f"{file.name} {files.sha256_file(file)}".encode())
+    own = [*model_folder.weights(path), path / "config.json"]
+    for file, of_file in kept_digests.of_files(own, path).items():
+        digest.update(f"{file.name} {of_file}".encode())
     for file_name, content in model_folder.processor_files(path).items():
         digest.update(f"{file_name} {hashlib.sha256(content).hexdigest()}".encode())
     return digest.hexdigest()

@@ -261,6 +261,10 @@ class Backbone(nn.Module, ABC):
         """sha256 of the weights: names, shapes and values."""
         return digest(self.state_dict())
 
+    def settings(self) -> dict[str, str]:
+        """Digests of what beside the weights decides what it reads; here the code alone does."""
+        return {}
+
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
         """How `count` tokens that follow the encoding see it: everything but padding, here."""
         return Suffix(encoding.mask)

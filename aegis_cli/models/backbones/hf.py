@@ -7,6 +7,7 @@ this file only clip.py and from_hub.py import transformers.
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import shutil
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -115,6 +116,11 @@ class HFBackbone(Backbone):
     @property
     def _rotary(self) -> nn.Module:
         return self.get_submodule(f"{self._language}.rotary_emb")
+
+    def settings(self) -> dict[str, str]:
+        """Digests of the model's configuration and of its processor's files."""
+        contents = {"config.json": self.vlm.config.to_json_string().encode(), **self._files}
+        return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
     def _measure_keys(self) -> tuple[int, int]:
         """Number and size of the heads of keys, from a pass over one black image.

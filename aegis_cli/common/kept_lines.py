@@ -1,0 +1,90 @@
+"""What long work has measured so far, line by line, so that it goes on where it was interrupted.
+
+A file in the cache holds what was measured under one set of circumstances. Several processes may
+add to it at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from aegis_cli.common import cache, files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned
+
+_KEPT_S = 30 * 86_400.0  # a file that nobody has used for so long is removed
+
+
+def home(kind: str) -> Path:
+    """The folder in which lines of a kind are kept."""
+    return cache.folder(kind)
+
+
+class KeptLines:
+    """Lines of JSON that are kept for whoever measures the same again.
+
+    Args:
+        kind: names the folder in the cache.
+        about: all that the measurements depend on, as JSON: of other circumstances nothing is
+            found.
+        on_event: told once where nothing can be kept; the work goes on.
+    """
+
+    def __init__(self, kind: str, about: Mapping[str, Any], on_event: OnEvent) -> None:
+        self.path = home(kind) / f"{files.sha256_value(about)[:32]}.jsonl"
+        self._on_event = on_event
+        self._can_keep = True
+        _sweep(self.path.parent)
+
+    def read(self) -> Iterator[dict[str, Any]]:
+        """What is kept. A line that was cut off, as by a full disk, is left out."""
+        try:
+            raw = self.path.read_bytes()
+            os.utime(self.path)  # it is in use
+        except OSError:  # nothing is kept, or not for this user: it is measured
+            return
+        for line in raw.splitlines():
+            with contextlib.suppress(ValueError):
+                found = json.loads(line)
+                if isinstance(found, dict):
+                    yield found
+
+    def add(self, lines: Iterable[Mapping[str, Any]]) -> None:
+        """Keep some lines, all of them or none."""
+        if not self._can_keep:
+            return
+        text = "".join(json.dumps(line) + "\n" for line in lines)
+        try:
+            files.make_folder(self.path.parent)
+            # Opened anew each time, and written in one go: so lines of several processes do not
+            # mix. A line that was cut off is ended first.
+            with open(self.path, "ab") as file:
+                file.write(b"\n" * (not _ends_a_line(self.path)) + text.encode())
+        except (OSError, AegisError) as error:
+            self._can_keep = False
+            why = error.found if isinstance(error, AegisError) else error.strerror or str(error)
+            text = f"what is measured is not kept, so that an interruption loses it ({why})"
+            fix = "set AEGIS_CACHE to a folder that can be written"
+            self._on_event(Warned(self.path.parent.name, f"{text}: {fix}"))
+
+
+def _ends_a_line(path: Path) -> bool:
+    with open(path, "rb") as file:
+        if file.seek(0, os.SEEK_END) == 0:
+            return True
+        file.seek(-1, os.SEEK_END)
+        return file.read(1) == b"\n"
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what nobody has used for a long time."""
+    with contextlib.suppress(OSError):  # of another user, or not there yet
+        for path in folder.glob("*.jsonl"):
+            if time.time() - path.stat().st_mtime > _KEPT_S:
+                path.unlink()

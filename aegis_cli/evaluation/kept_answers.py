@@ -1,0 +1,144 @@
+"""Answers that a model has given before, so that an interrupted probe goes on.
+
+So does one of more questions, and a baseline is asked once. An answer is that of the model's files,
+a question and its image, and of the code, the libraries and the kind of device that computed it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from aegis_cli.common import files, kept_digests
+from aegis_cli.common.events import Event, OnEvent, Progress
+from aegis_cli.common.kept_lines import KeptLines
+from aegis_cli.common.ranks import Ranks
+from aegis_cli.data.batch import Share
+from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.metrics import Graded, grade, graded_answer
+from aegis_cli.evaluation import circumstances
+from aegis_cli.models import backbones
+from aegis_cli.models.backbones.base import Backbone
+
+Said = tuple[str, float]  # and its cross-entropy
+
+
+def ask(
+    model: Backbone,
+    name: str,
+    asked: VQASet,
+    batch_size: int,
+    ranks: Ranks,
+    on_event: OnEvent,
+) -> list[Graded]:
+    """Every question's answer, graded; `models.asking.ask` of those that have none yet.
+
+    Questions are asked in the batches that they would be asked in anyway, so that an answer is the
+    same bit for bit whether the work was interrupted or not. What is answered is kept at once.
+
+    Args:
+        name: what the model was loaded from.
+        ranks: the processes that ask a part of the questions each.
+    """
+    own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
+    own = own.sized(model.image_size)
+    if backbones.model_files(name):
+        about = {"model": backbones.sha256(name), **circumstances.found()}
+        kept = KeptLines("answers", about, on_event)
+        graded = _asked(model, own, batch_size, kept, on_event)
+    else:  # random weights
+        graded = grade(model.answers, own, batch_size, on_event)
+    return [one for part in ranks.gathered(graded) for one in part]
+
+
+def _asked(
+    model: Backbone, own: VQASet, batch_size: int, kept: KeptLines, on_event: OnEvent
+) -> list[Graded]:
+    keys = _keys(own)
+    known = {line["question"]: _said(line) for line in kept.read() if _is_answer(line)}
+    rows: list[int] = []  # of the batches that are not answered whole
+    for first in range(0, len(keys), batch_size):
+        batch = range(len(keys))[first : first + batch_size]
+        if not all(keys[row] in known for row in batch):
+            rows += batch
+    if rows:
+        names = iter([keys[row] for row in rows])
+
+        def keep(graded: Sequence[Graded]) -> None:
+            given = {next(names): (one.said, one.cross_entropy) for one in graded}
+            known.update(given)
+            kept.add(_line(key, *said) for key, said in given.items())
+
+        told = _going_on(len(keys) - len(rows), len(keys), on_event)
+        grade(model.answers, own.part(rows), batch_size, told, keep)
+    else:
+        on_event(Progress("probe", len(keys), len(keys), "questions"))
+    numbers = own.image_of.tolist()
+    return [
+        graded_answer(question, *known[key], number)
+        for question, key, number in zip(own.questions, keys, numbers, strict=True)
+    ]
+
+
+def _going_on(done: int, total: int, on_event: OnEvent) -> OnEvent:
+    """A listener to the rest of the questions, of which so many are answered."""
+
+    def told(event: Event) -> None:
+        if isinstance(event, Progress):
+            event = replace(event, done=event.done + done, total=total)
+        on_event(event)
+
+    return told
+
+
+# --- what tells a question ------------------------------------------------------------------------
+
+
+def _keys(asked: VQASet) -> list[str]:
+    """A digest of each question, its reference answer and its image."""
+    images = _digests(asked)
+    return [
+        files.sha256_value([question.text, question.answer, images[number]])
+        for question, number in zip(asked.questions, asked.image_of.tolist(), strict=True)
+    ]
+
+
+def _digests(asked: VQASet) -> Mapping[int, str]:
+    """A digest of each image that is asked about, by its number."""
+    numbers = sorted(set(asked.image_of.tolist()))
+    images = asked.images
+    if isinstance(images, np.ndarray):
+        return {number: hashlib.sha256(images[number].tobytes()).hexdigest() for number in numbers}
+    sources = {number: images.pictures[number].source for number in numbers}
+    paths = {number: source for number, source in sources.items() if isinstance(source, Path)}
+    found: dict[int, str] = {}
+    if paths:
+        of_files = kept_digests.of_files(paths.values(), min(paths.values()).parent)
+        found = {number: of_files[path] for number, path in paths.items()}
+    for number, source in sources.items():
+        if not isinstance(source, Path):
+            found[number] = hashlib.sha256(source()).hexdigest()
+    return found
+
+
+# --- lines ----------------------------------------------------------------------------------------
+
+
+def _line(question: str, said: str, cross_entropy: float) -> dict[str, object]:
+    return {"question": question, "said": said, "cross_entropy": cross_entropy}
+
+
+def _is_answer(line: Mapping[str, object]) -> bool:
+    """Whether a line is whole; others are measured again."""
+    kinds = {"question": str, "said": str, "cross_entropy": float}
+    return all(isinstance(line.get(name), kind) for name, kind in kinds.items())
+
+
+def _said(line: Mapping[str, object]) -> Said:
+    said, cross_entropy = line["said"], line["cross_entropy"]
+    assert isinstance(said, str) and isinstance(cross_entropy, float)
+    return said, cross_entropy
