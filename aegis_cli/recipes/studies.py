@@ -135,6 +135,15 @@ class StudyRecipe:
     keep_runs: bool = key(
         default=False, doc="Keep the checkpoints of trainings that have been measured."
     )
+    max_error_rise: float = key(
+        NOT_NEGATIVE,
+        default=0.02,
+        later=True,
+        shapes=False,
+        doc="Where nothing can be rolled out: how far above naive's a variant's open-loop error "
+        "may be to pass the bar, as a share of the actions' variance. One policy's error moved by "
+        "as much on 16 episodes where its flow began with other noise.",
+    )
 
 
 @section

@@ -9,6 +9,7 @@ import dataclasses
 import shutil
 import statistics
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -202,7 +203,8 @@ class PolicyStudy:
             for vqa in self._sets() if found else ():
                 asked = {name: _asked(own, vqa) for name, own in found.items()}
                 chosen, costs = findings.chosen, findings.costs
-                table = task_results(task, asked, study.variants, chosen, costs, ceilings)
+                most = study.max_error_rise
+                table = task_results(task, asked, study.variants, chosen, costs, ceilings, most)
                 tables.append(dataclasses.replace(table, vqa=vqa))
         return StudyReport(
             name=study.name,
@@ -499,9 +501,9 @@ class PolicyRunner:
         # A task without colours has its figures under `seen`; a policy that cannot be rolled out
         # has none at all.
         seen, held_out = played.get("seen"), played.get("held-out")
-        error, hold = None, None
+        evaluated = OpenLoop()
         if not playable and not validation:
-            error, hold = self.open_loop_errors(label, recipe)
+            evaluated = self.open_loop_errors(label, recipe)
         return PolicyFigures(
             method=recipe.train.method,
             **vars(asked[first]),
@@ -509,8 +511,12 @@ class PolicyRunner:
             success_held_out=None if held_out is None else held_out["success"],
             wrong_target=None if seen is None else seen["wrong_target"],
             return_share=None if seen is None else seen["return_share"],
-            open_loop_error=error,
-            hold_error=hold,
+            open_loop_error=evaluated.error,
+            hold_error=evaluated.hold,
+            evaluated_episodes=evaluated.episodes,
+            weight_per_episode=evaluated.weights,
+            error_per_episode=evaluated.errors,
+            hold_per_episode=evaluated.holds,
             energy_shed=trained["energy_shed_mean"],
             step_s=trained["step_s"],
             step_time_ratio=None,
@@ -761,7 +767,7 @@ class PolicyRunner:
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
 
-    def open_loop_errors(self, label: str, recipe: Recipe) -> tuple[float | None, float | None]:
+    def open_loop_errors(self, label: str, recipe: Recipe) -> OpenLoop:
         """The open-loop errors of the cell and of holding the position, on held-out episodes.
 
         With several sets of demonstrations each is the mean over the sets in which actions vary,
@@ -769,17 +775,13 @@ class PolicyRunner:
         """
         given = self.demos(recipe)
         paths = mixture.each(given.path)
-        errors, holds = [], []
+        reports = {}
         for number, data in enumerate(paths, start=1):
             report = self.evaluated(label, recipe, data, given.sha256, number)
             # None where no action varied in training: there is no variance to measure by.
             if report["relative_error"] is not None:
-                errors.append(report["relative_error"])
-                holds.append(report["hold_error"])
-        if not errors:
-            return None, None
-        hold = None if None in holds else statistics.fmean(holds)
-        return statistics.fmean(errors), hold
+                reports[number] = report
+        return OpenLoop.of(reports)
 
     def evaluated(
         self, label: str, recipe: Recipe, data: Path, demos_sha256: str, number: int
@@ -798,6 +800,48 @@ class PolicyRunner:
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Open-loop errors as `PolicyFigures` has them; None where nothing was measured."""
+
+    error: float | None = None
+    hold: float | None = None
+    episodes: tuple[str, ...] | None = None
+    weights: tuple[float, ...] | None = None
+    errors: tuple[float, ...] | None = None
+    holds: tuple[float, ...] | None = None
+
+    @classmethod
+    def of(cls, reports: Mapping[int, Mapping[str, Any]]) -> OpenLoop:
+        """What the reports on data sets tell together, by the sets' numbers."""
+        if not reports:
+            return cls()
+        each = list(reports.values())
+        held = [report["hold_error"] for report in each]
+        made = cls(
+            statistics.fmean(report["relative_error"] for report in each),
+            None if None in held else statistics.fmean(held),
+        )
+        # A report that an earlier version has kept does not tell single episodes.
+        if not all(report.get("episode_errors") for report in each):
+            return made
+        episodes, weights = list[str](), list[float]()
+        for number, report in reports.items():
+            steps = sum(one["steps"] for one in report["episode_errors"])
+            for one in report["episode_errors"]:
+                episodes.append(f"{number}/{one['episode']}")
+                weights.append(one["steps"] / (steps * len(reports)))  # each set counts alike
+        every = [one for report in each for one in report["episode_errors"]]
+        holds = None if made.hold is None else tuple(one["hold_error"] for one in every)
+        return dataclasses.replace(
+            made,
+            episodes=tuple(episodes),
+            weights=tuple(weights),
+            errors=tuple(one["relative_error"] for one in every),
+            holds=holds,
+        )
 
 
 def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:

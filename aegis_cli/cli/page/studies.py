@@ -17,12 +17,13 @@ from aegis_cli.cli.render.frontier import (
     coloured_methods,
     shown_tasks,
 )
-from aegis_cli.cli.render.studies import knob_text, shown_as
+from aegis_cli.cli.render.studies import OPEN_LOOP, knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns, deciding_decimals, unmeasured
 
 _DECLARED = columns(PolicyResult)
 _LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
+_OPEN_LOOP = " ".join(f"{OPEN_LOOP[0].upper()}{OPEN_LOOP[1:]}.".split())
 _REST = -1  # the number of a series without a colour of its own
 
 
@@ -116,6 +117,7 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
                 *_before(task),
             ),
             table(header + ["Bar"] * barred, rows, left=1 + turned),  # the knob is a text too
+            note(_OPEN_LOOP) if any(r["open_loop_error"] for r in task["results"]) else None,
             _demands(task["results"]) if barred else None,
         )
 
