@@ -88,7 +88,9 @@ class Tuning:
     """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation success is near the best of `naive`, it is the one with the
-    highest validation accuracy.
+    highest validation accuracy. Where nothing can be rolled out, the open-loop error takes the
+    place of success, on episodes that the tuning's seed holds out and none of the seeds that are
+    compared.
     """
 
     task: str = key(TASK, default="reach", doc="Task that the knobs are chosen on.")
@@ -102,7 +104,8 @@ class Tuning:
     within: float = key(
         NOT_NEGATIVE,
         default=3.0,
-        doc="How far from the best success a value may be, in percentage points.",
+        doc="How far from the best success a value may be, in percentage points, or from the least "
+        "open-loop error in hundredths.",
     )
     runs: int | None = key(
         POSITIVE,

@@ -26,7 +26,13 @@ from aegis_cli.cli.render.layout import (
     unmarked,
 )
 from aegis_cli.studies.metrics import Column, columns, deciding_decimals, unmeasured
-from aegis_cli.studies.tuning import POLICY_RULE, ROBOT_STREAM_RULE, STREAM_RULE, Rule
+from aegis_cli.studies.tuning import (
+    OPEN_LOOP_RULE,
+    POLICY_RULE,
+    ROBOT_STREAM_RULE,
+    STREAM_RULE,
+    Rule,
+)
 
 
 def study(report: Any) -> RenderableType:
@@ -210,11 +216,14 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
 
 def _tried(points: Sequence[Any]) -> Table:
     """The knobs' values so far, while nothing has been compared yet."""
+    by_error = any(point.open_loop_error is not None for point in points)
     rows = []
     for point in points:
         value = "-" if point.value is None else value_text(point.value)
-        rows.append((point.variant, value, percent(point.accuracy), percent(point.success)))
-    return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
+        acts = fixed(point.open_loop_error, 3) if by_error else percent(point.success)
+        rows.append((point.variant, value, percent(point.accuracy), acts))
+    acts = "Open-loop error" if by_error else "Success or return %"
+    return plain_table(("Variant", "Value", "VQA %", acts), rows, left=2)
 
 
 def _references(results: Sequence[Any]) -> list[RenderableType]:
@@ -330,7 +339,9 @@ def _notes(report: Any) -> list[str]:
     if report.costs_on:
         notes.append(f"step times and memory were measured on: {'; '.join(report.costs_on)}")
     if report.tuning:
-        notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
+        by_error = any(point.open_loop_error is not None for point in report.tuning)
+        rule = OPEN_LOOP_RULE if by_error else POLICY_RULE
+        notes.append(_rule(rule, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]
 
 

@@ -1,0 +1,96 @@
+"""Studies of policies that cannot be rolled out: judged and tuned by their open-loop error."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from samples import studies
+from samples.command import refused
+from samples.lerobot import edit_info, episodes, save
+
+from aegis_cli.cli import render
+from aegis_cli.common import files
+from aegis_cli.common.events import ignore
+from aegis_cli.data import demonstrations
+from aegis_cli.recipes import study_cells
+from aegis_cli.studies import study
+
+pytestmark = pytest.mark.usefixtures("frame_cache")
+
+BOTH = ("top", "wrist")
+
+
+def own_robot(folder: Path, backbone: Path, count: int, **changes: Any) -> dict[str, Any]:
+    """The keys of a study of policies that cannot be rolled out, which holds out three of ten."""
+    recorded = [replace(e, instruction="go to the red pad") for e in episodes(count, ("wrist",))]
+    shared = studies.raw(backbone)["shared"]
+    shared["demos"] = {"path": str(save(folder, recorded))}
+    shared["train"]["validation_share"] = 0.3
+    return studies.raw(backbone, shared=shared, **changes)
+
+
+def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The compared seeds hold out other episodes than each other, and none of those."""
+    studies.fake_bench(monkeypatch)
+    knob = {"naive": {"method": "naive", "tune": {"train.backbone_lr": [1e-3, 1e-2]}}}
+    keys = own_robot(tmp_path / "d", tiny_folder, 20, variants=knob, keep_runs=True)
+    report = study.run(study_cells.load(studies.write(tmp_path, keys)), tmp_path / "runs")
+    assert all(p.success is None and p.open_loop_error is not None for p in report.tuning)
+    assert report.tuning_task and [p.chosen for p in report.tuning].count(True) == 1
+    runs = tmp_path / "runs" / "small"
+    tuned = [files.load_json(p) for p in runs.glob("tuning/*/*/evaluate-validation.json")]
+    judged = [files.load_json(p) for p in sorted(runs.glob("reach/*/*/evaluate.json"))]
+    assert len(tuned) == len(judged) == 2 and not list(runs.glob("tuning/*/*/evaluate.json"))
+    assert judged[0]["episodes"] != judged[1]["episodes"]
+    held = {episode for one in judged for episode in one["episodes"]}
+    for one in tuned:
+        assert one["episodes"] and not held & {*one["episodes"]} and not one["trained_on"]
+    errors = [one["relative_error"] for one in tuned]
+    assert sorted(errors) == sorted(p.open_loop_error for p in report.tuning)
+    said = io.StringIO()
+    Console(file=said, width=160).print(render.study(report))
+    assert "that judge no compared policy" in " ".join(said.getvalue().split())
+
+
+def test_further_seeds_may_leave_other_episodes_to_tune_on(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    """A value that was chosen on an episode that now judges would be chosen anew."""
+    keys = own_robot(tmp_path / "d", tiny_folder, 20)
+    found = []
+    for seeds in ([0, 1], [0, 1], [0, 1, 2]):
+        recipe = study_cells.load(studies.write(tmp_path, {**keys, "seeds": seeds}))
+        kind = study.kind_of(recipe)
+        runner = kind.make_runner(tmp_path / "runs", ignore)
+        found.append([runner.key(c) for own in study.trials(kind).values() for _, c in own])
+    assert found[0] == found[1] and not {*found[0]} & {*found[2]}
+
+
+def test_values_are_not_chosen_where_no_episode_is_left_or_acting_is_not_one_figure(
+    aegis: Any, tiny_folder: Path, tmp_path: Path
+) -> None:
+    """Before any work; one camera of a simulated task can be rolled out."""
+    keys = own_robot(tmp_path / "few", tiny_folder, 3)
+    for seeds, fix in (((0, 1), "set tuning.seed to 100"), (range(9), "compare fewer seeds")):
+        path = studies.write(tmp_path, {**keys, "seeds": list(seeds)})
+        err = refused(aegis("run", path, "--out", tmp_path / "runs"))
+        assert "no episode of" in err and fix in err
+    folder = save(tmp_path / "d", episodes(4, BOTH))
+    assert demonstrations.playable_task(folder, "wrist", "reach") is None
+    keys["shared"]["demos"] = {"path": str(folder), "camera": "wrist"}
+    other = save(tmp_path / "other", episodes(4, BOTH))
+    edit_info(other, lambda info: info.update(robot_type="aegis/reach"))
+    assert demonstrations.playable_task(other, "wrist", "reach") == "reach"
+    assert demonstrations.playable_task(other, BOTH, "reach") is None
+    simulated = {"method": "naive", "set": {"demos.path": str(other)}}
+    variants = {**keys["variants"], "simulated": simulated}
+    path = studies.write(tmp_path, {**keys, "variants": variants})
+    err = refused(aegis("run", path, "--out", tmp_path / "runs"))
+    assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()
