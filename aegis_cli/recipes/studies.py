@@ -93,7 +93,9 @@ class Tuning:
     compared.
     """
 
-    task: str = key(TASK, default="reach", doc="Task that the knobs are chosen on.")
+    task: str = key(
+        TASK, default="reach", doc="Task that the knobs are chosen on, in a study of tasks."
+    )
     seed: int = key(
         SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
@@ -120,10 +122,16 @@ class StudyRecipe:
     """Compares variants of methods over tasks and seeds, each at the best value of its knobs."""
 
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
-    tasks: tuple[str, ...] = key(TASK, doc="Tasks that variants are compared on.")
     seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
     variants: dict[str, PolicyVariant] = key(
         _SOME, doc="What is compared: a name for each variant."
+    )
+    tasks: tuple[str, ...] | None = key(
+        TASK,
+        default=None,
+        later=True,
+        doc="Tasks that variants are compared on. Null: the demonstrations that demos.path names, "
+        "as of a robot that is not simulated here; tables and folders have their name.",
     )
     shared: dict[str, Any] = key(
         factory=dict, doc="Keys of a recipe of kind policy, for every training."

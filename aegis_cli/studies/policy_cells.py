@@ -74,7 +74,7 @@ class PolicyStudy:
     def __init__(self, recipe: StudyRecipe) -> None:
         self.recipe = recipe
         self.make_runner: MakeRunner[Recipe] = PolicyRunner
-        self.places: Sequence[str] = recipe.tasks
+        self.places: Sequence[str] = study_cells.places(recipe)
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
         """The recipe of one policy on one task."""
@@ -82,11 +82,11 @@ class PolicyStudy:
 
     def trial(self, variant: str, value: Any) -> Recipe:
         """The recipe by which a knob's value is judged."""
-        tuning = self.recipe.tuning or Tuning(task=self.recipe.tasks[0])
+        tuning = self.recipe.tuning or Tuning(task=self.places[0])
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
         played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
-        if sim.has_colors(tuning.task):
+        if sim.has_colors(recipe.task):
             played = dataclasses.replace(played, colors=("seen",))
         return dataclasses.replace(recipe, probe=asked, rollout=played)
 
@@ -101,7 +101,8 @@ class PolicyStudy:
             track.check(recipe)
         tuning = self.recipe.tuning
         recorded = any(recipe.demos.path is None for recipe in trials)
-        for task in (*self.places, *([tuning.task] if tuning else [])):
+        named = [*self.places, *([tuning.task] if tuning else [])] if self.recipe.tasks else []
+        for task in named:
             if recorded:
                 sim.check_recordable(task)
             sim.check(task)
@@ -184,7 +185,7 @@ class PolicyStudy:
     def _first(self, variant: str, chosen: Mapping[str, Any]) -> Recipe:
         """The recipe of a variant's first cell, whose costs stand for those of all its cells."""
         study = self.recipe
-        return self.cell(variant, study.tasks[0], study.seeds[0], chosen[variant])
+        return self.cell(variant, self.places[0], study.seeds[0], chosen[variant])
 
     def _measure_costs(
         self, store: CellStore[Recipe], made: Mapping[str, Recipe], names: Collection[str]
@@ -208,7 +209,7 @@ class PolicyStudy:
         study = self.recipe
         ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
         tables = []
-        for task in study.tasks:
+        for task in self.places:
             found = findings.at(task)
             for vqa in self._sets() if found else ():
                 asked = {name: _asked(own, vqa) for name, own in found.items()}
@@ -222,18 +223,24 @@ class PolicyStudy:
             cells=store.total,
             seeds=list(study.seeds),
             tasks=tables,
-            tuning_task=None if study.tuning is None else study.tuning.task,
+            tuning_task=self._tuned_on(),
             within=None if study.tuning is None else study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
             costs_on=sorted({cost.machine for cost in findings.costs.values() if cost.machine}),
         )
 
+    def _tuned_on(self) -> str | None:
+        """The task that the knobs are chosen on, or the name of the demonstrations."""
+        if self.recipe.tuning is None:
+            return None
+        return self.recipe.tuning.task if self.recipe.tasks else self.places[0]
+
     def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:
         """Whether a variant trains on VQA data, at the values of its knobs that were chosen."""
         study = self.recipe
         value = chosen.get(variant, study.variants[variant].values[0])
-        return bool(_trained_on(self.cell(variant, study.tasks[0], study.seeds[0], value)))
+        return bool(_trained_on(self.cell(variant, self.places[0], study.seeds[0], value)))
 
 
 def _runner(store: CellStore[Recipe]) -> PolicyRunner:

@@ -31,7 +31,8 @@ def own_robot(folder: Path, backbone: Path, count: int, **changes: Any) -> dict[
     shared = studies.raw(backbone)["shared"]
     shared["demos"] = {"path": str(save(folder, recorded))}
     shared["train"]["validation_share"] = 0.3
-    return studies.raw(backbone, shared=shared, **changes)
+    tuning = {name: value for name, value in studies.TUNING.items() if name != "task"}
+    return studies.raw(backbone, **{"shared": shared, "tasks": None, "tuning": tuning, **changes})
 
 
 def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
@@ -40,13 +41,13 @@ def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
     """The compared seeds hold out other episodes than each other, and none of those."""
     studies.fake_bench(monkeypatch)
     knob = {"naive": {"method": "naive", "tune": {"train.backbone_lr": [1e-3, 1e-2]}}}
-    keys = own_robot(tmp_path / "d", tiny_folder, 20, variants=knob, keep_runs=True)
+    keys = own_robot(tmp_path / "arm", tiny_folder, 20, variants=knob, keep_runs=True)
     report = study.run(study_cells.load(studies.write(tmp_path, keys)), tmp_path / "runs")
     assert all(p.success is None and p.open_loop_error is not None for p in report.tuning)
-    assert report.tuning_task and [p.chosen for p in report.tuning].count(True) == 1
+    assert report.tuning_task == "arm" and [p.chosen for p in report.tuning].count(True) == 1
     runs = tmp_path / "runs" / "small"
     tuned = [files.load_json(p) for p in runs.glob("tuning/*/*/evaluate-validation.json")]
-    judged = [files.load_json(p) for p in sorted(runs.glob("reach/*/*/evaluate.json"))]
+    judged = [files.load_json(p) for p in sorted(runs.glob("arm/*/*/evaluate.json"))]
     assert len(tuned) == len(judged) == 2 and not list(runs.glob("tuning/*/*/evaluate.json"))
     assert judged[0]["episodes"] != judged[1]["episodes"]
     held = {episode for one in judged for episode in one["episodes"]}
@@ -56,7 +57,8 @@ def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
     assert sorted(errors) == sorted(p.open_loop_error for p in report.tuning)
     said = io.StringIO()
     Console(file=said, width=160).print(render.study(report))
-    assert "that judge no compared policy" in " ".join(said.getvalue().split())
+    assert "episodes of arm that judge no compared policy" in " ".join(said.getvalue().split())
+    assert "small: arm" in said.getvalue() and "reach" not in said.getvalue()
 
 
 def test_further_seeds_may_leave_other_episodes_to_tune_on(
@@ -94,3 +96,19 @@ def test_values_are_not_chosen_where_no_episode_is_left_or_acting_is_not_one_fig
     path = studies.write(tmp_path, {**keys, "variants": variants})
     err = refused(aegis("run", path, "--out", tmp_path / "runs"))
     assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()
+
+
+def test_a_study_that_named_a_task_goes_on_where_it_was(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its cells keep their folders, and are known as well once the recipe leaves the task out."""
+    studies.fake_bench(monkeypatch)
+    variants = {"naive": {"method": "naive"}, "kept": {"method": "stop-gradient"}}
+    keys = own_robot(tmp_path / "d", tiny_folder, 5, tuning=None, variants=variants)
+    named = study_cells.load(studies.write(tmp_path, {**keys, "tasks": ["reach"], "seeds": [0]}))
+    study.run(named, tmp_path / "runs")
+    assert (tmp_path / "runs" / "small" / "reach" / "naive" / "0").is_dir()
+    later = study_cells.load(studies.write(tmp_path, keys))
+    plan = list(study.planned(later, tmp_path / "runs"))
+    known = {f"d/{name}/0": True for name in variants} | {f"d/{name}/1": False for name in variants}
+    assert dict(plan) == known
