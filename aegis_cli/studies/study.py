@@ -121,6 +121,7 @@ def planned(
         if kept.exists() and not overwrite:
             shutil.copy(kept, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
+        store.total = sum(map(len, tuned.values()))  # of which those that are known are delivered
         # In the order in which `run` measures them, so that a plan reads as the study will go.
         for own in tuned.values():
             for _, cell in own:
