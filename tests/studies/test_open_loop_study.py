@@ -19,6 +19,7 @@ from aegis_cli.common.events import ignore
 from aegis_cli.data import demonstrations
 from aegis_cli.recipes import study_cells
 from aegis_cli.studies import study
+from aegis_cli.studies.policy_cells import OpenLoop
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -112,3 +113,25 @@ def test_a_study_that_named_a_task_goes_on_where_it_was(
     plan = list(study.planned(later, tmp_path / "runs"))
     known = {f"d/{name}/0": True for name in variants} | {f"d/{name}/1": False for name in variants}
     assert dict(plan) == known
+
+
+def test_each_of_several_sets_counts_alike_however_long_it_is() -> None:
+    def report(errors: list[float], steps: list[int], hold: float | None) -> dict[str, Any]:
+        whole = sum(s * e for s, e in zip(steps, errors, strict=True)) / sum(steps)
+        each = [
+            {"episode": 3 * i, "steps": s, "relative_error": e, "hold_error": hold}
+            for i, (s, e) in enumerate(zip(steps, errors, strict=True))
+        ]
+        return {"relative_error": whole, "hold_error": hold, "episode_errors": each}
+
+    reports = {1: report([0.25, 0.5], [30, 10], 0.75), 3: report([1.0], [400], 0.5)}
+    found = OpenLoop.of(reports)
+    assert found.episodes == ("1/0", "1/3", "3/0") and found.hold == pytest.approx(0.625)
+    for whole, errors in ((found.error, found.errors), (found.hold, found.holds)):
+        shared = zip(found.weights or (), errors or (), strict=True)
+        assert sum(weight * error for weight, error in shared) == pytest.approx(whole)
+    assert sum(found.weights or ()) == pytest.approx(1)
+    unheld = OpenLoop.of({**reports, 3: report([1.0], [400], None)})
+    assert unheld.hold is unheld.holds is None and unheld.errors == found.errors
+    older = OpenLoop.of({number: {**one, "episode_errors": []} for number, one in reports.items()})
+    assert older.error == found.error and older.errors is older.episodes is None
