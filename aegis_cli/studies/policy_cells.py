@@ -75,6 +75,7 @@ class PolicyStudy:
         self.recipe = recipe
         self.make_runner: MakeRunner[Recipe] = PolicyRunner
         self.places: Sequence[str] = study_cells.places(recipe)
+        self._has_warned = False
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
         """The recipe of one policy on one task."""
@@ -120,6 +121,7 @@ class PolicyStudy:
         for cell in cells:
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 runner.check_questions(cell.recipe, split)
+        self._warn_of_tasks(cells, runner.on_event)
         # To load a backbone and demonstrations takes long, so each combination is checked once.
         distinct = {}
         for cell in cells:
@@ -131,6 +133,23 @@ class PolicyStudy:
         for cell in cells if together else ():
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
+
+    def _warn_of_tasks(self, cells: Sequence[Cell[Recipe]], on_event: OnEvent) -> None:
+        """Warn once of tasks that nothing is played on, which a table would seem to be of."""
+        tasks = self.recipe.tasks
+        if tasks is None or self._has_warned:
+            return
+        others = [cell.recipe for cell in cells if not playable_colors(cell.recipe)]
+        if others:
+            self._has_warned = True
+            text = (
+                f"policies of {mixture.said(mixture.at(_path(others[0])))} cannot be rolled out "
+                f"here, so that tasks: [{', '.join(tasks)}] is but a name: without 'tasks' and "
+                "tuning.task, tables and folders have the demonstrations' name"
+            )
+            if set(tasks) == {Recipe.task}:  # the default, which cells without one have
+                text += ", and what is finished stays finished"
+            on_event(Warned("study", text))
 
     def point(self, variant: str, value: Any, found: PolicyFigures | Divergence) -> PolicyPoint:
         """What a knob's value led to."""

@@ -15,7 +15,7 @@ from samples.lerobot import edit_info, episodes, save
 
 from aegis_cli.cli import render
 from aegis_cli.common import files
-from aegis_cli.common.events import ignore
+from aegis_cli.common.events import Event, Warned, ignore
 from aegis_cli.data import demonstrations
 from aegis_cli.recipes import study_cells
 from aegis_cli.studies import study
@@ -107,7 +107,10 @@ def test_a_study_that_named_a_task_goes_on_where_it_was(
     variants = {"naive": {"method": "naive"}, "kept": {"method": "stop-gradient"}}
     keys = own_robot(tmp_path / "d", tiny_folder, 5, tuning=None, variants=variants)
     named = study_cells.load(studies.write(tmp_path, {**keys, "tasks": ["reach"], "seeds": [0]}))
-    study.run(named, tmp_path / "runs")
+    events: list[Event] = []
+    study.run(named, tmp_path / "runs", events.append)
+    told = [e.text for e in events if isinstance(e, Warned) and e.stage == "study"]
+    assert len(told) == 1 and "so that tasks: [reach] is but a name" in told[0]
     assert (tmp_path / "runs" / "small" / "reach" / "naive" / "0").is_dir()
     later = study_cells.load(studies.write(tmp_path, keys))
     plan = list(study.planned(later, tmp_path / "runs"))
