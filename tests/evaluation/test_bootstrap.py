@@ -138,14 +138,6 @@ def test_images_that_several_seeds_were_asked_about_are_one_look() -> None:
     assert crossed_interval(alike) == pytest.approx((0.5 - bound, 0.5 + bound))
 
 
-def test_what_nothing_limits_is_no_share_however_few_units_there_are() -> None:
-    """A squared error may be of any size: a share's interval says nothing of it."""
-    seeds = [Units(np.array([0.4, 0.5, level]), np.ones(3)) for level in (0.6, 0.7)]
-    wide, own = crossed_interval(seeds), crossed_interval([replace(s, reach=None) for s in seeds])
-    assert wide is not None and own is not None
-    assert wide[0] < own[0] and own[0] > 0.3 and own[1] < 0.8 < wide[1]
-
-
 def test_one_seed_has_no_interval() -> None:
     assert crossed_interval([Units(np.arange(5.0), np.ones(5))]) is None
 

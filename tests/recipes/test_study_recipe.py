@@ -36,39 +36,6 @@ def with_variant(**keys: Any) -> dict[str, Any]:
     return {"variants": {"naive": VARIANTS["naive"], "x": keys}}
 
 
-@pytest.mark.parametrize(
-    ("path", "name"),
-    [
-        ("data/arm", "arm"),
-        ("data/arm/", "arm"),
-        ("owner/arm-pick", "arm-pick"),
-        ("data/arm.safetensors", "arm"),
-        ("data/my arm!", "my_arm"),
-        (["data/left", "data/right"], "left+right"),
-        ("data/tuning", "tuning-demos"),
-        ("..", "demonstrations"),
-        ("ä" * 200, "ä" * 50),
-    ],
-)
-def test_a_study_without_tasks_is_named_by_its_demonstrations(
-    path: str | list[str], name: str, tmp_path: Path
-) -> None:
-    """The recipes of its cells are those of a study of the default task."""
-    tuning = {key: value for key, value in TUNING.items() if key != "task"}
-    shared = {"demos": {"path": path}}
-    keys = raw("embedded", tasks=None, tuning=tuning, shared=shared)
-    made, named = (
-        study_cells.load(write(tmp_path, one)) for one in (keys, {**keys, "tasks": ["reach"]})
-    )
-    assert isinstance(made, StudyRecipe) and isinstance(named, StudyRecipe)
-    assert study_cells.places(made) == (name,) and study_cells.places(named) == ("reach",)
-    cells = [
-        study_cells.cell(one, "naive", at, 1, 1e-3) for one, at in ((made, name), (named, "reach"))
-    ]
-    assert cells[0] == cells[1]
-    assert study_cells.written_out(made)["tasks"] is None
-
-
 def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
     """Also one of dots, of none of a name's characters, or longer than a name may be."""
     values = ("a/b", "a_b", ".", "..", "/", "?", "ä" * 200, "ä" * 300, 1e-3, "_._", None)
@@ -222,13 +189,6 @@ def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
             "its default is 1000",
         ),
         ({"tasks": ["raech"]}, "tasks: ['raech']", "did you mean 'reach'?"),
-        ({"tasks": None}, "no key 'tasks', and no demonstrations", "add the line 'tasks: [reach]'"),
-        (
-            {"tasks": None, "shared": {"demos": {"path": "arm"}}},
-            "tuning.task: reach without tasks",
-            "delete tuning.task",
-        ),
-        ({"max_error_rise": -0.1}, "max_error_rise: -0.1", "its default is 0.02"),
         ({"tuning": None}, "naive with 'tune'", "add it"),
         (
             {"tuning": {**TUNING, "withn": 3}},

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 from samples import studies
@@ -15,9 +16,11 @@ from samples.lerobot import edit_info, episodes, save
 
 from aegis_cli.cli import render
 from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Warned, ignore
 from aegis_cli.data import demonstrations
-from aegis_cli.recipes import study_cells
+from aegis_cli.evaluation.bootstrap import Units, crossed_interval
+from aegis_cli.recipes import StudyRecipe, study_cells
 from aegis_cli.studies import study
 from aegis_cli.studies.policy_cells import OpenLoop
 
@@ -138,3 +141,65 @@ def test_each_of_several_sets_counts_alike_however_long_it_is() -> None:
     assert unheld.hold is unheld.holds is None and unheld.errors == found.errors
     older = OpenLoop.of({number: {**one, "episode_errors": []} for number, one in reports.items()})
     assert older.error == found.error and older.errors is older.episodes is None
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("data/arm", "arm"),
+        ("data/arm/", "arm"),
+        ("owner/arm-pick", "arm-pick"),
+        ("data/arm.safetensors", "arm"),
+        ("data/my arm!", "my_arm"),
+        (["data/left", "data/right"], "left+right"),
+        ("data/tuning", "tuning-demos"),
+        ("..", "demonstrations"),
+        ("ä" * 200, "ä" * 50),
+    ],
+)
+def test_a_study_without_tasks_is_named_by_its_demonstrations(
+    path: str | list[str], name: str, tmp_path: Path
+) -> None:
+    """The recipes of its cells are those of a study of the default task."""
+    tuning = {key: value for key, value in studies.TUNING.items() if key != "task"}
+    shared = {"demos": {"path": path}}
+    keys = studies.raw("embedded", tasks=None, tuning=tuning, shared=shared)
+    made, named = (
+        study_cells.load(studies.write(tmp_path, one))
+        for one in (keys, {**keys, "tasks": ["reach"]})
+    )
+    assert isinstance(made, StudyRecipe) and isinstance(named, StudyRecipe)
+    assert study_cells.places(made) == (name,) and study_cells.places(named) == ("reach",)
+    cells = [
+        study_cells.cell(one, "naive", at, 1, 1e-3) for one, at in ((made, name), (named, "reach"))
+    ]
+    assert cells[0] == cells[1]
+    assert study_cells.written_out(made)["tasks"] is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "found", "fix"),
+    [
+        ({"tasks": None}, "no key 'tasks', and no demonstrations", "add the line 'tasks: [reach]'"),
+        (
+            {"tasks": None, "shared": {"demos": {"path": "arm"}}},
+            "tuning.task: reach without tasks",
+            "delete tuning.task",
+        ),
+        ({"max_error_rise": -0.1}, "max_error_rise: -0.1", "its default is 0.02"),
+    ],
+)
+def test_what_a_study_of_demonstrations_lacks_is_refused(
+    changes: dict[str, Any], found: str, fix: str, tmp_path: Path
+) -> None:
+    with pytest.raises(AegisError) as caught:
+        study_cells.load(studies.write(tmp_path, studies.raw("embedded") | changes))
+    assert found in caught.value.found and fix in caught.value.fix
+
+
+def test_what_nothing_limits_is_no_share_however_few_units_there_are() -> None:
+    """A squared error may be of any size: a share's interval says nothing of it."""
+    seeds = [Units(np.array([0.4, 0.5, level]), np.ones(3)) for level in (0.6, 0.7)]
+    wide, own = crossed_interval(seeds), crossed_interval([replace(s, reach=None) for s in seeds])
+    assert wide is not None and own is not None
+    assert wide[0] < own[0] and own[0] > 0.3 and own[1] < 0.8 < wide[1]
