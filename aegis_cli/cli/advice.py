@@ -21,7 +21,7 @@ from aegis_cli.recipes import (
     options,
 )
 from aegis_cli.recipes.policy import CONSTANT
-from aegis_cli.recipes.study_cells import cell
+from aegis_cli.recipes.study_cells import cell, places
 from aegis_cli.recipes.variants import SECTIONS
 
 _SCENES = "scenes"
@@ -68,7 +68,7 @@ def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
         of_questions(asked.backbone, asked.probe.only_set)
         return
     # Here a variant may have an anchor of its own. Tasks and seeds ask the same.
-    place, seed = recipe.tasks[0], recipe.seeds[0]
+    place, seed = places(recipe)[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():
         one = cell(recipe, name, place, seed, variant.values[0])
         names = list(_asked(one))

@@ -1367,7 +1367,7 @@ def _save_frontier(report: Any) -> None:
     if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
-        render.note("no frontier.png: every training diverged, or none can be rolled out")
+        render.note("no frontier.png: every training diverged, or nothing tells how well they act")
 
 
 @app.command(short_help="Compare the methods' step times and peak memory.")

@@ -575,6 +575,20 @@ def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
     return np.array(numbers, dtype=np.int64)
 
 
+def held_out_of(path: Path, only: str | None, validation_share: float, seed: int) -> list[int]:
+    """The numbers of the episodes of these that a training of this seed is validated on.
+
+    Args:
+        only: as `demos.only` says.
+
+    Raises:
+        AegisError: episodes that are not there.
+    """
+    own = learned_from(path, count_episodes(path), only)
+    numbers: list[int] = own[held_out(len(own), validation_share, seed)].tolist()
+    return sorted(numbers)
+
+
 def held_out(episodes: int, validation_share: float | None, seed: int) -> np.ndarray:
     """The numbers of the episodes that a training with this share and seed is validated on.
 

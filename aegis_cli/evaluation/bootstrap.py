@@ -30,7 +30,7 @@ class Units:
         values: [N] float64, each unit's sum.
         counts: [N] float64, how many questions or episodes each sum is of.
         draw: seeds of the same draw were measured on the same units, in the same order.
-        reach: how far two questions or episodes can be apart.
+        reach: how far two questions or episodes can be apart; None where nothing limits it.
         sure: whether nothing else could have come out, as of a model that has not moved.
         names: N names by which units are known in other draws too; None where no other draw has
             them.
@@ -39,7 +39,7 @@ class Units:
     values: np.ndarray
     counts: np.ndarray
     draw: int = 0
-    reach: float = 100.0
+    reach: float | None = 100.0
     sure: bool = False
     names: tuple[str, ...] | None = None
 
@@ -102,8 +102,12 @@ def _of_few(seeds: Sequence[Units]) -> tuple[float, float]:
     """How far below and above the mean an interval of shares reaches; nothing where many differ.
 
     An image's questions share its difficulty, so that they are one look and not several; so do the
-    looks of several seeds at one image. Shares count in units of `reach`.
+    looks of several seeds at one image. Shares count in units of `reach`, and what is not limited
+    is no share.
     """
+    reach = seeds[0].reach
+    if reach is None:
+        return 0.0, 0.0
     import numpy as np
 
     from aegis_cli.data.vqa.metrics import mean_loss_interval  # loads torch
@@ -120,10 +124,10 @@ def _of_few(seeds: Sequence[Units]) -> tuple[float, float]:
     if sum(any(mean != common for mean in own) for own in looks.values()) >= FEW:
         return 0.0, 0.0
     # How far each unit is from the common outcome, its looks averaged, as a share of `reach`.
-    apart = np.array([sum(own) / len(own) - common for own in looks.values()]) / seeds[0].reach
+    apart = np.array([sum(own) / len(own) - common for own in looks.values()]) / reach
     low, high = mean_loss_interval(apart.clip(-1, 1), range(len(apart)))
     middle = float(apart.clip(-1, 1).mean())
-    return (middle - low) * seeds[0].reach, (high - middle) * seeds[0].reach
+    return (middle - low) * reach, (high - middle) * reach
 
 
 def _units(one: Units) -> list[Hashable]:

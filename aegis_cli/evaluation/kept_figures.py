@@ -136,6 +136,17 @@ class InstructionFigures:
 
 
 @dataclass(frozen=True)
+class EpisodeFigures:
+    """One episode of an open-loop evaluation."""
+
+    episode: int
+    frames: int
+    steps: int
+    relative_error: Number | None = None
+    hold_error: Number | None = None
+
+
+@dataclass(frozen=True)
 class OpenLoopFigures:
     """An open-loop evaluation."""
 
@@ -148,6 +159,7 @@ class OpenLoopFigures:
     relative_interval: Interval = None
     hold_error: Number | None = None
     instructions: list[InstructionFigures] | None = None
+    episode_errors: list[EpisodeFigures] | None = None
     chunk: int | None = None
     fps: Number | None = None
     seed: int | None = None

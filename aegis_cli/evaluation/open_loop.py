@@ -95,6 +95,20 @@ class InstructionError:
     hold_error: float | None
 
 
+@dataclass(frozen=True)
+class EpisodeError:
+    """The error in one episode, over all dimensions and steps of the chunks that begin in it.
+
+    `steps` counts those of all its chunks, of which the errors are means.
+    """
+
+    episode: int
+    frames: int
+    steps: int
+    relative_error: float | None
+    hold_error: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """An episode as a plot shows it; `predicted` [T, A] is new every `replan` frames."""
@@ -122,6 +136,7 @@ class OpenLoopReport:
         fps: steps of a chunk per second, which is the control rate of the demonstrations; None
             where they do not say.
         instructions: the same of each instruction that the frames have, the worst first.
+        episode_errors: the same of each episode, in the order of `episodes`.
         traces: what a plot shows; empty unless asked for.
     """
 
@@ -139,6 +154,7 @@ class OpenLoopReport:
     horizon: list[StepError]
     fps: float | None = None
     instructions: list[InstructionError] = dataclasses.field(default_factory=list)
+    episode_errors: list[EpisodeError] = dataclasses.field(default_factory=list)
     traces: list[Trace] = dataclasses.field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
@@ -148,7 +164,7 @@ class OpenLoopReport:
         return found
 
     def kept(self) -> dict[str, Any]:
-        """What a run keeps of it: figures of all dimensions and steps, and of each instruction."""
+        """What a run keeps of it: the error, by instruction and by episode."""
         found = self.to_json()
         return {name: value for name, value in found.items() if name not in _BY_PART}
 
@@ -623,6 +639,7 @@ def compare(
         horizon=_horizon(relative, held, valid),
         fps=shown.fps,
         instructions=_instructions(shown, at, relative, held, valid),
+        episode_errors=_episodes(errors.episode_of, relative, held, valid),
     )
 
 
@@ -691,6 +708,26 @@ def _horizon(
             own = None if relative is None else float(relative[rows, h].mean())
             hold = None if held is None else float(held[rows, h].mean())
             found.append(StepError(h + 1, int(rows.sum()), own, hold))
+    return found
+
+
+def _episodes(
+    episode_of: np.ndarray, relative: np.ndarray | None, held: np.ndarray | None, valid: np.ndarray
+) -> list[EpisodeError]:
+    """One entry per episode; a chunk counts for that in which it begins."""
+    found = []
+    for episode in np.unique(episode_of):
+        rows = episode_of == episode
+        own = valid[rows]
+        found.append(
+            EpisodeError(
+                episode=int(episode),
+                frames=int(rows.sum()),
+                steps=int(own.sum()),
+                relative_error=mean(None if relative is None else relative[rows], own),
+                hold_error=mean(None if held is None else held[rows], own),
+            )
+        )
     return found
 
 

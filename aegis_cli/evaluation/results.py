@@ -362,8 +362,10 @@ def open_loops(run: Path) -> list[Result]:
     """
     found = dict[str, Result]()
     for _, one in _read(run, OPEN_LOOP, OpenLoopFigures):
-        # The path of the data may be written in several ways.
-        told = {name: value for name, value in one.figures.items() if name != "data"}
+        # The path of the data may be written in several ways, and an earlier version did not tell
+        # single episodes.
+        vary = ("data", "episode_errors")
+        told = {name: value for name, value in one.figures.items() if name not in vary}
         found.setdefault(files.canonical(told), one)
     return sorted(found.values(), key=lambda one: one.figures["split"] != VALIDATION)
 

@@ -88,10 +88,14 @@ class Tuning:
     """How each variant's knob is chosen; needed where a variant has one.
 
     Among the values whose validation success is near the best of `naive`, it is the one with the
-    highest validation accuracy.
+    highest validation accuracy. Where nothing can be rolled out, the open-loop error takes the
+    place of success, on episodes that the tuning's seed holds out and none of the seeds that are
+    compared.
     """
 
-    task: str = key(TASK, default="reach", doc="Task that the knobs are chosen on.")
+    task: str = key(
+        TASK, default="reach", doc="Task that the knobs are chosen on, in a study of tasks."
+    )
     seed: int = key(
         SEED, default=1000, doc="Seed of the trainings; it is none of the seeds that are compared."
     )
@@ -102,7 +106,8 @@ class Tuning:
     within: float = key(
         NOT_NEGATIVE,
         default=3.0,
-        doc="How far from the best success a value may be, in percentage points.",
+        doc="How far from the best success a value may be, in percentage points, or from the least "
+        "open-loop error in hundredths.",
     )
     runs: int | None = key(
         POSITIVE,
@@ -117,10 +122,16 @@ class StudyRecipe:
     """Compares variants of methods over tasks and seeds, each at the best value of its knobs."""
 
     name: str = key(FOLDER_NAME, doc="Name of the study; it is written to runs/NAME.")
-    tasks: tuple[str, ...] = key(TASK, doc="Tasks that variants are compared on.")
     seeds: tuple[int, ...] = key(SEED, doc="Seeds of the trainings that are compared.")
     variants: dict[str, PolicyVariant] = key(
         _SOME, doc="What is compared: a name for each variant."
+    )
+    tasks: tuple[str, ...] | None = key(
+        TASK,
+        default=None,
+        later=True,
+        doc="Tasks that variants are compared on. Null: the demonstrations that demos.path names, "
+        "as of a robot that is not simulated here; tables and folders have their name.",
     )
     shared: dict[str, Any] = key(
         factory=dict, doc="Keys of a recipe of kind policy, for every training."
@@ -134,6 +145,15 @@ class StudyRecipe:
     )
     keep_runs: bool = key(
         default=False, doc="Keep the checkpoints of trainings that have been measured."
+    )
+    max_error_rise: float = key(
+        NOT_NEGATIVE,
+        default=0.02,
+        later=True,
+        shapes=False,
+        doc="Where nothing can be rolled out: how far above naive's a variant's open-loop error "
+        "may be to pass the bar, as a share of the actions' variance. One policy's error moved by "
+        "as much on 16 episodes where its flow began with other noise.",
     )
 
 

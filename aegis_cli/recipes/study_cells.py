@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,10 @@ from aegis_cli.recipes.studies import PER_SEED
 NAIVE, ISOLATED, ZERO_SHOT = "naive", "isolated-lora", "zero-shot"
 # One of half the rank, if there is one: what iGSP's smaller experts reach without sharing.
 HALF = "isolated-lora-half"
+
+
+_LONGEST_NAME = 100  # bytes of a folder's name
+_TAKEN = {"tuning", "stages"}  # what else a study's folder has
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,8 @@ def cell(
     """The recipe of one training.
 
     Args:
-        place: the task or stream; of a stream of robot tasks its tasks.
+        place: the task or stream; of a stream of robot tasks its tasks. In a study without tasks
+            it is but a name.
         value: what the variant's knob is set to, if it has one.
 
     Raises:
@@ -134,12 +140,35 @@ def cell(
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
     # Last, for they win against what `shared` and the variant say.
-    raw |= {"name": study.name, rules.place: place, "seed": seed}
+    raw |= {"name": study.name, "seed": seed}
+    if not isinstance(study, StudyRecipe) or study.tasks is not None:
+        raw[rules.place] = place
     for dotted in _drawn(study):
         put(raw, dotted, seed)
     made: Recipe | StreamRecipe | RobotStreamRecipe = build(rules.recipe, raw, problems)
     refuse(problems or list(rules.together(made)), f"variant {variant} of {study.name}")
     return made
+
+
+def places(study: StudyRecipe) -> tuple[str, ...]:
+    """The tasks of a study, or a name for the demonstrations that all its cells are given.
+
+    It is that of their file or folder, in the characters that a folder of the study may have.
+    """
+    if study.tasks is not None:
+        return study.tasks
+    given = study.shared.get("demos", {}).get("path") or ()
+    names = [_name_of(path) for path in ([given] if isinstance(given, str) else given)]
+    name = "+".join(filter(None, names)).encode()[:_LONGEST_NAME].decode(errors="ignore")
+    if name in _TAKEN:
+        name += "-demos"
+    return (name or "demonstrations",)
+
+
+def _name_of(path: str) -> str:
+    at = Path(path)
+    name = at.stem if at.suffix == ".safetensors" else at.name
+    return re.sub(r"[^\w.+-]+", "_", name).strip("._")
 
 
 def load_any(path: str | Path) -> AnyRecipe:
@@ -271,6 +300,34 @@ def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
                     yield f"variants.{name}.{part}: {key}: {own[key]}"
 
 
+def _place_problems(raw: Mapping[str, Any]) -> list[Problem]:
+    """What a study without tasks lacks, or says of them all the same."""
+    if raw.get("tasks") is not None:
+        return []
+    named, given = raw.get("variants"), [*_given_demos(raw)]
+    own = [f"variants.{name}." for name in (named if isinstance(named, dict) else ())]
+    everywhere = own and all(any(where.startswith(name) for where in given) for name in own)
+    if not everywhere and not any(where.startswith("shared") for where in given):
+        return [
+            Problem(
+                "no key 'tasks', and no demonstrations",
+                "'tasks', or demonstrations of your robot (shared: demos.path)",
+                "add the line 'tasks: [reach]'",
+            )
+        ]
+    tuning = raw.get("tuning")
+    if isinstance(tuning, dict) and tuning.get("task") is not None:
+        return [
+            Problem(
+                f"tuning.task: {tuning['task']} without tasks",
+                "the demonstrations that the study compares on, to tune on as well",
+                "delete tuning.task",
+                line_of(tuning, "task"),
+            )
+        ]
+    return []
+
+
 def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
     """A gate of one run; a study says of every variant whether it passes its bar."""
     shared = raw.get("shared")
@@ -357,6 +414,7 @@ _CELL_RULES: Mapping[type, _CellRules] = {
         tuning_keys="task, seed, questions, episodes, within, runs",
         together=_together,
         problems=lambda raw: [
+            *_place_problems(raw),
             *_gate_problems(raw),
             *_drawn_problems(raw),
             *_reference_problems(raw),

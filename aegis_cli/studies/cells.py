@@ -42,11 +42,14 @@ class Cell(Generic[R]):
     Attributes:
         label: its run folder below the study's.
         validation: whether it is measured on the validation split.
+        judging: with `validation`, the seeds of the compared cells: on episodes that these hold
+            out, nothing is tuned.
     """
 
     label: str
     recipe: R
     validation: bool = False
+    judging: tuple[int, ...] = ()
 
 
 class CellRunner(Protocol[R]):

@@ -16,7 +16,7 @@ from operator import attrgetter, sub
 from typing import Annotated, Any
 
 from aegis_cli.evaluation.bootstrap import Units
-from aegis_cli.recipes import Pairs, PolicyVariant, Variant
+from aegis_cli.recipes import Pairs, PolicyVariant, StudyRecipe, Variant
 from aegis_cli.recipes.study_cells import HALF, ISOLATED, NAIVE, ZERO_SHOT
 from aegis_cli.studies.figures import (
     Divergence,
@@ -40,6 +40,7 @@ from aegis_cli.studies.metrics import (
     at_least,
     at_most,
     bar,
+    below,
     lowest,
     measure,
     over_seeds,
@@ -151,6 +152,44 @@ def _held_out_share(figures: PolicyFigures) -> Units | None:
     return _episodes(figures.outcomes_held_out, figures.rollout_seed, 1.0)
 
 
+def _error_by_episode(figures: PolicyFigures) -> Units | None:
+    """The open-loop error, one unit per held-out episode."""
+    return _evaluated(figures, figures.error_per_episode)
+
+
+def _error_over_still(figures: PolicyFigures) -> float | None:
+    """The open-loop error less that which needs no policy: of holding, or of the mean action."""
+    if figures.open_loop_error is None:
+        return None
+    return figures.open_loop_error - _without_policy(figures)
+
+
+def _over_still_by_episode(figures: PolicyFigures) -> Units | None:
+    found = _evaluated(figures, figures.error_per_episode)
+    if found is None:
+        return None
+    if figures.hold_error != _without_policy(figures):  # the mean action's, 1 in any episode
+        return dataclasses.replace(found, values=found.values - found.counts)
+    held = _evaluated(figures, figures.hold_per_episode)
+    return None if held is None else found.minus(held)
+
+
+def _without_policy(figures: PolicyFigures) -> float:
+    """The lesser error of holding the position and of always the mean action, which has 1."""
+    return 1.0 if figures.hold_error is None else min(1.0, figures.hold_error)
+
+
+def _evaluated(figures: PolicyFigures, errors: Sequence[float] | None) -> Units | None:
+    """Errors in held-out episodes; another seed may have held out some of the same ones."""
+    names, weights = figures.evaluated_episodes, figures.weight_per_episode
+    if errors is None or names is None or weights is None:  # an earlier version measured the cell
+        return None
+    import numpy as np
+
+    counts = np.array(weights, np.float64)
+    return Units(counts * np.array(errors, np.float64), counts, reach=None, names=names)
+
+
 def _episodes(outcomes: str | None, seed: int, whole: float = 100.0) -> Units | None:
     """Successes, one unit per episode, from one character per episode.
 
@@ -172,9 +211,13 @@ class PolicyResult:
     Shares are in [0, 1], `_points` in percentage points, cross-entropy in nats. On a task measured
     by its return, `return_share` (1: the highest there is) takes the place of successes and
     `return_gain_points` of their gains. Where nothing can be rolled out there is an
-    `open_loop_error` instead.
+    `open_loop_error` instead, of which 1 is that of always the mean action, and
+    `open_loop_difference` is how much more it is than naive's.
 
     Attributes:
+        hold_error: the error of a robot that holds its position, where actions are positions.
+        open_loop_over_still: the error less that which needs no policy: the lesser of `hold_error`
+            and 1.
         diverged: the seeds whose training did, which no mean counts and which cost the bar.
         step_time: ratio to naive's training step, or to that of `against`; so is `peak_memory`.
         bar: None for naive and for methods that train on VQA data.
@@ -264,7 +307,39 @@ class PolicyResult:
             sure=_stands_still,
         ),
     ] = None
-    open_loop_error: Annotated[Mean, Metric("Open-loop error", 3, more_is_better=False)] = None
+    open_loop_error: Annotated[
+        Mean,
+        Metric(
+            "Open-loop error",
+            3,
+            axis="open-loop error on held-out episodes",
+            units=_error_by_episode,
+            more_is_better=False,
+        ),
+    ] = None
+    hold_error: Annotated[Mean, Metric("Holding's error", 3)] = None
+    open_loop_difference: Annotated[
+        Mean,
+        Contrast(
+            "Error - naive's",
+            3,
+            signed=True,
+            of=attrgetter("open_loop_error"),
+            against=NAIVE,
+            compare=sub,
+            units=_error_by_episode,
+        ),
+    ] = None
+    open_loop_over_still: Annotated[
+        Mean,
+        Metric(
+            "Error - no policy's",
+            3,
+            signed=True,
+            of=_error_over_still,
+            units=_over_still_by_episode,
+        ),
+    ] = None
 
     @property
     def questions(self) -> float:
@@ -276,13 +351,32 @@ class PolicyResult:
 # well, generalises better, and costs no more: each by the worse end of its interval. A task that is
 # measured by its return has no colours to generalise to, and so no verdict but by a demand that
 # fails.
-POLICY_BAR = (
-    Demand("VQA drop", "drop_points", at_most(0.1, "points")),
-    Demand("success seen - naive", "seen_gain_points", at_least(-1, "point")),
-    Demand("success held-out - naive", "held_out_gain_points", above(0, "points")),
+_KEEPS = Demand("VQA drop", "drop_points", at_most(0.1, "points"))
+_COSTS_NO_MORE = (
     Demand("step time", "step_time", at_most(1.02, "x naive")),
     Demand("VQA questions in training", "questions", Limit("none", lambda count: count == 0)),
 )
+POLICY_BAR = (
+    _KEEPS,
+    Demand("success seen - naive", "seen_gain_points", at_least(-1, "point")),
+    Demand("success held-out - naive", "held_out_gain_points", above(0, "points")),
+    *_COSTS_NO_MORE,
+)
+
+
+def open_loop_bar(most: float) -> tuple[Demand, ...]:
+    """The bar where nothing can be rolled out, so that no success is known.
+
+    The open-loop error may surely be no more than `most` above naive's. A naive that has learned
+    nothing would be matched by anything, so that the error has to be below what needs no policy,
+    too. It tells nothing of other colours.
+    """
+    return (
+        _KEEPS,
+        Demand("open-loop error - naive's", "open_loop_difference", at_most(most, "of variance")),
+        Demand("open-loop error - no policy's", "open_loop_over_still", below(0, "of variance")),
+        *_COSTS_NO_MORE,
+    )
 
 
 @dataclass(frozen=True)
@@ -356,6 +450,7 @@ def task_results(
     values: Mapping[str, Any],
     costs: Mapping[str, Cost],
     ceilings: Collection[str],
+    max_error_rise: float = StudyRecipe.max_error_rise,
 ) -> TaskResults:
     """One task's table.
 
@@ -364,11 +459,14 @@ def task_results(
         values: variant -> what its knob is set to.
         costs: variant -> ratios to naive; empty where there is no naive.
         ceilings: variants that train on VQA data.
+        max_error_rise: how far an open-loop error may be above naive's.
     """
     samples: dict[str, Sample] = {}
     for name, own in found.items():
         figures = {(task, seed): row for seed, row in own.items() if measured(row)}
         samples[name] = Sample(figures)
+    rows = [row for sample in samples.values() for row in sample.figures.values()]
+    demands = open_loop_bar(max_error_rise) if _only_evaluated(rows) else POLICY_BAR
     results, pairs = [], list[tuple[PolicyFigures, PolicyFigures]]()
     for name, own in found.items():
         variant = variants[name]
@@ -393,7 +491,7 @@ def task_results(
             against=variant.against,
         )
         if not variant.is_plain(NAIVE) and name not in ceilings:
-            made = dataclasses.replace(made, bar=bar(POLICY_BAR, made))
+            made = dataclasses.replace(made, bar=bar(demands, made))
         results.append(made)
     asked = _each_probed(samples.values())
     return TaskResults(
@@ -405,6 +503,12 @@ def task_results(
         compared=len(pairs),
         across_versions=sum(one.code != other.code for one, other in pairs),
     )
+
+
+def _only_evaluated(rows: Sequence[PolicyFigures]) -> bool:
+    """Whether an open-loop error is all that is known of how policies act."""
+    acted = any(row.success_seen is not None or row.return_share is not None for row in rows)
+    return not acted and any(row.open_loop_error is not None for row in rows)
 
 
 def _pairs(sample: Sample, reference: Sample) -> list[tuple[PolicyFigures, PolicyFigures]]:

@@ -49,6 +49,10 @@ class PolicyFigures:
             held-out episodes over their variance in training; 1 is that of always the mean action.
             Of several data sets, the mean of theirs.
         hold_error: the same of a robot that holds its position, where actions are positions.
+        evaluated_episodes: the held-out episodes, each `SET/NUMBER` with the data set's place among
+            several, from 1.
+        weight_per_episode: the share that each has in these errors; together 1.
+        error_per_episode, hold_per_episode: the errors in each.
         code: version and digest of the package that measured the cell.
     """
 
@@ -71,6 +75,10 @@ class PolicyFigures:
     return_share: float | None = None
     open_loop_error: float | None = None
     hold_error: float | None = None
+    evaluated_episodes: tuple[str, ...] | None = None
+    weight_per_episode: tuple[float, ...] | None = None
+    error_per_episode: tuple[float, ...] | None = None
+    hold_per_episode: tuple[float, ...] | None = None
     lost_per_image: tuple[int, ...] | None = None
     questions_per_image: tuple[int, ...] | None = None
     images: tuple[str, ...] | None = None

@@ -250,6 +250,7 @@ _SIGNS: dict[str, Callable[[float, float], bool]] = {
     "<=": lambda value, limit: value <= limit + ROUNDING,
     ">=": lambda value, limit: value >= limit - ROUNDING,
     ">": lambda value, limit: value > limit + ROUNDING,
+    "<": lambda value, limit: value < limit - ROUNDING,
 }
 _ALL_DECIMALS = 9  # what differs by less than ROUNDING is judged alike
 
@@ -378,6 +379,11 @@ def at_least(limit: float, unit: str) -> Limit:
 def above(limit: float, unit: str) -> Limit:
     """A figure that is surely above `limit`: the lower end of its interval is."""
     return Limit(f"> {limit:g} {unit}", lambda found: _reaches(found, -1, limit + ROUNDING))
+
+
+def below(limit: float, unit: str) -> Limit:
+    """A figure that is surely below `limit`: the upper end of its interval is."""
+    return Limit(f"< {limit:g} {unit}", lambda found: _reaches(found, 1, limit - ROUNDING))
 
 
 def _reaches(found: Estimate | float, side: int, limit: float) -> bool | None:

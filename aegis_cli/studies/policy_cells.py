@@ -9,6 +9,7 @@ import dataclasses
 import shutil
 import statistics
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -17,7 +18,7 @@ from aegis_cli.anchors import measure
 from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress, Warned
-from aegis_cli.data import mixture
+from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
@@ -57,6 +58,8 @@ from aegis_cli.training import checkpoint, loading, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
+_OTHER_SEEDS = 100  # that are tried where the tuning's leaves it no episode of its own
+
 # The files of a checkpoint that a probe or rollout reads.
 POLICY = ("backbone/model.safetensors", "expert.safetensors")
 
@@ -71,7 +74,8 @@ class PolicyStudy:
     def __init__(self, recipe: StudyRecipe) -> None:
         self.recipe = recipe
         self.make_runner: MakeRunner[Recipe] = PolicyRunner
-        self.places: Sequence[str] = recipe.tasks
+        self.places: Sequence[str] = study_cells.places(recipe)
+        self._has_warned = False
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> Recipe:
         """The recipe of one policy on one task."""
@@ -79,11 +83,11 @@ class PolicyStudy:
 
     def trial(self, variant: str, value: Any) -> Recipe:
         """The recipe by which a knob's value is judged."""
-        tuning = self.recipe.tuning or Tuning(task=self.recipe.tasks[0])
+        tuning = self.recipe.tuning or Tuning(task=self.places[0])
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
         played = dataclasses.replace(recipe.rollout, episodes=tuning.episodes)
-        if sim.has_colors(tuning.task):
+        if sim.has_colors(recipe.task):
             played = dataclasses.replace(played, colors=("seen",))
         return dataclasses.replace(recipe, probe=asked, rollout=played)
 
@@ -91,19 +95,20 @@ class PolicyStudy:
         """Check the study before any work.
 
         Raises:
-            AegisError: a task that is not there, or values that are to be chosen by the success of
-                policies that cannot be rolled out.
+            AegisError: a task that is not there, or values that are to be chosen where nothing
+                tells how well all of them act.
         """
         for recipe in trials:
             track.check(recipe)
         tuning = self.recipe.tuning
         recorded = any(recipe.demos.path is None for recipe in trials)
-        for task in (*self.places, *([tuning.task] if tuning else [])):
+        named = [*self.places, *([tuning.task] if tuning else [])] if self.recipe.tasks else []
+        for task in named:
             if recorded:
                 sim.check_recordable(task)
             sim.check(task)
         if tuning is not None:
-            _check_playable(trials)
+            _check_tunable(trials, self.recipe.seeds)
 
     def prepare(self, runner: PolicyRunner, cells: Sequence[Cell[Recipe]], together: bool) -> None:
         """Check questions and demonstrations; record and measure what processes would share.
@@ -116,6 +121,7 @@ class PolicyStudy:
         for cell in cells:
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 runner.check_questions(cell.recipe, split)
+        self._warn_of_tasks(cells, runner.on_event)
         # To load a backbone and demonstrations takes long, so each combination is checked once.
         distinct = {}
         for cell in cells:
@@ -128,6 +134,23 @@ class PolicyStudy:
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
 
+    def _warn_of_tasks(self, cells: Sequence[Cell[Recipe]], on_event: OnEvent) -> None:
+        """Warn once of tasks that nothing is played on, which a table would seem to be of."""
+        tasks = self.recipe.tasks
+        if tasks is None or self._has_warned:
+            return
+        others = [cell.recipe for cell in cells if not playable_colors(cell.recipe)]
+        if others:
+            self._has_warned = True
+            text = (
+                f"policies of {mixture.said(mixture.at(_path(others[0])))} cannot be rolled out "
+                f"here, so that tasks: [{', '.join(tasks)}] is but a name: without 'tasks' and "
+                "tuning.task, tables and folders have the demonstrations' name"
+            )
+            if set(tasks) == {Recipe.task}:  # the default, which cells without one have
+                text += ", and what is finished stays finished"
+            on_event(Warned("study", text))
+
     def point(self, variant: str, value: Any, found: PolicyFigures | Divergence) -> PolicyPoint:
         """What a knob's value led to."""
         own = self.recipe.variants[variant]
@@ -136,7 +159,15 @@ class PolicyStudy:
         if isinstance(found, Divergence):
             return PolicyPoint(variant, method, value, None, None, None)
         success = found.success_seen if found.return_share is None else found.return_share
-        return PolicyPoint(variant, method, value, found.accuracy, found.baseline_accuracy, success)
+        return PolicyPoint(
+            variant,
+            method,
+            value,
+            found.accuracy,
+            found.baseline_accuracy,
+            success,
+            open_loop_error=found.open_loop_error,
+        )
 
     def _sets(self) -> tuple[str | None, ...]:
         """The sets of questions that have a table each; one alone is not named."""
@@ -173,7 +204,7 @@ class PolicyStudy:
     def _first(self, variant: str, chosen: Mapping[str, Any]) -> Recipe:
         """The recipe of a variant's first cell, whose costs stand for those of all its cells."""
         study = self.recipe
-        return self.cell(variant, study.tasks[0], study.seeds[0], chosen[variant])
+        return self.cell(variant, self.places[0], study.seeds[0], chosen[variant])
 
     def _measure_costs(
         self, store: CellStore[Recipe], made: Mapping[str, Recipe], names: Collection[str]
@@ -197,12 +228,13 @@ class PolicyStudy:
         study = self.recipe
         ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
         tables = []
-        for task in study.tasks:
+        for task in self.places:
             found = findings.at(task)
             for vqa in self._sets() if found else ():
                 asked = {name: _asked(own, vqa) for name, own in found.items()}
                 chosen, costs = findings.chosen, findings.costs
-                table = task_results(task, asked, study.variants, chosen, costs, ceilings)
+                most = study.max_error_rise
+                table = task_results(task, asked, study.variants, chosen, costs, ceilings, most)
                 tables.append(dataclasses.replace(table, vqa=vqa))
         return StudyReport(
             name=study.name,
@@ -210,18 +242,24 @@ class PolicyStudy:
             cells=store.total,
             seeds=list(study.seeds),
             tasks=tables,
-            tuning_task=None if study.tuning is None else study.tuning.task,
+            tuning_task=self._tuned_on(),
             within=None if study.tuning is None else study.tuning.within,
             tuning=findings.points,
             out=str(store.folder),
             costs_on=sorted({cost.machine for cost in findings.costs.values() if cost.machine}),
         )
 
+    def _tuned_on(self) -> str | None:
+        """The task that the knobs are chosen on, or the name of the demonstrations."""
+        if self.recipe.tuning is None:
+            return None
+        return self.recipe.tuning.task if self.recipe.tasks else self.places[0]
+
     def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:
         """Whether a variant trains on VQA data, at the values of its knobs that were chosen."""
         study = self.recipe
         value = chosen.get(variant, study.variants[variant].values[0])
-        return bool(_trained_on(self.cell(variant, study.tasks[0], study.seeds[0], value)))
+        return bool(_trained_on(self.cell(variant, self.places[0], study.seeds[0], value)))
 
 
 def _runner(store: CellStore[Recipe]) -> PolicyRunner:
@@ -246,19 +284,55 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
     return found
 
 
-def _check_playable(trials: Sequence[Recipe]) -> None:
-    read = ((r.demos.path, r.demos.selection, r.task) for r in trials if r.demos.path is not None)
-    for path, chosen, named in dict.fromkeys(read):
-        given = mixture.at(path)
-        if mixture.playable_task(given, chosen.camera, named, chosen.rename) is None:
-            raise AegisError(
-                f"'tuning' with demonstrations in {mixture.said(given)}, whose policies cannot be "
-                "rolled out here",
-                "demonstrations of a simulated task seen by one camera, since values are chosen "
-                "by success",
-                "delete 'tuning' and put the values under 'set', or tune on demonstrations of a "
-                "simulated task; if they are LIBERO's, name its suite as tuning.task",
-            )
+def _check_tunable(trials: Sequence[Recipe], judging: Sequence[int]) -> None:
+    """Raise AegisError where values cannot be chosen by how well their policies act."""
+    played = [recipe for recipe in trials if playable_colors(recipe)]
+    others = [recipe for recipe in trials if recipe not in played]
+    if played and others:
+        given = mixture.said(mixture.at(_path(others[0])))
+        raise AegisError(
+            f"'tuning' with demonstrations in {given}, whose policies cannot be rolled out here, "
+            "and with others, whose policies can",
+            "values that are all chosen by success, or all by the open-loop error",
+            "give all variants demonstrations of one robot, or delete 'tuning' and put the values "
+            "under 'set'; if these are LIBERO's, name its suite as tuning.task",
+        )
+    for recipe in others:
+        for data in mixture.each(mixture.at(_path(recipe))):
+            if not tuning_episodes(recipe, data, judging):
+                raise _no_episode_to_tune_on(recipe, data, judging)
+
+
+def _no_episode_to_tune_on(recipe: Recipe, data: Path, judging: Sequence[int]) -> AegisError:
+    fix = "record more, hold out fewer by train.validation_share, or compare fewer seeds"
+    for seed in range(recipe.seed + 1, recipe.seed + _OTHER_SEEDS):
+        if tuning_episodes(dataclasses.replace(recipe, seed=seed), data, judging):
+            fix = f"set tuning.seed to {seed}, which has some, or record more demonstrations"
+            break
+    return AegisError(
+        f"no episode of '{data}' that tuning.seed {recipe.seed} holds out and none of the seeds "
+        f"{', '.join(map(str, judging))} does",
+        "some to choose values by, on which no policy is judged",
+        fix,
+    )
+
+
+def _path(recipe: Recipe) -> str | tuple[str, ...]:
+    """Where demonstrations lie that cannot be rolled out, which are never recorded here."""
+    assert recipe.demos.path is not None
+    return recipe.demos.path
+
+
+def tuning_episodes(recipe: Recipe, data: Path, judging: Sequence[int]) -> list[int]:
+    """The episodes that a trial has held out, and none of the compared trainings of its recipe.
+
+    Args:
+        judging: the seeds of these trainings.
+    """
+    only, share = recipe.demos.only, recipe.train.validation_share
+    held = {s: demonstrations.held_out_of(data, only, share, s) for s in (recipe.seed, *judging)}
+    judged = {episode for seed in judging for episode in held[seed]}
+    return [episode for episode in held[recipe.seed] if episode not in judged]
 
 
 def cell_key(
@@ -266,6 +340,7 @@ def cell_key(
     backbone_sha256: str,
     demos_sha256: str | None = None,
     vqa_state: Sequence[Mapping[str, Any]] = (),
+    judging: Sequence[int] = (),
 ) -> str:
     """Digest of all that shapes a cell's figures.
 
@@ -277,6 +352,7 @@ def cell_key(
     Args:
         demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
         vqa_state: of the question files that it reads, if any.
+        judging: seeds whose held-out episodes it must not be evaluated on.
     """
     key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
     for name in ("demos", "anchor", "probe", "rollout"):
@@ -284,6 +360,8 @@ def cell_key(
     # What is not there adds no key, so that cells of before there was any are still found.
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
+    if judging:
+        key["judging"] = sorted(judging)
     if demos_sha256 is not None:
         key["demos"] = {"sha256": demos_sha256, **recipes.drawn(cell.recipe)}
     return digest(key | ({"vqa": vqa_state} if any(vqa_state) else {}))
@@ -462,14 +540,26 @@ class PolicyRunner:
         """Digest of all that shapes what the cell leads to."""
         recipe = cell.recipe
         given = None if recipe.demos.path is None else self.demos(recipe).sha256
-        return cell_key(cell, self.backbone_sha256(recipe), given, self.vqa_state(recipe))
+        evaluated = cell.validation and not playable_colors(recipe)
+        return cell_key(
+            cell,
+            self.backbone_sha256(recipe),
+            given,
+            self.vqa_state(recipe),
+            cell.judging if evaluated else (),
+        )
 
     def measure(self, cell: Cell[Recipe]) -> PolicyFigures | Divergence:
         """The cell's figures. A training that diverges is a finding."""
         try:
-            return self.figures(cell.label, cell.recipe, cell.validation)
+            found = self.figures(cell.label, cell.recipe, cell.validation)
         except Diverged as end:
             return Divergence(end.good_steps)
+        if not cell.validation or playable_colors(cell.recipe):
+            return found
+        # A value is chosen by episodes of its own.
+        evaluated = self.open_loop_errors(cell.label, cell.recipe, cell.judging)
+        return dataclasses.replace(found, **evaluated.figures())
 
     def clear(self, label: str) -> None:
         """Remove the checkpoints, which are large and no result."""
@@ -486,8 +576,7 @@ class PolicyRunner:
 
         A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
         rolled out: its figures have neither success nor return, but its open-loop error on the
-        episodes that training has held out. No value is chosen by that, so none is measured for
-        tuning.
+        episodes that training has held out. With `validation` that is left to `measure`.
         """
         trained = self._trained(label, recipe)
         asked = self._asked(label, recipe, validation)
@@ -499,9 +588,9 @@ class PolicyRunner:
         # A task without colours has its figures under `seen`; a policy that cannot be rolled out
         # has none at all.
         seen, held_out = played.get("seen"), played.get("held-out")
-        error, hold = None, None
+        evaluated = OpenLoop()
         if not playable and not validation:
-            error, hold = self.open_loop_errors(label, recipe)
+            evaluated = self.open_loop_errors(label, recipe)
         return PolicyFigures(
             method=recipe.train.method,
             **vars(asked[first]),
@@ -509,8 +598,7 @@ class PolicyRunner:
             success_held_out=None if held_out is None else held_out["success"],
             wrong_target=None if seen is None else seen["wrong_target"],
             return_share=None if seen is None else seen["return_share"],
-            open_loop_error=error,
-            hold_error=hold,
+            **evaluated.figures(),
             energy_shed=trained["energy_shed_mean"],
             step_s=trained["step_s"],
             step_time_ratio=None,
@@ -761,43 +849,109 @@ class PolicyRunner:
         self.records.fresh(f"{label}/{name} {colors}", key, [path], make)
         return files.load_json(path)
 
-    def open_loop_errors(self, label: str, recipe: Recipe) -> tuple[float | None, float | None]:
+    def open_loop_errors(
+        self, label: str, recipe: Recipe, judging: Sequence[int] | None = None
+    ) -> OpenLoop:
         """The open-loop errors of the cell and of holding the position, on held-out episodes.
 
         With several sets of demonstrations each is the mean over the sets in which actions vary,
         and None where there is no such set. Holding has an error where it has one in all of them.
+
+        Args:
+            judging: seeds whose held-out episodes are left out, where a value is to be chosen.
         """
         given = self.demos(recipe)
         paths = mixture.each(given.path)
-        errors, holds = [], []
+        reports = {}
         for number, data in enumerate(paths, start=1):
-            report = self.evaluated(label, recipe, data, given.sha256, number)
+            episodes = None if judging is None else tuning_episodes(recipe, data, judging)
+            report = self.evaluated(label, recipe, data, given.sha256, number, episodes)
             # None where no action varied in training: there is no variance to measure by.
             if report["relative_error"] is not None:
-                errors.append(report["relative_error"])
-                holds.append(report["hold_error"])
-        if not errors:
-            return None, None
-        hold = None if None in holds else statistics.fmean(holds)
-        return statistics.fmean(errors), hold
+                reports[number] = report
+        return OpenLoop.of(reports)
 
     def evaluated(
-        self, label: str, recipe: Recipe, data: Path, demos_sha256: str, number: int
+        self,
+        label: str,
+        recipe: Recipe,
+        data: Path,
+        demos_sha256: str,
+        number: int,
+        episodes: Sequence[int] | None = None,
     ) -> dict[str, Any]:
-        """The open-loop report on one set of demonstrations, of that number from 1."""
+        """The open-loop report on one set of demonstrations, of that number from 1.
+
+        Args:
+            episodes: default: all that the training has held out.
+        """
         run = self._policy(label, recipe)
-        name = results.OPEN_LOOP if number == 1 else f"{results.OPEN_LOOP}-{number}"
+        name = results.OPEN_LOOP if episodes is None else f"{results.OPEN_LOOP}-validation"
+        name = name if number == 1 else f"{name}-{number}"
         path = run / f"{name}.json"
         key = {"policy": _sha256(run), "demos": demos_sha256, "number": number}
-        key |= recipes.selected(recipe)
+        key |= recipes.selected(recipe) | ({} if episodes is None else {"episodes": episodes})
 
         def make(on_event: OnEvent) -> None:
-            report = open_loop.run(run, data, on_event=on_event).kept()
+            report = open_loop.run(run, data, episodes, on_event=on_event).kept()
             files.save_json(path, report)
             track.tell(recipe, run, name, report, recipe.train.steps)
 
         self.records.fresh(f"{label}/{name}", key, [path], make)
         return files.load_json(path)
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Open-loop errors as `PolicyFigures` has them; None where nothing was measured."""
+
+    error: float | None = None
+    hold: float | None = None
+    episodes: tuple[str, ...] | None = None
+    weights: tuple[float, ...] | None = None
+    errors: tuple[float, ...] | None = None
+    holds: tuple[float, ...] | None = None
+
+    def figures(self) -> dict[str, Any]:
+        """The same by the names of `PolicyFigures`."""
+        return {
+            "open_loop_error": self.error,
+            "hold_error": self.hold,
+            "evaluated_episodes": self.episodes,
+            "weight_per_episode": self.weights,
+            "error_per_episode": self.errors,
+            "hold_per_episode": self.holds,
+        }
+
+    @classmethod
+    def of(cls, reports: Mapping[int, Mapping[str, Any]]) -> OpenLoop:
+        """What the reports on data sets tell together, by the sets' numbers."""
+        if not reports:
+            return cls()
+        each = list(reports.values())
+        held = [report["hold_error"] for report in each]
+        made = cls(
+            statistics.fmean(report["relative_error"] for report in each),
+            None if None in held else statistics.fmean(held),
+        )
+        # A report that an earlier version has kept does not tell single episodes.
+        if not all(report.get("episode_errors") for report in each):
+            return made
+        episodes, weights = list[str](), list[float]()
+        for number, report in reports.items():
+            steps = sum(one["steps"] for one in report["episode_errors"])
+            for one in report["episode_errors"]:
+                episodes.append(f"{number}/{one['episode']}")
+                weights.append(one["steps"] / (steps * len(reports)))  # each set counts alike
+        every = [one for report in each for one in report["episode_errors"]]
+        holds = None if made.hold is None else tuple(one["hold_error"] for one in every)
+        return dataclasses.replace(
+            made,
+            episodes=tuple(episodes),
+            weights=tuple(weights),
+            errors=tuple(one["relative_error"] for one in every),
+            holds=holds,
+        )
 
 
 def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:

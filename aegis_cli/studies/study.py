@@ -121,6 +121,7 @@ def planned(
         if kept.exists() and not overwrite:
             shutil.copy(kept, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
+        store.total = sum(map(len, tuned.values()))  # of which those that are known are delivered
         # In the order in which `run` measures them, so that a plan reads as the study will go.
         for own in tuned.values():
             for _, cell in own:
@@ -209,11 +210,13 @@ def trials(kind: StudyKind[R]) -> Trials[R]:
     They are made at once, so that a bad one is refused before any work.
     """
     made: dict[str, list[tuple[Any, Cell[R]]]] = {}
+    judging = tuple(kind.recipe.seeds)
     for name, variant in kind.recipe.variants.items():
         made[name] = []
         for value, folder in zip(variant.values, _folders(variant.values), strict=True):
             label = f"tuning/{name}/{folder}"
-            made[name].append((value, Cell(label, kind.trial(name, value), validation=True)))
+            recipe = kind.trial(name, value)
+            made[name].append((value, Cell(label, recipe, validation=True, judging=judging)))
     return made
 
 

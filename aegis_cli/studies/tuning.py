@@ -6,8 +6,9 @@ Each kind of study declares what ability and merit are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from aegis_cli.common.limits import ROUNDING
@@ -18,8 +19,8 @@ class PolicyPoint:
     """One value of a variant's knob (None: it has none), and its figures on the validation split.
 
     They are shares in [0, 1]. `success` is on seen colours or, on a task measured by its return,
-    its share of the highest return. It is None if the training diverged: what cannot be rolled out
-    is never tuned.
+    its share of the highest return. Of what cannot be rolled out `open_loop_error` takes its place,
+    on episodes that judge no compared cell. Both are None if the training diverged.
     """
 
     variant: str
@@ -29,6 +30,7 @@ class PolicyPoint:
     baseline_accuracy: float | None
     success: float | None
     chosen: bool = False
+    open_loop_error: float | None = None
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Rule:
     """Ability first, within a margin, and merit then.
 
     Attributes:
-        ability: a share in [0, 1]; None for a value that diverged.
+        ability: the more the better, in shares; None for a value that diverged.
         merit: what decides among able values; the highest is chosen.
         reference: the method whose best value sets the margin for all variants; without one, each
             variant's own best value does.
@@ -87,13 +89,26 @@ class Rule:
         return self.sentence.format(place=place, within=within)
 
 
+def _acts(point: PolicyPoint) -> float | None:
+    if point.success is not None:
+        return point.success
+    return None if point.open_loop_error is None else -point.open_loop_error
+
+
 POLICY_RULE: Rule = Rule(
-    ability=lambda point: point.success,
+    ability=_acts,
     merit=lambda point: point.accuracy or 0.0,
     sentence="by validation scenes and episodes of {place}: of a variant's values within "
     "{within:g} points of naive's best success, the one with the highest VQA accuracy; if none is "
     "within, the one with the highest success",
     reference="naive",
+)
+# The same rule, in the words of what cannot be rolled out.
+OPEN_LOOP_RULE = replace(
+    POLICY_RULE,
+    sentence="by validation questions, and episodes of {place} that judge no compared policy: of a "
+    "variant's values within {within:g} hundredths of naive's least open-loop error, the one with "
+    "the highest VQA accuracy; if none is within, the one with the least error",
 )
 STREAM_RULE: Rule = Rule(
     ability=lambda point: point.last,
@@ -126,8 +141,7 @@ def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> 
         compared = measures if rule.reference else own
         # One margin for all: a method may not buy accuracy with ability that the others keep.
         best = max(_ability(rule, point) for point in compared)
-        # At least 0, so that a value that diverged, whose ability is -1, is never an able one.
-        chosen[variant] = _best(rule, own, max(0, best - within / 100 - ROUNDING))
+        chosen[variant] = _best(rule, own, best - within / 100 - ROUNDING)
     return chosen
 
 
@@ -136,7 +150,8 @@ def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
     abilities = [_ability(rule, point) for point in own]
     merits = [rule.merit(point) for point in own]
     numbers = range(len(own))
-    able = [i for i in numbers if abilities[i] >= least]
+    # A value that diverged is never an able one, not even where all of the reference's did.
+    able = [i for i in numbers if -math.inf < abilities[i] >= least]
     if able:  # else the one nearest to it stands for the variant
         return max(able, key=lambda i: (merits[i], abilities[i]))
     return max(numbers, key=lambda i: (abilities[i], merits[i]))
@@ -145,4 +160,4 @@ def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
 def _ability(rule: Rule, point: Point) -> float:
     """The ability of a value; less than any other's if it diverged."""
     ability = rule.ability(point)
-    return -1.0 if ability is None else ability
+    return -math.inf if ability is None else ability

@@ -61,7 +61,7 @@ def test_a_recipe_is_warned_of_what_it_asks(real: str, said: Said) -> None:
 def test_a_study_is_warned_of_once(real: str, said: Said) -> None:
     variants = {"a": PolicyVariant(method="naive"), "b": PolicyVariant(method="aegis")}
     shared = {"backbone": real}
-    advice.of_run(StudyRecipe("s", ("reach",), (0, 1), variants, shared))
+    advice.of_run(StudyRecipe("s", (0, 1), variants, ("reach",), shared))
     assert said().count("warning") == 1
 
 

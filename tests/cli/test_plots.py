@@ -87,6 +87,25 @@ def test_up_and_right_is_better_and_an_arrow_says_so() -> None:
     assert to_x > x and to_y > y
 
 
+def test_where_nothing_is_rolled_out_right_is_less_error() -> None:
+    report = found(("naive", "a", "x"), by_error=True)
+    figure = frontier._figure(report)
+    axis = figure.axes[0]
+    first, last = axis.get_xlim()
+    assert first > last and axis.get_xlabel() == "open-loop error on held-out episodes"
+    assert "against open-loop error" in axis.get_title(loc="left")
+    stars = [line for line in axis.lines if line.get_marker() == "*"]
+    circles = [line for line in axis.lines if line.get_marker() == "o"]
+    for star, result in zip(stars, report.tasks[0].results, strict=True):
+        spot = (result.open_loop_error.mean, result.drop_points.mean)
+        assert (*star.get_xdata(), *star.get_ydata()) == pytest.approx(spot)
+    assert [line.get_xdata()[0] for line in circles] == [p.open_loop_error for p in report.tuning]
+    assert all(last < line.get_xdata()[0] < first for line in [*stars, *circles])
+    played = found(("naive", "a", "x"))
+    own = [frontier._named(frontier._tried(r), frontier._compared(r)) for r in (report, played)]
+    assert own[0] == own[1]  # the methods that no other beats
+
+
 def test_references_and_unbeaten_methods_come_first() -> None:
     spots = [("a", 90.0, 2.0), ("b", 80.0, 1.0), ("worse", 79.0, 3.0), ("naive", 95.0, 20.0)]
     assert frontier._unbeaten(spots) == ["naive", "a", "b"]

@@ -156,7 +156,9 @@ def test_the_table_of_a_job_has_the_open_loop_error_of_what_cannot_be_rolled_out
     assert shown["/table/rows/1/open_loop_error"] == "0.375"
     assert shown["/table/rows/0/hold_error"] == "0.250"
     assert "/table/rows/0/success_seen" not in shown
-    assert "Open-loop error" in page.said
+    assert "Open-loop error" in page.said and "is no success" in page.said
+    assert "open-loop error on held-out episodes" in page.said  # below the chart of all methods
+    assert f"{table['rows'][0]['method']} has the least open-loop error: 0.125." in page.said
 
 
 def test_the_success_in_each_suite_is_on_the_page(aegis, job: Path) -> None:
@@ -523,6 +525,26 @@ def test_page_and_table_say_what_of_the_bar_was_not_measured(aegis, tmp_path: Pa
     assert said in reported(aegis, tmp_path)[0].said
     assert f"on reach nobody can pass the bar: no figure of {name}" in " ".join(_notes(study))
     assert "nobody can pass" not in " ".join(_notes(found(("naive", "x"), 5)))
+
+
+def test_a_study_of_what_is_not_rolled_out_has_its_frontier_and_its_bar(
+    aegis, tmp_path: Path
+) -> None:
+    study = found(("naive", "a", "x"), by_error=True)
+    barred = study.tasks[0].results[1].bar
+    assert barred is not None
+    check = replace(barred.checks[1], value=0.01, interval=(-0.0004, 0.0204), passed=False)
+    (task,) = study.tasks
+    task.results[1] = replace(
+        task.results[1], bar=replace(barred, checks=[barred.checks[0], check, *barred.checks[2:]])
+    )
+    files.save_json(tmp_path / "table.json", study.to_json())
+    page, document = reported(aegis, tmp_path)
+    check_figures(page, document)
+    assert "open-loop error on held-out episodes" in page.said and "no success" in page.said
+    place = "/tasks/0/results/1/bar/checks/1/interval/1"
+    # 0.02, failed by a limit of 0.02, would contradict itself.
+    assert [text for path, _, text in page.figures if path.endswith(place)] == ["0.0204"]
 
 
 def test_a_study_that_still_tunes_has_a_page(aegis, tmp_path: Path) -> None:

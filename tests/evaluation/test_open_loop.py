@@ -221,6 +221,21 @@ def test_each_instruction_has_its_own_error_and_the_worst_comes_first() -> None:
     assert found.relative_error == pytest.approx((3 * 1 + 21 * 0.25) / 24)
 
 
+def test_the_errors_of_single_episodes_have_the_error_of_all_as_their_mean_over_steps() -> None:
+    shown = recorded(("a", "b"), ("a", "b"))
+    off = (1 + shown.episode_of)[:, None, None] / 4
+    found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0] + off, SPREAD)
+    own = found.episode_errors
+    assert [one.episode for one in own] == found.episodes and len(own) == len(LENGTHS)
+    assert [one.frames for one in own] == list(LENGTHS)
+    steps = sum(one.steps for one in own)
+    for name in ("relative_error", "hold_error"):
+        whole = sum(one.steps * getattr(one, name) for one in own) / steps
+        assert whole == pytest.approx(getattr(found, name))
+    assert len({one.relative_error for one in own}) == len(own)
+    assert [one["episode"] for one in found.kept()["episode_errors"]] == found.episodes
+
+
 def test_one_instruction_has_the_figures_of_all_frames() -> None:
     shown = recorded(("a", "b"), ("a", "b"))
     found = open_loop.compare(shown, EVERY, shown.chunks(EVERY, CHUNK)[0] + 0.5, SPREAD)

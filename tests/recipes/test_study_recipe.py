@@ -41,7 +41,7 @@ def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
     values = ("a/b", "a_b", ".", "..", "/", "?", "ä" * 200, "ä" * 300, 1e-3, "_._", None)
     variants = {"x": SimpleNamespace(values=values)}
     kind: Any = SimpleNamespace(
-        recipe=SimpleNamespace(variants=variants), trial=lambda name, value: value
+        recipe=SimpleNamespace(variants=variants, seeds=()), trial=lambda name, value: value
     )
     above = tmp_path / "tuning" / "x"
     above.mkdir(parents=True)

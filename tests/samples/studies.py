@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import random
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -87,13 +88,20 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
         baseline_cross_entropy=0.05,
         majority_accuracy=0.3,
     )
-    return dataclasses.replace(made, **changes)
+    return replace(made, **changes)
+
+
+def unplayed(figures: PolicyFigures) -> PolicyFigures:
+    """The same of a policy that cannot be rolled out, whose error is less where it succeeds."""
+    error = 1.3 - figures.success_seen if figures.success_seen is not None else None
+    acted = dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
+    return replace(figures, **acted, open_loop_error=error, hold_error=0.75)
 
 
 def vqa_figures(**changes: Any) -> VqaFigures:
     """Invented figures of a further set of questions."""
     made = VqaFigures(0.9, 5.0, (4.0, 6.0), 0.3, 2.0, 0.95, 0.2, 0.5)
-    return dataclasses.replace(made, **changes)
+    return replace(made, **changes)
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
@@ -141,16 +149,22 @@ def found(
     seeds: int = 5,
     tuned: bool = True,
     diverged: Mapping[str, set[int]] = {},
+    by_error: bool = False,
 ) -> StudyReport:
     """An invented study of one task.
 
     The last variant has a knob, and some seeds of some variants diverged.
+
+    Args:
+        by_error: whether nothing was rolled out, so that there are open-loop errors instead.
     """
     methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
     rows = {
         n: {s: row(Recipe(name="x", seed=s, train=Train(method=m))) for s in range(seeds)}
         for n, m in methods.items()
     }
+    if by_error:
+        rows = {n: {s: unplayed(r) for s, r in own.items()} for n, own in rows.items()}
     rows = {
         n: {s: Divergence(7) if s in diverged.get(n, ()) else r for s, r in own.items()}
         for n, own in rows.items()
@@ -166,6 +180,8 @@ def found(
         for i, n in enumerate(names)
         for v in (4, 16)
     ]
+    if by_error:
+        points = [replace(p, success=None, open_loop_error=1.4 - p.success) for p in points]
     return StudyReport(
         "n",
         1,

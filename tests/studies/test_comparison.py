@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import random
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, get_type_hints
 
@@ -21,9 +22,10 @@ from aegis_cli.studies.comparison import (
     PairResult,
     PolicyResult,
     StreamResult,
+    open_loop_bar,
     task_results,
 )
-from aegis_cli.studies.figures import Divergence
+from aegis_cli.studies.figures import Divergence, PolicyFigures
 from aegis_cli.studies.metrics import (
     Bar,
     Demand,
@@ -121,6 +123,20 @@ def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
     assert choose(POLICY_RULE, {"naive": [lost], **others}, within=3)["naive"] == 0
 
 
+def test_where_nothing_is_rolled_out_the_error_takes_the_place_of_success() -> None:
+    """Also beyond 1, where an error is above that of always the mean action."""
+    lost = PolicyPoint("a", "lora", None, 1.0, None, None)
+    for seed in range(20):
+        points = invented(seed)
+        errors = {
+            name: [replace(p, success=None, open_loop_error=1.5 - p.success) for p in own]
+            for name, own in points.items()
+        }
+        assert choose(POLICY_RULE, errors, within=3) == choose(POLICY_RULE, points, within=3)
+        errors["a"] = [lost, *errors["a"]]
+        assert choose(POLICY_RULE, errors, within=1000)["a"] > 0
+
+
 # --- the bar -------------------------------------------------------------------------------------
 
 GOOD = (
@@ -184,6 +200,86 @@ def test_each_demand_of_the_bar_is_needed(
     assert all(check.passed for i, check in enumerate(made.checks) if i != place)
 
 
+def evaluated(error: float, hold: float | None = None, **changes: Any) -> PolicyFigures:
+    """A policy that cannot be rolled out, evaluated on forty episodes of little variety."""
+    spread = [0.001 * (i % 5 - 2) for i in range(40)]
+    known: dict[str, Any] = {
+        "open_loop_error": error,
+        "hold_error": hold,
+        "evaluated_episodes": tuple(f"1/{i}" for i in range(40)),
+        "weight_per_episode": (1 / 40,) * 40,
+        "error_per_episode": tuple(error + away for away in spread),
+        "hold_per_episode": None if hold is None else tuple(hold + 2 * away for away in spread),
+    }
+    acted = dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
+    frozen = {"drop_points": 0.0, "cross_entropy": 0.05}  # as before the training
+    base = dataclasses.replace(row(Recipe(name="x")), **frozen, **acted)
+    return dataclasses.replace(base, **{**known, **changes})
+
+
+def judged_open_loop(
+    naive: list[PolicyFigures], other: list[PolicyFigures], most: float = 0.02
+) -> PolicyResult:
+    rows: dict[str, dict[int, Any]] = {"naive": dict(enumerate(naive))}
+    rows["other"] = dict(enumerate(other))
+    variants = {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")}
+    costs = {"other": Cost(1.0, 1.0)}
+    return task_results("arm", rows, variants, {}, costs, frozenset(), most).results[1]
+
+
+LEVELS = (0.3, 0.4, 0.5)  # of naive's error with each seed: they hold out other episodes
+
+
+@pytest.mark.parametrize(
+    ("rises", "hold", "most", "passed"),
+    [
+        ((0.009, 0.01, 0.011), None, 0.02, [True, True]),
+        ((0.009, 0.01, 0.011), None, 0.01, [False, True]),  # the upper end is beyond
+        ((0.0, 0.01, 0.02), None, 0.02, [False, True]),  # on average within, and not surely
+        ((-0.2, -0.2, -0.21), None, 0.0, [True, True]),
+        ((0.0, 0.001, 0.002), 0.3, 0.02, [True, False]),  # as good as naive, and as useless
+        ((0.0, 0.001, 0.002), 0.9, 0.02, [True, True]),
+        ((0.7, 0.6, 0.5), 1.5, 2.0, [True, False]),  # no better than always the mean action
+    ],
+)
+def test_what_cannot_be_rolled_out_is_judged_by_its_error_beside_naives(
+    rises: tuple[float, ...], hold: float | None, most: float, passed: list[bool]
+) -> None:
+    """Paired by seed, and by the worse end of the interval; nothing is asked of success."""
+    levels = zip(LEVELS, rises, strict=True)
+    other = [evaluated(level + rise, hold) for level, rise in levels]
+    result = judged_open_loop([evaluated(level, hold) for level in LEVELS], other, most)
+    checks = result.bar.checks
+    assert [check.passed for check in checks[1:3]] == passed
+    assert result.open_loop_difference.mean == pytest.approx(sum(rises) / 3)
+    assert not any("success" in check.name for check in checks)
+    assert result.bar.passed is all(passed)
+
+
+def test_errors_are_paired_by_episode_and_those_of_an_earlier_version_by_seed_alone() -> None:
+    """Episodes differ by more than the two policies do."""
+    hard = tuple(0.1 + 0.02 * i for i in range(40))
+    naive = [evaluated(0.49, error_per_episode=hard) for _ in range(3)]
+    # Each seed's mean rises by a little less or more, and within it one episode by much.
+    raised = [(*hard[:-1], hard[-1] + rise) for rise in (0.3, 0.4, 0.5)]
+    other = [evaluated(0.49 + (e[-1] - hard[-1]) / 40, error_per_episode=e) for e in raised]
+    found = judged_open_loop(naive, other).open_loop_difference
+    assert found.mean == pytest.approx(0.01)
+    assert found.crossed is not None and found.crossed[1] > found.interval[1]
+    assert judged_open_loop(naive, other).open_loop_error.crossed is not None
+    old = [dataclasses.replace(one, error_per_episode=None) for one in other]
+    assert judged_open_loop(naive, old).open_loop_difference.crossed is None
+
+
+def test_one_bar_is_held_up_to_all_variants_of_a_task() -> None:
+    """Also to one of which nothing is left, so that a table has one line per demand."""
+    rows: dict[str, dict[int, Any]] = {"a": {0: Divergence(1)}, "b": {0: evaluated(0.5)}}
+    variants = {"a": PolicyVariant("lora"), "b": PolicyVariant("ewc")}
+    lost, kept = task_results("arm", rows, variants, {}, {}, frozenset()).results
+    assert [c.name for c in lost.bar.checks] == [c.name for c in kept.bar.checks]
+    assert lost.bar.passed is False and "open-loop error - naive's" in lost.bar.checks[1].name
+
+
 @pytest.mark.parametrize(
     ("value", "demand", "decimals"),
     [
@@ -194,6 +290,7 @@ def test_each_demand_of_the_bar_is_needed(
         (0.98, "<= 1.02 x naive", 2),
         (-1.004, ">= -1 point", 3),
         (0.0004, "> 0 points", 4),
+        (-0.004, "< 0 of variance", 3),
         (0.0, "none", 2),
     ],
 )
@@ -443,9 +540,9 @@ def test_every_mean_of_a_result_is_declared_once(kind: type) -> None:
     assert len(set(headers)) == len(headers)
 
 
-@pytest.mark.parametrize("demands", [POLICY_BAR, STREAM_BAR])
+@pytest.mark.parametrize("demands", [POLICY_BAR, open_loop_bar(0.02), STREAM_BAR])
 def test_every_demand_is_of_a_figure_that_a_result_has(demands: tuple[Demand, ...]) -> None:
-    kind = PolicyResult if demands is POLICY_BAR else StreamResult
+    kind = StreamResult if demands is STREAM_BAR else PolicyResult
     for demand in demands:
         first, _, rest = demand.of.partition(".")
         assert hasattr(kind, first) or first in get_type_hints(kind)

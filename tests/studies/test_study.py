@@ -21,11 +21,13 @@ from samples.studies import VARIANTS, fake_bench, invent, raw, row, study, vqa_f
 from samples.vqa_files import write_jsonl
 
 from aegis_cli.cli import render
+from aegis_cli.cli.page import pages
 from aegis_cli.common import files, machine, version
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Progress, ignore
 from aegis_cli.data.vqa import sets
 from aegis_cli.recipes import Recipe, StudyRecipe, study_cells
+from aegis_cli.reporting import gather
 from aegis_cli.studies import policy_cells, table
 from aegis_cli.studies import study as stage
 from aegis_cli.studies.cells import CLEARING, Cell, CellStore
@@ -823,7 +825,7 @@ def test_policies_that_cannot_be_rolled_out_are_compared_by_their_open_loop_erro
         PolicyRunner,
         "figures",
         lambda self, label, recipe, validation=False: row(
-            recipe, **acted, open_loop_error=errors[label.split("/")[1]]
+            recipe, **acted, open_loop_error=errors[label.split("/")[1]], hold_error=0.75
         ),
     )
     monkeypatch.setattr(PolicyStudy, "prepare", lambda *_: None)
@@ -835,10 +837,20 @@ def test_policies_that_cannot_be_rolled_out_are_compared_by_their_open_loop_erro
     shown = io.StringIO()
     Console(file=shown, width=160).print(render.study(report))
     header = next(line for line in shown.getvalue().splitlines() if "Drop (points)" in line)
-    assert "Open-loop error" in header and "Success" not in header
+    assert "Open-loop error  Holding's error" in header and "Success" not in header
+    said = " ".join(shown.getvalue().split())
+    assert "Error - naive's Error - no policy's" in said and "success seen" not in said
+    assert "the open-loop error is no success" in said and "nobody can pass" not in said
+    bars = {r.variant: r.bar for r in task.results}
+    failed = {c.name: c.passed for c in bars["kept"].checks}
+    assert failed["open-loop error - naive's"] is not True and bars["naive"] is None
+    document = str(pages.page(gather.run(place), place))
+    assert "the open-loop error is no success" in document and "Holding&#x27;s error" in document
     older = files.load_json(place / "table.json")
     for result in older["tasks"][0]["results"]:
-        del result["open_loop_error"]
+        for name in ("open_loop_error", "hold_error", "open_loop_difference"):
+            del result[name]
+        del result["open_loop_over_still"]
     files.save_json(place / "table.json", older)  # as it was written before there was the figure
     assert {r.open_loop_error for r in table.load(place).tasks[0].results} == {None}
 

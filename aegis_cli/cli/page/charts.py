@@ -226,32 +226,42 @@ class Spot:
 
 
 def frontier(
-    spots: Sequence[Spot], curves: Sequence[Series], x_label: str, y_label: str, name: str
+    spots: Sequence[Spot],
+    curves: Sequence[Series],
+    x_label: str,
+    y_label: str,
+    name: str,
+    turned: bool = False,
 ) -> Markup:
     """What was lost over what was won, better to the upper right.
 
     Up is better: the vertical axis is turned around. Beyond one point it is logarithmic, since
     those that keep most lie within a few points and the others lose dozens.
+
+    Args:
+        turned: whether the other axis is turned around as well, since it is of errors.
     """
     width, height, line_y = 760, 430, 46
     spots = [replace(spot, x_interval=_possible(spot)) for spot in spots]
     values = [value for s in spots for value in (s.y, *(s.y_interval or ()))]
     lost = [symlog(value) for value in [*values, 0.0]]  # the line of no loss is always there
     across = [value for s in spots for value in (s.x, *(s.x_interval or ()))]
-    room = max(2.0, 0.06 * (max(across) - min(across)))
-    x = Scale(max(min(across) - room, 0), max(across) + room, _LEFT, width - 24)
+    room = max(0.02 if turned else 2.0, 0.06 * (max(across) - min(across)))
+    left, right = _LEFT, width - 24
+    start, end = (right, left) if turned else (left, right)
+    x = Scale(max(min(across) - room, 0), max(across) + room, start, end)
     y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)  # of values by `symlog`
     drawn = []
     ticks = [t for t in (0, 0.5, 1, 2, 5, 10, 20, 50, 100) if y.low <= symlog(t) <= y.high]
     for value in ticks:
         at = y(symlog(value))
-        drawn.append(line(x.start, at, x.end, at, "grid" if value else "zero"))
-        drawn.append(text(x.start - 6, at + 4, label(value), "end", class_="tick"))
+        drawn.append(line(left, at, right, at, "grid" if value else "zero"))
+        drawn.append(text(left - 6, at + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
         if value <= max(*across, _ALL):  # the room at the right is beyond 100 %
             drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
-    drawn.append(line(x.start, y.end, x.end, y.end, "axis"))
-    drawn.append(text((x.start + x.end) / 2, height - 8, x_label, class_="label"))
+    drawn.append(line(left, y.end, right, y.end, "axis"))
+    drawn.append(text((left + right) / 2, height - 8, x_label, class_="label"))
     drawn.append(_turned(y, y_label))
     for curve in curves:
         bent = Series(curve.name, [(a, symlog(b)) for a, b in curve.points], curve.number)
@@ -299,6 +309,7 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
     """Each name beside its mark, moved until it covers no name, no mark and no interval."""
     taken = [box for spot in spots for box in _drawn(spot, x, y)]
     drawn = []
+    first, last = sorted((x.start, x.end))  # an axis of errors is turned around
     for spot in spots:
         at, down, wide = x(spot.x), y(symlog(spot.y)), _NAME_LETTER * len(spot.name)
         # Places (left, middle) from the nearest on: to the right and the left, above and below.
@@ -306,7 +317,7 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
         for shift in (0, -15, 15, -30, 30, -45, 45, -60, 60, -75, 75):
             tries.append((at + 11, down + shift))
             tries.append((at - 11 - wide, down + shift))
-        inside = [t for t in tries if t[0] >= x.start and t[0] + wide <= x.end + 24]
+        inside = [t for t in tries if t[0] >= first and t[0] + wide <= last + 24]
         free = (t for t in inside if not any(_touch(_box(t, wide), other) for other in taken))
         left, middle = next(free, tries[0])
         taken.append(_box((left, middle), wide))
@@ -320,7 +331,7 @@ def _drawn(spot: Spot, x: Scale, y: Scale) -> list[tuple[float, float, float, fl
     at, down = x(spot.x), y(symlog(spot.y))
     found = [(at - 7, down - 7, at + 7, down + 7)]
     if spot.x_interval is not None:
-        left, right = map(x, spot.x_interval)
+        left, right = sorted(map(x, spot.x_interval))
         found.append((left, down - 1, right, down + 1))
     if spot.y_interval is not None:
         top, bottom = sorted(y(symlog(end)) for end in spot.y_interval)

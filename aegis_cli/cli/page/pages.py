@@ -22,6 +22,8 @@ from aegis_cli.common import files
 from aegis_cli.common.version import __version__
 from aegis_cli.inspection import steps_taken
 from aegis_cli.recipes.policy import CONSTANT, COSINE
+from aegis_cli.studies.comparison import PolicyResult
+from aegis_cli.studies.metrics import columns
 
 # The page itself forbids what it never does, to load anything from elsewhere or to run a script: a
 # browser keeps to it whatever a file's metadata may have brought in.
@@ -204,7 +206,7 @@ def _job(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
 
 def _verdict(compared: At) -> Child:
     """What the table says, in a sentence or two."""
-    if compared["verdict"]:
+    if compared["verdict"].value:  # an empty text is something, too
         return compared["verdict"]
     rows = sorted(compared["rows"], key=lambda row: row["drop_points"].value)
     before = compared["baseline_accuracy"]
@@ -220,11 +222,15 @@ def _verdict(compared: At) -> Child:
 
 
 def _most_successful(rows: Sequence[At]) -> list[Child]:
-    """A sentence on who acts best; nothing where nobody was rolled out."""
+    """A sentence on who acts best; nothing where that is not known."""
     name = _acting(rows)
     acting = [row for row in rows if row[name].value is not None]
     if not acting:
         return []
+    if name == _OPEN:
+        best = min(acting, key=lambda row: row[name].value)
+        error = decimal(best[name], 3)
+        return [element("strong", best["method"]), " has the least open-loop error: ", error, "."]
     best = max(acting, key=lambda row: row[name].value)
     what = "succeeds most often" if name == "success_seen" else "returns most"
     said: list[Child] = [element("strong", best["method"]), f" {what}: ", share(best[name]), " %"]
@@ -235,8 +241,9 @@ def _most_successful(rows: Sequence[At]) -> list[Child]:
 
 def _acting(rows: Sequence[At]) -> str:
     """The figure of acting that the rows have."""
-    by_return = any(row["return_share"].value is not None for row in rows)
-    return "return_share" if by_return else "success_seen"
+    figures = ("return_share", "success_seen", _OPEN)
+    known = (name for name in figures if any(row[name].value is not None for row in rows))
+    return next(known, "success_seen")
 
 
 def _has_colors(rows: Sequence[At]) -> bool:
@@ -282,22 +289,27 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     hold = next((row["hold_error"] for row in rows if row["hold_error"].value is not None), None)
     if hold is not None:
         parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
+    if _acting(rows) == _OPEN:
+        parts.append(note("An open-loop error is no success, and does not tell it."))
     spots = _spots(rows, own)
     if spots:
-        chart = charts.frontier(
-            spots, [], _acting_axis(rows), _LOST, "VQA accuracy lost over success"
-        )
+        errs = _acting(rows) == _OPEN
+        over = "open-loop error" if errs else "success"
+        name = f"VQA accuracy lost over {over}"
+        chart = charts.frontier(spots, [], _acting_axis(rows), _LOST, name, turned=errs)
         said = "Better is to the upper right. Bars are 95 % intervals of one training."
         parts.append(figure(chart, said, wide=True))
     return section("Methods compared", *parts)
 
 
-_LOST = "VQA accuracy lost (points)"
+_LOST, _OPEN = "VQA accuracy lost (points)", "open_loop_error"
 
 
 def _acting_axis(rows: Sequence[At]) -> str:
     if _acting(rows) == "return_share":
         return "return (% of the highest)"
+    if _acting(rows) == _OPEN:
+        return str(columns(PolicyResult)[_OPEN].axis)
     return "success on seen colours (%)" if _has_colors(rows) else "success (%)"
 
 
@@ -311,9 +323,10 @@ def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
         # The table has no interval of a success, its run has; a return has none.
         ends = runs.rollout(run, "seen")["interval"].value if name == "success_seen" else None
         wide = None if ends is None else (100 * ends[0], 100 * ends[1])
+        across = acted if name == _OPEN else 100 * acted
         label, lost = str(row["method"]), row["drop_points"].value
         tall = tuple(row["drop_interval"].value)
-        found.append(Spot(label, 100 * acted, lost, wide, tall, number))
+        found.append(Spot(label, across, lost, wide, tall, number))
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from aegis_cli.cli.page import charts
@@ -13,16 +14,19 @@ from aegis_cli.cli.page.runs import figure, note, section
 from aegis_cli.cli.page.tables import table, verdict
 from aegis_cli.cli.render.frontier import (
     acting_axis,
+    by_error,
     chosen_task,
     coloured_methods,
     shown_tasks,
 )
-from aegis_cli.cli.render.studies import knob_text, shown_as
+from aegis_cli.cli.render.studies import OPEN_LOOP, knob_text, shown_as
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns, deciding_decimals, unmeasured
 
 _DECLARED = columns(PolicyResult)
 _LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
+_OPEN = "open_loop_error"
+_OPEN_LOOP = " ".join(f"{OPEN_LOOP[0].upper()}{OPEN_LOOP[1:]}.".split())
 _REST = -1  # the number of a series without a colour of its own
 
 
@@ -43,7 +47,8 @@ def frontier(compared: At, report: Any) -> Markup | None:
         curves,
         acting_axis(report),
         _DECLARED[_LOST].axis or "",
-        "VQA accuracy lost over success",
+        f"VQA accuracy lost over {'open-loop error' if by_error(report) else 'success'}",
+        turned=by_error(report),
     )
     where = shown_tasks(report)
     said = (
@@ -55,17 +60,18 @@ def frontier(compared: At, report: Any) -> Markup | None:
 
 
 def _means(compared: At, task: int, number: dict[str, int]) -> list[Spot]:
-    """The compared variants of one task, as far as they were rolled out."""
+    """The compared variants of one task, as far as it is known how they act."""
     found = []
     for result in compared["tasks"][task]["results"]:
         acted = result[_SEEN] or result[_RETURN]  # a task has one of them
+        scale = 100.0 if acted else 1.0  # shares become percent, errors stay as they are
+        acted = acted or result[_OPEN]
         lost = result[_LOST]
         if not acted or not lost:
             continue
         own = number.get(str(result["method"]), _REST)
-        # Shares become percent; what was lost is in percentage points already.
-        wide, tall = _span(acted, 100), _span(lost, 1)
-        x, y = 100 * acted["mean"].value, lost["mean"].value
+        wide, tall = _span(acted, scale), _span(lost, 1)  # of percentage points already
+        x, y = scale * acted["mean"].value, lost["mean"].value
         found.append(Spot(str(result["variant"]), x, y, wide, tall, own))
     return found
 
@@ -79,11 +85,12 @@ def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Serie
     """The values of knobs that did not diverge, and the lines that join a variant's."""
     spots, lines = [], {}
     for point in compared["tuning"]:
-        if point["success"].value is None:  # it diverged
+        success, error = point["success"].value, point[_OPEN].value
+        if success is None and error is None:  # it diverged
             continue
         own = number.get(str(point["method"]), _REST)
         place: Point = (
-            100 * point["success"].value,
+            error if success is None else 100 * success,
             100 * (point["baseline_accuracy"].value - point["accuracy"].value),
         )
         name = str(point["variant"])
@@ -116,6 +123,7 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
                 *_before(task),
             ),
             table(header + ["Bar"] * barred, rows, left=1 + turned),  # the knob is a text too
+            note(_OPEN_LOOP) if any(r["open_loop_error"] for r in task["results"]) else None,
             _demands(task["results"]) if barred else None,
         )
 
@@ -188,6 +196,10 @@ def _demands(results: At) -> Markup:
 def _checked(check: At) -> Sequence[Child]:
     """A demand's figure, its verdict, and below them the interval by whose end it is judged."""
     judged, value, digits = verdict(check["passed"].value), check["value"].value, 2
-    if value is not None and not check["interval"]:  # else an end is judged, not this value
-        digits = deciding_decimals(value, check["demand"].value, digits)
-    return [decimal(check["value"], digits), " ", judged, between(check["interval"], decimal)]
+    demand = check["demand"].value
+    if check["interval"]:  # the upper end is judged where the demand is of a greatest value
+        value = check["interval"].value[demand.startswith("<")]
+    if value is not None:
+        digits = deciding_decimals(value, demand, digits)
+    show = partial(decimal, digits=digits)
+    return [show(check["value"]), " ", judged, between(check["interval"], show)]

@@ -1,4 +1,8 @@
-"""The frontier plot: how much success each variant buys with how much of the VQA skill."""
+"""The frontier plot: how much success each variant buys with how much of the VQA skill.
+
+Where nothing can be rolled out, the open-loop error stands for success, with less of it to the
+right.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from aegis_cli.studies.metrics import columns
 _COLORS = ("#1a1a1a", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#e69f00")
 _REST = "#9a9a9a"
 _COLUMNS = columns(PolicyResult)  # what each figure is called, and its unit
-_LOST = "drop_points"
+_LOST, _OPEN = "drop_points", "open_loop_error"
 _REFERENCES = ("naive", "aegis", "cotrain")  # methods that every other is held against
 _LINEAR = 1.0  # points; losses up to here are drawn to scale, larger ones on a log scale
 _TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
@@ -26,7 +30,7 @@ _TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
 def has_frontier(report: Any) -> bool:
     """Whether there is anything to draw.
 
-    There is nothing where every training diverged, or where none can be rolled out.
+    There is nothing where every training diverged, or where nothing tells how well policies act.
     """
     return bool(_tried(report) or _compared(report))
 
@@ -44,10 +48,8 @@ def frontier_plot(report: Any, path: Path) -> None:
             written.
     """
     if not has_frontier(report):
-        found = "no variant with both VQA accuracy and success"
-        raise AegisError(
-            found, "a study some of whose trainings can be rolled out", "leave out --plot"
-        )
+        found = "no variant with both VQA accuracy and a figure of how well it acts"
+        raise AegisError(found, "a study some of whose trainings were measured", "leave out --plot")
     save_figure(lambda: _figure(report), path)
 
 
@@ -70,11 +72,11 @@ def _figure(report: Any) -> Any:
 
 def _tried(report: Any) -> list[Any]:
     """The values that did not diverge."""
-    return [p for p in report.tuning if p.success is not None]
+    return [p for p in report.tuning if p.success is not None or p.open_loop_error is not None]
 
 
 def _compared(report: Any) -> list[Any]:
-    """The compared variants of the task that was tuned, as far as they were rolled out.
+    """The compared variants of the task that was tuned, as far as it is known how they act.
 
     Without tuning they are those of the first task.
     """
@@ -102,6 +104,8 @@ def shown_tasks(report: Any) -> str:
 
 def acting_axis(report: Any) -> str:
     """What the frontier's axis of success says; of a task without held-out colours, no colours."""
+    if by_error(report):
+        return str(_COLUMNS[_OPEN].axis)
     acting = next(map(_acting, _compared(report)), "success_seen")
     return str(_COLUMNS[acting].axis) if _has_colors(report) else "success (%)"
 
@@ -115,8 +119,17 @@ def _has_colors(report: Any) -> bool:
 
 
 def _acting(result: Any) -> str:
-    """Which figure says how well it acts: success on seen colours, or the share of a return."""
-    return "success_seen" if result.return_share is None else "return_share"
+    """Which figure says how well it acts: success on seen colours, a return, or an error."""
+    if result.return_share is not None:
+        return "return_share"
+    is_evaluated = result.success_seen is None and result.open_loop_error is not None
+    return _OPEN if is_evaluated else "success_seen"
+
+
+def by_error(report: Any) -> bool:
+    """Whether the frontier shows open-loop errors, since nothing was rolled out."""
+    compared = [_acting(result) == _OPEN for result in _compared(report)]
+    return any(compared or [point.success is None for point in _tried(report)])
 
 
 def _acts(result: Any) -> Any:
@@ -131,12 +144,13 @@ def _curves(points: Sequence[Any]) -> dict[str, list[Any]]:
 
 
 def _tried_at(point: Any) -> tuple[float, float]:
-    """Percent of success, and points of VQA accuracy lost on the validation questions."""
-    return 100 * point.success, 100 * (point.baseline_accuracy - point.accuracy)
+    """Percent of success or an error, and points of VQA lost on the validation questions."""
+    acts = point.open_loop_error if point.success is None else 100 * point.success
+    return acts, 100 * (point.baseline_accuracy - point.accuracy)
 
 
 def _compared_at(result: Any) -> tuple[float, float]:
-    """Percent of success, and points of VQA accuracy lost on the probe questions."""
+    """Percent of success or an error, and points of VQA lost on the probe questions."""
     success = _COLUMNS[_acting(result)].shown(_acts(result).mean)
     return success, _COLUMNS[_LOST].shown(getattr(result, _LOST).mean)
 
@@ -161,6 +175,8 @@ def _named(tried: Sequence[Any], compared: Sequence[Any]) -> list[str]:
         spots = [(r.method, *_compared_at(r)) for r in compared]
     else:
         spots = [(p.method, *_tried_at(p)) for p in tried]
+    if any(_acting(r) == _OPEN for r in compared) or any(p.success is None for p in tried):
+        spots = [(method, -error, lost) for method, error, lost in spots]  # less of it is better
     first = [method for method in _REFERENCES if method in methods]
     return list(dict.fromkeys([*first, *_unbeaten(spots), *methods]))[: len(_COLORS)]
 
@@ -197,12 +213,17 @@ def _draw_tried(axis: Any, points: Sequence[Any], color: str) -> None:
 def _draw_compared(axis: Any, result: Any, color: str) -> None:
     success, lost = _compared_at(result)
     front = 4 if color == _REST else 5  # grey lies behind what has a colour
-    bars = {"xerr": _bars(_acts(result), 100), "yerr": _bars(result.drop_points, 1)}
+    bars = {"xerr": _bars(_acts(result), _unit(result)), "yerr": _bars(result.drop_points, 1)}
     shade = 0.25 if color == _REST else 0.45
     look = {"ecolor": color, "elinewidth": 1.1, "alpha": shade, "fmt": "none"}
     axis.errorbar(success, lost, **bars, **look, zorder=front - 0.5)
     look = {"color": color, "markeredgecolor": "white", "markeredgewidth": 0.8}
     axis.plot(success, lost, "*", markersize=10 if color == _REST else 15, zorder=front, **look)
+
+
+def _unit(result: Any) -> float:
+    """What 1 of the figure of acting is on the axis: 100 % of a share."""
+    return _COLUMNS[_acting(result)].shown(1.0)
 
 
 def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
@@ -222,11 +243,15 @@ def _scale(axis: Any, report: Any) -> None:
     tried, compared = _tried(report), _compared(report)
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
     across, lost = [x for x, _ in spots], [y for _, y in spots]
-    margin = max(2.0, 0.08 * (max(across) - min(across)))
-    # A return may surpass the expert's; no success is below 0 % or above 100 %.
-    left, right = max(min(across) - margin, -1.0), max(across) + margin
-    if all(_acting(result) != "return_share" for result in compared):
-        right = min(right, 101.0)
+    errs = by_error(report)
+    margin = max(0.02 if errs else 2.0, 0.08 * (max(across) - min(across)))
+    if errs:  # the axis is turned around as well: less is better
+        left, right = max(across) + margin, max(min(across) - margin, 0.0)
+    else:
+        # A return may surpass the expert's; no success is below 0 % or above 100 %.
+        left, right = max(min(across) - margin, -1.0), max(across) + margin
+        if all(_acting(result) != "return_share" for result in compared):
+            right = min(right, 101.0)
     axis.set(xlabel=acting_axis(report), ylabel=_COLUMNS[_LOST].axis, xlim=(left, right))
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)
     axis.set_yticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
@@ -235,7 +260,8 @@ def _scale(axis: Any, report: Any) -> None:
     axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
-    title = f"{report.name}: VQA accuracy lost against success, {shown_tasks(report)}"
+    acting = "open-loop error" if errs else "success"
+    title = f"{report.name}: VQA accuracy lost against {acting}, {shown_tasks(report)}"
     axis.set_title(title, loc="left", fontsize=11)
 
 
@@ -310,7 +336,8 @@ def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, f
             spots += _between((success, low), (success, high))
         if _acts(result).ends is not None:
             low, high = _acts(result).ends
-            spots += _between((100 * low, lost), (100 * high, lost))
+            unit = _unit(result)
+            spots += _between((unit * low, lost), (unit * high, lost))
     for points in _curves(tried).values():
         ends = [_tried_at(p) for p in points]
         for first, second in zip(ends, ends[1:], strict=False):

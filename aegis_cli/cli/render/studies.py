@@ -26,7 +26,13 @@ from aegis_cli.cli.render.layout import (
     unmarked,
 )
 from aegis_cli.studies.metrics import Column, columns, deciding_decimals, unmeasured
-from aegis_cli.studies.tuning import POLICY_RULE, ROBOT_STREAM_RULE, STREAM_RULE, Rule
+from aegis_cli.studies.tuning import (
+    OPEN_LOOP_RULE,
+    POLICY_RULE,
+    ROBOT_STREAM_RULE,
+    STREAM_RULE,
+    Rule,
+)
 
 
 def study(report: Any) -> RenderableType:
@@ -94,13 +100,23 @@ def _acting(results: Sequence[Any]) -> tuple[str, ...]:
     """The fields that say how well policies act: in closed loop, or by their open-loop error."""
     closed = tuple(acting(results).values())
     acted = any(getattr(r, field) is not None for r in results for field in closed)
-    opened = any(r.open_loop_error is not None for r in results)
-    return ("open_loop_error",) if opened and not acted else closed
+    opened = [field for field in _OPENED if any(getattr(r, field) is not None for r in results)]
+    return tuple(opened) if opened and not acted else closed
+
+
+OPEN_LOOP = (
+    "nothing could be rolled out: the open-loop error is no success, and does not tell it; it is\n"
+    "  the squared error of the actions on held-out episodes over their variance in training, 1\n"
+    "  for always the mean action; no policy's is the lesser of 1 and that of holding the position"
+)
 
 
 # --- columns that results declare -----------------------------------------------------------------
 
 _KEPT = ("drop_points", "cross_entropy")
+_OPENED = ("open_loop_error", "hold_error")
+_GAINS = ("seen_gain_points", "held_out_gain_points")
+_EVALUATED = ("open_loop_difference", "open_loop_over_still")  # where nothing was rolled out
 _COSTS = ("validation_loss", "w2", "energy_shed", "step_time", "peak_memory")
 _TRAINED = ("trained_phase1", "trained", "trained_mean")
 _STORED = (
@@ -200,11 +216,14 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
 
 def _tried(points: Sequence[Any]) -> Table:
     """The knobs' values so far, while nothing has been compared yet."""
+    by_error = any(point.open_loop_error is not None for point in points)
     rows = []
     for point in points:
         value = "-" if point.value is None else value_text(point.value)
-        rows.append((point.variant, value, percent(point.accuracy), percent(point.success)))
-    return plain_table(("Variant", "Value", "VQA %", "Success or return %"), rows, left=2)
+        acts = fixed(point.open_loop_error, 3) if by_error else percent(point.success)
+        rows.append((point.variant, value, percent(point.accuracy), acts))
+    acts = "Open-loop error" if by_error else "Success or return %"
+    return plain_table(("Variant", "Value", "VQA %", acts), rows, left=2)
 
 
 def _references(results: Sequence[Any]) -> list[RenderableType]:
@@ -237,9 +256,9 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     others = [r for r in results if r.variant != "naive" or r.against]
     if any(r.return_gain_points for r in results):
         return [_table(others, ("return_gain_points",))]
-    if all(r.seen_gain_points is None and r.held_out_gain_points is None for r in results):
+    gains = next((each for each in (_GAINS, _EVALUATED) if _has_any(results, each)), None)
+    if gains is None:
         return []
-    gains = ("seen_gain_points", "held_out_gain_points")
     declared = columns(type(results[0]))
     header = (
         "Variant",
@@ -266,6 +285,10 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
             checked.append(f"{figure} {verdict}".strip())
         rows.append((r.variant, *checked, verdict_text(r.bar.passed) if r.bar else "-"))
     return [plain_table(header, rows)]
+
+
+def _has_any(results: Sequence[Any], fields: Iterable[str]) -> bool:
+    return any(getattr(r, field) is not None for r in results for field in fields)
 
 
 def _diverged(results: Sequence[Any]) -> list[RenderableType]:
@@ -302,6 +325,8 @@ def _notes(report: Any) -> list[str]:
             unknown = unmeasured([{c.name: c.value for c in bar.checks} for bar in barred])
             if unknown:
                 notes.append(f"on {task.task} nobody can pass the bar: no figure of {unknown}")
+    if any(r.open_loop_error is not None for r in results):
+        notes.append(OPEN_LOOP)
     if any(r.against for r in results):
         notes.append("where a variant has a reference of its own, 'naive' stands for that")
     mixed = sum(task.across_versions for task in report.tasks)
@@ -314,7 +339,9 @@ def _notes(report: Any) -> list[str]:
     if report.costs_on:
         notes.append(f"step times and memory were measured on: {'; '.join(report.costs_on)}")
     if report.tuning:
-        notes.append(_rule(POLICY_RULE, report.tuning_task, report.within))
+        by_error = any(point.open_loop_error is not None for point in report.tuning)
+        rule = OPEN_LOOP_RULE if by_error else POLICY_RULE
+        notes.append(_rule(rule, report.tuning_task, report.within))
     return [*notes, f"files: {report.out}"]
 
 

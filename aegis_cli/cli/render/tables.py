@@ -27,8 +27,8 @@ from aegis_cli.cli.render.layout import (
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _OPEN_LOOP_INSTEAD = (
     "nothing could be rolled out. The open-loop error is the squared error of the actions on "
-    "held-out episodes over their variance in training: 1 is that of always the mean action. "
-    "aegis inspect of a run has its interval"
+    "held-out episodes over their variance in training: 1 is that of always the mean action. It is "
+    "no success, and does not tell it. aegis inspect of a run has its interval"
 )
 # Fields that hold a share in [0, 1], shown in percent; `_is_share` knows some more by their names.
 _SHARES = {

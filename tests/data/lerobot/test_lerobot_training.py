@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from samples import studies as study_samples
 from samples.command import refused
 from samples.lerobot import (
     STATE,
@@ -644,24 +643,6 @@ def test_the_open_loop_error_on_several_sets_is_the_mean_of_theirs(
     holds = [found.hold_error for found in alone]  # since these actions are positions
     assert None not in holds and row.hold_error == pytest.approx(sum(holds) / 2)
     assert len(results.open_loops(run)) == 2
-
-
-def test_values_cannot_be_chosen_by_a_success_that_there_is_not(
-    aegis: Any, tiny_folder: Path, tmp_path: Path
-) -> None:
-    """Before any work; one camera of a simulated task can be rolled out."""
-    folder = save(tmp_path / "d", episodes(4, BOTH))
-    assert demonstrations.playable_task(folder, "wrist", "reach") is None
-    shared = {
-        **study_samples.raw(tiny_folder)["shared"],
-        "demos": {"path": str(folder), "camera": "wrist"},
-    }
-    path = study_samples.write(tmp_path, study_samples.raw(tiny_folder, shared=shared))
-    err = refused(aegis("run", path, "--out", tmp_path / "runs"))
-    assert f"'tuning' with demonstrations in '{folder}'" in err and not (tmp_path / "runs").exists()
-    edit_info(folder, lambda info: info.update(robot_type="aegis/reach"))
-    assert demonstrations.playable_task(folder, "wrist", "reach") == "reach"
-    assert demonstrations.playable_task(folder, BOTH, "reach") is None
 
 
 def test_a_policy_of_no_simulated_task_plays_one_that_fits(
