@@ -42,6 +42,7 @@ from aegis_cli.cli.options import (
     Format,
     Gate,
     Json,
+    OfStream,
     Overwrite,
     OwnAsk,
     OwnBatchSize,
@@ -91,6 +92,7 @@ from aegis_cli.recipes import (
     Anchor,
     Recipe,
     StudyRecipe,
+    is_robot_stream_run,
     is_stream_run,
     load_pretrain,
     load_training,
@@ -1051,13 +1053,14 @@ def rollout(
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
     run: PolicyArg,
+    task: OfStream = None,
     demos: Annotated[
         Path | None,
         Option(
             parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
-            "default: those that the run learned from.",
+            "default: those that the run, or its task, learned from.",
         ),
     ] = None,
     episodes: Annotated[
@@ -1087,29 +1090,25 @@ def evaluate(
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
     is given by dimension of the actions, by steps ahead and by instruction, relative to that of the
     training's mean action, and beside that of the current position where actions are positions. The
-    run keeps the figures.
+    run of one policy keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --plot actions.png
     Example: aegis evaluate runs/x --demos datasets/arm --episodes 40-49
+    Example: aegis evaluate runs/bench --task open-drawer
     """
     if plot is not None:  # before the work, which takes minutes
         render.check_plot(plot)
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
-    report = stages.EVALUATE.run(
-        run,
-        demos or resuming.demonstrations_of(run),
-        chosen,
-        frames,
-        seed,
-        batch_size,
-        plot is not None,  # traces of some episodes are kept for a plot alone
-        keep=True,
-        rename=renaming(rename),
-        device=device,
-        as_json=as_json,
-    )
+    # Traces of some episodes are kept for a plot alone.
+    asked: list[Any] = [chosen, frames, seed, batch_size, plot is not None]
+    options: dict[str, Any] = {"rename": renaming(rename), "device": device, "as_json": as_json}
+    if is_robot_stream_run(run):
+        report = stages.EVALUATE_STREAM.run(run, task, demos, *asked, **options)
+    else:
+        learned = demos or resuming.demonstrations_of(run)
+        report = stages.EVALUATE.run(run, learned, *asked, keep=True, task=task, **options)
     _warn_of(report)
     if plot is not None:
         render.open_loop_plot(report, plot)
@@ -1131,9 +1130,7 @@ def serve(
         str, Option(help="Address to listen at; 0.0.0.0 lets every machine connect.")
     ] = "127.0.0.1",
     port: Annotated[int, Option(help="Port; 0 takes a free one.", callback=port_number)] = 8000,
-    task: Annotated[
-        str | None, Option(help="Which policy, if RUN is a stream of robot tasks.")
-    ] = None,
+    task: OfStream = None,
     prompt: Annotated[
         str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
     ] = None,

@@ -169,6 +169,20 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         sizes = checkpoint.sizes_of(view)
         return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
 
+    def meta(self, task: int) -> PolicyMeta:
+        """What a user of the policy of the task of that number has to know."""
+        recipe = self.recipe
+        found: dict[str, Any] = {
+            "method": recipe.train.method,
+            "task": self.names[task] if recipe.simulated else None,
+            "replan": recipe.rollout.replan,
+            "normalization": recipe.train.normalization,
+        }
+        chosen = recipes.selected(recipe)
+        if "only" in chosen:
+            chosen["only"] = chosen["only"][task]
+        return cast(PolicyMeta, {**found, **chosen, **self.views[task]})
+
     def activate(self, task: int | None) -> None:
         """Let every map compute for the task of that number; None: the bare backbone."""
         routing.activate(self.sites, None if task is None else self.learner.router(task))
@@ -313,7 +327,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    views = [_view(recipe, shown, backbone) for shown in demos]
+    views = [_view(recipe, *each, backbone) for each in zip(demos, scales, strict=True)]
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
     run.measure_with(source, on_event)
     return run
@@ -469,7 +483,7 @@ def no_simulator(run: Path, task: str) -> AegisError:
         f"'{task}' of the stream in '{run}', a task that no simulator has",
         "a simulated task, to be played",
         f"let the robot act: {commands.aegis('serve', run, '--task', task)}; how far its actions "
-        f"are from held-out ones, {commands.aegis('inspect', run)} shows",
+        f"are from held-out ones, {commands.aegis('evaluate', run, '--task', task)} shows",
     )
 
 
@@ -477,9 +491,11 @@ def number_of(path: Path, task: str | None) -> int:
     """The number of one of a run's tasks.
 
     Raises:
-        AegisError: a task that the run has not learned, or none named.
+        AegisError: a task that the run has not learned, or none named where it has several.
     """
     known = files.read(path).tasks
+    if task is None and len(known) == 1:
+        return 0
     if task not in known:
         named = "no --task" if task is None else f"task '{task}'"
         raise AegisError(
@@ -534,9 +550,13 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
     return views
 
 
-def _view(recipe: RobotStreamRecipe, shown: Demonstrations, backbone: Backbone) -> PolicyMeta:
+def _view(
+    recipe: RobotStreamRecipe, shown: Demonstrations, scales: Scales, backbone: Backbone
+) -> PolicyMeta:
     """How a task's policy looks; of a robot that is not simulated also what its numbers are."""
     found = assemble.view(shown, backbone)
+    if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
+        found["action_std"] = shown.action_std
     if recipe.demos.rename is not None:
         found["rename"] = recipe.demos.rename
     if recipe.simulated:
@@ -679,9 +699,9 @@ def _source(
     """
     if recipe.demos.paths is not None:
         return given(recipe, number)
-    home = out.parent / "demos"
-    make_folder(home)
-    made = record(recipe, number, StageRecords(home, on_event))
+    records = _records(out, on_event)
+    make_folder(records.folder)
+    made = record(recipe, number, records)
     return made.path, recipe.demos.selection(only=None)
 
 
@@ -691,28 +711,66 @@ def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
     Raises:
         AegisError: nothing is there, or it cannot be told which episodes are the task's.
     """
-    demos, named = recipe.demos, recipe.demos.of_task(number)
-    path = demonstrations.at(named)
+    demos = recipe.demos
+    path = demonstrations.at(demos.of_task(number))
     if demos.only is not None:
         return path, demos.selection(demos.only[number])
-    of_each = [demos.of_task(i) for i in range(len(recipe.tasks))]
-    shared = of_each.count(named) > 1
-    if shared and not recipe.simulated:
+    if _is_shared(recipe, number) and not recipe.simulated:
         raise AegisError(
             f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
             "would learn",
             "demonstrations of its own for each task, or which of these episodes are whose",
             "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
         )
-    only = demonstrations.part_of(path, recipe.tasks[number], shared)
+    only = demonstrations.part_of(path, recipe.tasks[number], _is_shared(recipe, number))
     return path, demos.selection(only)
+
+
+def _is_shared(recipe: RobotStreamRecipe, number: int) -> bool:
+    """Whether other tasks learn from the same demonstrations as the task of that number."""
+    of_each = [recipe.demos.of_task(i) for i in range(len(recipe.tasks))]
+    return of_each.count(of_each[number]) > 1
+
+
+def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, Any]:
+    """What the task of that number would have learned of demonstrations, as `recipes.selected`.
+
+    Args:
+        path: where they lie by now; also others than it learned from.
+    """
+    chosen, demos = recipes.selected(recipe), recipe.demos
+    only = None
+    if demos.only is not None:
+        only = demos.only[number]
+    elif demos.paths is not None:
+        try:
+            shared = _is_shared(recipe, number)
+            only = demonstrations.part_of(path, recipe.tasks[number], shared)
+        except AegisError:  # others, whose episodes cannot be told apart: then all are meant
+            only = None
+    return chosen if only is None else {**chosen, "only": only}
+
+
+def place_of(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
+    """Where the demonstrations that the task of that number learned from lie, or lay."""
+    if recipe.demos.paths is not None:
+        return Path(recipe.demos.of_task(number))
+    return _records(run, ignore).recorded(recipe.tasks[number], _to_record(recipe))
 
 
 def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
     """The demonstrations of one task, recorded as the recipe says unless they are there."""
+    return records.demonstrations(recipe.tasks[number], _to_record(recipe))
+
+
+def _records(run: Path, on_event: OnEvent) -> StageRecords:
+    """What is recorded for a run, beside it."""
+    return StageRecords(run.parent / "demos", on_event)
+
+
+def _to_record(recipe: RobotStreamRecipe) -> Demos:
     settings = recipe.demos
-    asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
-    return records.demonstrations(recipe.tasks[number], asked)
+    return Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
 
 
 def share(
