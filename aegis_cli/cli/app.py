@@ -1173,6 +1173,7 @@ def serve(
 def export(
     run: PolicyArg,
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    task: OfStream = None,
     form: Annotated[
         PolicyFormat,
         Option("--format", help="The layout of LeRobot's policies, or that of a checkpoint."),
@@ -1197,11 +1198,15 @@ def export(
     A Hugging Face backbone is written in the type that it was stored in before it was trained;
     checkpoints have float32.
 
+    Of a stream of robot tasks the policy of one task is written, with its low-rank terms as part of
+    the weights. A task that weighs several experts at a map, as those of igsp may, is refused.
+
     \b
     Example: aegis export runs/x --format lerobot --out policies/x
     Example: aegis export runs/x --format aegis --dtype bfloat16 --out policies/x
+    Example: aegis export runs/bench --task open-drawer --out policies/drawer
     """
-    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, as_json=as_json)
+    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, task=task, as_json=as_json)
 
 
 @app.command(short_help="Send a trained policy to the Hugging Face hub.")

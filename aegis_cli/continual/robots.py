@@ -49,7 +49,7 @@ from aegis_cli.data.vqa.metrics import score
 from aegis_cli.models import backbones, policy_meta
 from aegis_cli.models.acting import Acting, play
 from aegis_cli.models.asking import ask
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
@@ -169,6 +169,16 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         sizes = checkpoint.sizes_of(view)
         return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
 
+    @property
+    def origin(self) -> dict[str, str]:
+        """Of a policy's meta what the backbone was before the stream: `stored`, `base_model`."""
+        backbone, found = self.model.backbone, dict[str, str]()
+        if backbone.hub_id is not None:
+            found["base_model"] = backbone.hub_id
+        if backbone.stored != FLOAT32:
+            found["stored"] = backbone.stored
+        return found
+
     def meta(self, task: int) -> PolicyMeta:
         """What a user of the policy of the task of that number has to know."""
         recipe = self.recipe
@@ -181,7 +191,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         chosen = recipes.selected(recipe)
         if "only" in chosen:
             chosen["only"] = chosen["only"][task]
-        return cast(PolicyMeta, {**found, **chosen, **self.views[task]})
+        return cast(PolicyMeta, {**found, **chosen, **self.views[task], **self.origin})
 
     def activate(self, task: int | None) -> None:
         """Let every map compute for the task of that number; None: the bare backbone."""
@@ -283,6 +293,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             "tasks": list(self.names),
             "shape": self.model.expert.shape.to_json(),
         }
+        meta |= self.origin
         if any(self.views):
             meta["views"] = list(self.views)
         if self.sites:
