@@ -91,6 +91,7 @@ from aegis_cli.recipes import (
     TASK,
     Anchor,
     Recipe,
+    RobotStreamRecipe,
     StudyRecipe,
     is_robot_stream_run,
     is_stream_run,
@@ -392,7 +393,7 @@ def train(
         Option(
             "--dry-run",
             help="Check all inputs, estimate memory, disk and hours, and write nothing (policies "
-            "only); exit 1 if memory or disk does not suffice.",
+            "and streams of robot tasks); exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     overrides: Set = None,
@@ -426,10 +427,18 @@ def train(
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
-        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
+        dry_run_of = stages.DRY_RUN_STREAM if isinstance(resolved, RobotStreamRecipe) else None
+        no_dry_run = dry_run and dry_run_of is None
+        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
+        if dry_run and dry_run_of is not None:
+            report = dry_run_of.run(
+                resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
+            )
+            _gate(dry_run_of.module.shortage(report))
+            return
         ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json

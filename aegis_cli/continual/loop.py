@@ -47,6 +47,10 @@ class TaskTraining:
     slower: str
     constraint: Constraint | None = None
 
+    def fetch(self, step: int) -> Any:
+        """The examples of a step."""
+        return self.objective.fetch(torch.from_numpy(self.order.rows(step)))
+
 
 def learn(
     run: AnyStreamRun,
@@ -66,21 +70,18 @@ def learn(
         KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     current, settings = run.current, run.recipe.train
-    training = _prepare(run, prototypes, optimizer)
+    training = prepare(run, prototypes, optimizer)
     loss: float | None = None
     started = time.perf_counter()
 
-    def fetch(step: int) -> Any:
-        return training.objective.fetch(torch.from_numpy(training.order.rows(step)))
-
     steps = settings.steps if run.learner.trains != "nothing" else 0
-    ahead = prefetch.ahead(fetch, range(current.step, steps))
+    ahead = prefetch.ahead(training.fetch, range(current.step, steps))
     stage = f"task {current.task + 1} {training.objective.name}"
     with ahead as batches, interrupts.saved_first(stage, on_event) as signaled:
         if current.step < steps:
             on_event(Progress(stage, current.step, steps, "steps"))
         for step in range(current.step, steps):
-            loss = _step(run, training, step, next(batches))
+            loss = take(run, training, step, next(batches))
             current.window.append(loss)
             current.step = step + 1
             if current.phase == 1:
@@ -102,7 +103,7 @@ def learn(
 # --- before ---------------------------------------------------------------------------------------
 
 
-def _prepare(
+def prepare(
     run: AnyStreamRun, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
 ) -> TaskTraining:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
@@ -144,7 +145,7 @@ def _learning_maps(run: AnyStreamRun) -> dict[str, int]:
 # --- a step ---------------------------------------------------------------------------------------
 
 
-def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> float:
+def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> float:
     """Take one step, and return the task's own loss before it.
 
     Raises:

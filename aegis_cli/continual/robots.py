@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -47,7 +48,7 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
 from aegis_cli.models import backbones, policy_meta
-from aegis_cli.models.acting import Acting, play
+from aegis_cli.models.acting import Acting, longest_s, play
 from aegis_cli.models.asking import ask
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
@@ -59,6 +60,7 @@ from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
 from aegis_cli.training.up_to_date import Made, StageRecords
+from aegis_cli.training.validation_time import expected_s
 
 # Training frames, evenly spaced, on which routers are measured, always with the same noise.
 CALIBRATION_FRAMES = 32
@@ -224,7 +226,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         if not self.recipe.simulated:
             current.intervals.append(self.measuring.intervals(current.task))
         current.vqa.append(self.measuring.vqa())
-        loss = self._validation_loss()
+        loss = self.validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
         if not self.recipe.simulated:
             figures["action error"] = current.oracle[-1][-1]
@@ -232,13 +234,14 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         check_finite(figures, where, self.slower(self.parameters()), self.recipe.train.steps)
         return {"validation_loss": loss}
 
-    def _validation_loss(self) -> float:
+    def validation_loss(self, on_event: OnEvent = ignore) -> float:
         """The loss of the task just learned, on held-out episodes."""
         number, settings = self.current.task, self.recipe.train
         self.activate(number)
         noise = _seed(self.recipe.seed, number * settings.steps, VALIDATION_NOISE)
         policy = self.policies[number].eval()
-        return train.validation_loss(policy, self.demos[number], settings, noise)
+        demos = self.demos[number]
+        return train.validation_loss(policy, demos, settings, noise, on_event=on_event)
 
     def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
         """Every task is tried once: with frozen experts a column has one policy in all rows."""
@@ -898,10 +901,13 @@ class RobotEvaluator(ABC):
     """How tasks are done with the task told, and questions with no task active.
 
     The questions are the same every time, and so is what a task is tried on.
+
+    Attributes:
+        on_event: hears of its progress.
     """
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
-        self._run, self._on_event = run, on_event
+        self._run, self.on_event = run, on_event
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
         # settings are chosen by other questions than those that figures are of
         part = "validation" if run.recipe.rollout.split == "validation" else "probe"
@@ -928,18 +934,38 @@ class RobotEvaluator(ABC):
     def tried(self, task: int) -> float:
         """How the task of that number is done now."""
 
+    def tried_s(self, task: int) -> float:
+        """About how many seconds `tried` takes, by its first parts."""
+        return expected_s(self._heard_by(partial(self.tried, task)))
+
+    def vqa_s(self) -> float:
+        """About how many seconds `vqa` takes."""
+        return expected_s(self._heard_by(self.vqa))
+
+    def _heard_by(self, work: Callable[[], object]) -> Callable[[OnEvent], None]:
+        """Some of its work, of whose progress somebody else hears."""
+
+        def heard(on_event: OnEvent) -> None:
+            before, self.on_event = self.on_event, on_event
+            try:
+                work()
+            finally:
+                self.on_event = before
+
+        return heard
+
     def vqa(self) -> list[float]:
         """Accuracy and cross-entropy of the backbone with no task active."""
         self._run.activate(None)
         model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
-        found = score(ask(model, self._asked, batch_size, self._on_event))
+        found = score(ask(model, self._asked, batch_size, self.on_event))
         return [found.accuracy, found.cross_entropy]
 
     def _named(self, task: str) -> OnEvent:
         """Events of a rollout, with the task's name."""
 
         def passed_on(event: Event) -> None:
-            self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
+            self.on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
 
         return passed_on
 
@@ -947,15 +973,24 @@ class RobotEvaluator(ABC):
 class ClosedLoopEvaluator(RobotEvaluator):
     """Lets policies act in simulated tasks."""
 
+    def tried_s(self, task: int) -> float:
+        """About how many seconds `tried` takes if no episode ends early."""
+        acting, settings = self._run.acting(task), self._run.recipe.rollout
+        return longest_s(acting, settings.episodes, settings.colors, self._split, settings.seed)
+
+    @property
+    def _split(self) -> int:
+        named = {"evaluation": EVALUATION, "validation": VALIDATION}
+        return named[self._run.recipe.rollout.split]
+
     def tried(self, task: int) -> float:
         """Share of successes of the task of that number, or of the highest return."""
         acting, settings = self._run.acting(task), self._run.recipe.rollout
-        split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
         found = play(
             acting,
             settings.episodes,
             settings.colors,
-            split,
+            self._split,
             on_event=self._named(acting.task),
             seed=settings.seed,
         )

@@ -393,6 +393,17 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     return made
 
 
+def place_in(path: Path) -> TaskInProgress:
+    """Where a state is in its stream, by its header alone.
+
+    Raises:
+        AegisError: it is damaged.
+    """
+    meta = artifacts.read_header(path).meta
+    with reading_meta(path):
+        return TaskInProgress(**meta["place"])
+
+
 def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:
     """The inputs of a state, those of the run's own recipe as today's version names them.
 
