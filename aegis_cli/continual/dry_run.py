@@ -148,7 +148,7 @@ def shortage(report: StreamDryRunReport) -> str | None:
         assert report.memory_free_mb is not None  # else nobody knows whether it fits
         smaller = "use a smaller backbone"
         if report.memory_needed_mb - report.memory_mb["activations"] < report.memory_free_mb:
-            smaller = "lower train.batch_size"
+            smaller = "take a step in more passes: set train.accumulate"
         missing.append(too_little(report.memory_needed_mb, report.memory_free_mb, smaller))
     if not report.disk_fits:
         missing.append(
@@ -195,8 +195,11 @@ def _left(stream: RobotStreamRun, overwrite: bool) -> list[int]:
 
 def _frames_of_a_pass(stream: RobotStreamRun) -> int:
     """The most frames that pass at once: of a step, or where routers are looked at, of that."""
-    frames = stream.recipe.train.batch_size
-    return max(frames, robots.CALIBRATION_FRAMES) if stream.sites else frames
+    settings = stream.recipe.train
+    frames = -(-settings.batch_size // settings.accumulate)  # rounded up
+    looked_at = robots.CALIBRATION_FRAMES
+    whole = robots.calibration_passes(settings, looked_at) == 1
+    return max(frames, looked_at) if stream.sites and whole else frames
 
 
 # --- tasks that have begun ------------------------------------------------------------------------

@@ -38,11 +38,11 @@ from aegis_cli.continual.report import (
     SuccessMatrix,
     vqa_scores,
 )
-from aegis_cli.continual.state import StreamRun, changed_inputs
+from aegis_cli.continual.state import WHOLE, StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.routing import Routed
 from aegis_cli.data import demonstrations, mixture, renaming, spread, task_episodes
-from aegis_cli.data.batch import Normalizer, RobotBatch
+from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
@@ -55,7 +55,7 @@ from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
-from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe
+from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe, RobotTrain
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
@@ -329,6 +329,8 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         else:
             sim.check(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    if recipe.train.gradient_checkpointing:
+        backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
     _check_given(recipe)
@@ -343,6 +345,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
     views = [_view(recipe, *each, backbone) for each in zip(demos, scales, strict=True)]
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
+    run.model.expert.recomputes = recipe.train.gradient_checkpointing
     run.measure_with(source, on_event)
     return run
 
@@ -860,24 +863,45 @@ class FlowMatchingLoss:
         self._settings, self._seed = recipe.train, recipe.seed
         self._policy, self._demos = policy, demos
         self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_FRAMES))
+        self.passes = recipe.train.accumulate
+        self.calibration_passes = calibration_passes(recipe.train, len(self._calibration))
 
     def fetch(self, rows: Tensor) -> RobotBatch:
         return self._demos.batch(self._demos.train[rows], self._settings.chunk)
 
-    def loss(self, batch: RobotBatch, step: int) -> Tensor:
-        return self._loss(batch, generator(self._seed, self._first_step + step, TRAINING_NOISE))
+    def loss(self, batch: RobotBatch, step: int, share: Share = WHOLE) -> Tensor:
+        draws = generator(self._seed, self._first_step + step, TRAINING_NOISE)
+        return self._loss(batch, draws, share)
 
-    def calibration_loss(self) -> Tensor:
+    def calibration_loss(self, share: Share = WHOLE) -> Tensor:
         # The same noise at each check, so that routers that stand still are seen to.
         draws = generator(self._seed, self._first_step, CALIBRATION_NOISE)
-        return self._loss(self._calibration, draws)
+        return self._loss(self._calibration, draws, share)
 
     def trainable_changed(self) -> None:
         """Nothing is kept from step to step."""
 
-    def _loss(self, batch: RobotBatch, draws: torch.Generator) -> Tensor:
-        encoding = self._policy.encode(batch.images, batch.instructions)
-        return self._policy.flow_loss(batch, encoding, self._settings.flow_samples, draws)
+    def _loss(self, batch: RobotBatch, draws: torch.Generator, share: Share) -> Tensor:
+        # Each pass draws the whole batch's noise, and takes its own frames' of it.
+        of = WholeBatch(len(batch), int((~batch.is_pad).sum()), share)
+        part = batch if share == WHOLE else batch.rows(share.rows(len(batch)))
+        encoding = self._policy.encode(part.images, part.instructions)
+        samples = self._settings.flow_samples
+        return self._policy.flow_loss(part, encoding, samples, draws, of=of)
+
+
+def calibration_passes(settings: RobotTrain, frames: int) -> int:
+    """In how many passes routers are measured on so many frames, for no more memory than a step's.
+
+    What is measured is no training, in which alone a Hugging Face model checkpoints gradients: one
+    frame at a time takes less than a step with them.
+    """
+    if settings.gradient_checkpointing:
+        return frames
+    if settings.accumulate == 1:
+        return 1  # as it always was
+    of_a_pass = max(1, settings.batch_size // settings.accumulate)
+    return -(-frames // of_a_pass)  # rounded up
 
 
 def generator(seed: int, index: int, purpose: int) -> torch.Generator:

@@ -161,6 +161,13 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _demos_checks(recipe.demos, len(recipe.tasks))
     yield from _task_checks(recipe)
+    train = recipe.train
+    if train.batch_size < train.accumulate:
+        yield Problem(
+            f"train.batch_size: {train.batch_size} with train.accumulate: {train.accumulate}",
+            "at least one frame in each pass of a step",
+            f"set train.accumulate to at most {train.batch_size}",
+        )
     plain = [task for task in recipe.tasks if task not in TASKS]
     if recipe.expert.start is not None:
         found = f"expert.start: {recipe.expert.start} with a stream"

@@ -161,6 +161,18 @@ class RobotTrain:
         doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
         "float32.",
     )
+    gradient_checkpointing: bool = key(
+        default=False,
+        later=True,
+        doc="Hugging Face backbones only: less memory, at the price of a second forward pass, of "
+        "the action expert too.",
+    )
+    accumulate: int = key(
+        POSITIVE,
+        default=1,
+        later=True,
+        doc="Passes in which a step's frames are taken, for less memory.",
+    )
 
 
 @section
