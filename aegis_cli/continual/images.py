@@ -355,7 +355,7 @@ class ClassificationLoss:
         # the classes' features [C, D], as long as nothing that learns acts on them
         self._texts: Tensor | None = None
 
-    def fetch(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def fetch(self, rows: Tensor, step: int | None = None) -> tuple[Tensor, Tensor]:
         """Images [B, H, W, 3] uint8 and labels [B]."""
         return self._task.train.images(rows), self._task.train.labels[rows]
 

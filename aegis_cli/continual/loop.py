@@ -50,7 +50,7 @@ class TaskTraining:
 
     def fetch(self, step: int) -> Any:
         """The examples of a step."""
-        return self.objective.fetch(torch.from_numpy(self.order.rows(step)))
+        return self.objective.fetch(torch.from_numpy(self.order.rows(step)), step)
 
 
 def learn(

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import Event, OnEvent, Progress, ignore
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
@@ -41,7 +41,7 @@ from aegis_cli.continual.report import (
 from aegis_cli.continual.state import WHOLE, StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.routing import Routed
-from aegis_cli.data import demonstrations, mixture, renaming, spread, task_episodes
+from aegis_cli.data import augment, demonstrations, mixture, renaming, spread, task_episodes
 from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Selection
@@ -333,7 +333,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
-    _check_given(recipe)
+    _check_given(recipe, on_event)
     for task in recipe.tasks if recipe.simulated else ():
         _check_words(backbone, task)
     # Only now, when all else has been found to fit: recording takes long.
@@ -634,7 +634,7 @@ def _check_words(backbone: Backbone, task: str) -> None:
         backbone.prepare(picture, [template.format(color=COLORS[0])])
 
 
-def _check_given(recipe: RobotStreamRecipe) -> None:
+def _check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
     """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
 
     To decode the first task's frames can take hours.
@@ -651,6 +651,34 @@ def _check_given(recipe: RobotStreamRecipe) -> None:
         if not recipe.simulated:
             robot = mixture.robot_of(path, selection)  # with its cameras and features
             _check_task(robot.task, recipe.tasks[number], path)
+    if not recipe.simulated:
+        _check_own_episodes(recipe, on_event)
+
+
+def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
+    """Refuse tasks that learn from the same episodes, and warn of those that share some.
+
+    Raises:
+        AegisError: two tasks have all of their episodes in common.
+    """
+    seen: list[tuple[str, Path, set[int]]] = []
+    for number, task in enumerate(recipe.tasks):
+        path, selection = given(recipe, number)
+        count = demonstrations.count_episodes(path)
+        own = set(demonstrations.learned_from(path, count, selection.only).tolist())
+        place = demonstrations.locate(path).resolve()  # a folder may be named in two ways
+        for other, elsewhere, theirs in seen:
+            if elsewhere != place or not own & theirs:
+                continue
+            if own == theirs:
+                raise AegisError(
+                    f"the same {len(own)} episodes of '{path}' for '{other}' and '{task}'",
+                    "episodes of its own for each task",
+                    "correct demos.only, or demos.paths",
+                )
+            shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
+            on_event(Warned("train", f"{shared}, which learn from them twice"))
+        seen.append((task, place, own))
 
 
 def _demos(
@@ -866,8 +894,16 @@ class FlowMatchingLoss:
         self.passes = recipe.train.accumulate
         self.calibration_passes = calibration_passes(recipe.train, len(self._calibration))
 
-    def fetch(self, rows: Tensor) -> RobotBatch:
-        return self._demos.batch(self._demos.train[rows], self._settings.chunk)
+    def fetch(self, rows: Tensor, step: int | None = None) -> RobotBatch:
+        settings, frames = self._settings, self._demos.train[rows]
+        batch = self._demos.batch(frames, settings.chunk)
+        if step is None or settings.augment is None:
+            return batch
+        numbers, drawn = frames.tolist(), (settings.augment, settings.augment_count, self._seed)
+        # By the step of the whole stream: two tasks may have frames of the same numbers.
+        at, repeats = self._first_step + step, augment.earlier(numbers)
+        images = augment.augmented(batch.images, numbers, *drawn, at, repeats)
+        return dataclasses.replace(batch, images=images)
 
     def loss(self, batch: RobotBatch, step: int, share: Share = WHOLE) -> Tensor:
         draws = generator(self._seed, self._first_step + step, TRAINING_NOISE)

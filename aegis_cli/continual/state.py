@@ -127,8 +127,12 @@ class Objective(Protocol):
     passes: int
     calibration_passes: int
 
-    def fetch(self, rows: Tensor) -> Any:
-        """The training examples with these numbers [B]."""
+    def fetch(self, rows: Tensor, step: int | None = None) -> Any:
+        """The training examples with these numbers [B].
+
+        Args:
+            step: that trains on them, for which they may be changed; None: as they are.
+        """
 
     def loss(self, batch: Any, step: int, share: Share = WHOLE) -> Tensor:
         """The task's own loss of a batch of `fetch`, with its graph.

@@ -346,3 +346,37 @@ def test_a_recipe_says_whether_its_tasks_are_simulated(real: Make, make: Make) -
     assert recipes.training_part(make())["rollout"].keys() == {
         *("episodes", "colors", "replan", "split")
     }
+
+
+# --- tasks with the same episodes -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("only", [("0-2", "0-2"), ("0-2", "2,1,0"), None])
+def test_two_tasks_with_the_same_episodes_are_refused_before_anything_is_decoded(
+    only: tuple[str, ...] | None,
+    real: Make,
+    paths: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where the dataset is named in two ways."""
+    (tmp_path / "link").symlink_to(paths["pick"])
+    monkeypatch.setattr(demonstrations, "load", lambda *given, **options: pytest.fail("decoded"))
+    demos = RobotDemos(paths=(str(paths["pick"]), str(tmp_path / "link")), only=only)
+    says = "the same [36] episodes of .* for 'pick' and 'open-drawer'"
+    with pytest.raises(AegisError, match=says):
+        train.build(real("sequential", demos=demos), tmp_path / "run")
+
+
+def test_tasks_that_share_some_episodes_are_warned_of(
+    real: Make, paths: dict[str, Path], tmp_path: Path
+) -> None:
+    demos = RobotDemos(paths=str(paths["pick"]), only=("0-3", "2-5"))
+    told: list[Any] = []
+    train.build(real("sequential", demos=demos), tmp_path / "run", told.append)
+    warned = [event.text for event in told if isinstance(event, Warned)]
+    assert any("2 episodes of" in text and "'pick' and 'open-drawer'" in text for text in warned)
+    apart = RobotDemos(paths=str(paths["pick"]), only=("0-2", "3-5"))
+    told.clear()
+    train.build(real("sequential", demos=apart), tmp_path / "run", told.append)
+    assert not [e for e in told if isinstance(e, Warned) and "episodes of" in e.text]
