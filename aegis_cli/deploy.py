@@ -449,9 +449,7 @@ def load_policy(
     if is_robot_stream_run(folder):
         return _of_stream(folder, task, device, acts_in, seed, ensemble)
     policy, meta = checkpoint.load_policy(folder)
-    if task not in (None, meta["task"]):
-        said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
-        raise AegisError(said, "its own", "leave out the task")
+    checkpoint.check_task(meta, task)
     policy.acts_in = acts_in
     return DeployedPolicy(
         policy.to(device),

@@ -56,6 +56,7 @@ pytest_plugins = [
     "samples.nullspace",
     "samples.processes",
     "samples.robots",
+    "samples.own_robots",  # after what it imports
     "samples.streams",
     "samples.training_runs",
     "samples.user_folder",

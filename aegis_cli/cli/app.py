@@ -42,6 +42,7 @@ from aegis_cli.cli.options import (
     Format,
     Gate,
     Json,
+    OfStream,
     Overwrite,
     OwnAsk,
     OwnBatchSize,
@@ -90,7 +91,9 @@ from aegis_cli.recipes import (
     TASK,
     Anchor,
     Recipe,
+    RobotStreamRecipe,
     StudyRecipe,
+    is_robot_stream_run,
     is_stream_run,
     load_pretrain,
     load_training,
@@ -390,7 +393,7 @@ def train(
         Option(
             "--dry-run",
             help="Check all inputs, estimate memory, disk and hours, and write nothing (policies "
-            "only); exit 1 if memory or disk does not suffice.",
+            "and streams of robot tasks); exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     overrides: Set = None,
@@ -424,10 +427,18 @@ def train(
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
-        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": dry_run}
+        dry_run_of = stages.DRY_RUN_STREAM if isinstance(resolved, RobotStreamRecipe) else None
+        no_dry_run = dry_run and dry_run_of is None
+        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}
         stages.refuse_options(
             [name for name, value in unused.items() if value], f"of '{resolved.name}'"
         )
+        if dry_run and dry_run_of is not None:
+            report = dry_run_of.run(
+                resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
+            )
+            _gate(dry_run_of.module.shortage(report))
+            return
         ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
@@ -1062,13 +1073,14 @@ def rollout(
 @app.command(short_help="Compare predicted actions with recorded ones.")
 def evaluate(
     run: PolicyArg,
+    task: OfStream = None,
     demos: Annotated[
         Path | None,
         Option(
             parser=demonstrations_path,
             metavar="PATH",
             help="Demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub; "
-            "default: those that the run learned from.",
+            "default: those that the run, or its task, learned from.",
         ),
     ] = None,
     episodes: Annotated[
@@ -1098,29 +1110,25 @@ def evaluate(
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
     is given by dimension of the actions, by steps ahead and by instruction, relative to that of the
     training's mean action, and beside that of the current position where actions are positions. The
-    run keeps the figures.
+    run of one policy keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --plot actions.png
     Example: aegis evaluate runs/x --demos datasets/arm --episodes 40-49
+    Example: aegis evaluate runs/bench --task open-drawer
     """
     if plot is not None:  # before the work, which takes minutes
         render.check_plot(plot)
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
-    report = stages.EVALUATE.run(
-        run,
-        demos or resuming.demonstrations_of(run),
-        chosen,
-        frames,
-        seed,
-        batch_size,
-        plot is not None,  # traces of some episodes are kept for a plot alone
-        keep=True,
-        rename=renaming(rename),
-        device=device,
-        as_json=as_json,
-    )
+    # Traces of some episodes are kept for a plot alone.
+    asked: list[Any] = [chosen, frames, seed, batch_size, plot is not None]
+    options: dict[str, Any] = {"rename": renaming(rename), "device": device, "as_json": as_json}
+    if is_robot_stream_run(run):
+        report = stages.EVALUATE_STREAM.run(run, task, demos, *asked, **options)
+    else:
+        learned = demos or resuming.demonstrations_of(run)
+        report = stages.EVALUATE.run(run, learned, *asked, keep=True, task=task, **options)
     _warn_of(report)
     if plot is not None:
         render.open_loop_plot(report, plot)
@@ -1142,9 +1150,7 @@ def serve(
         str, Option(help="Address to listen at; 0.0.0.0 lets every machine connect.")
     ] = "127.0.0.1",
     port: Annotated[int, Option(help="Port; 0 takes a free one.", callback=port_number)] = 8000,
-    task: Annotated[
-        str | None, Option(help="Which policy, if RUN is a stream of robot tasks.")
-    ] = None,
+    task: OfStream = None,
     prompt: Annotated[
         str | None, Option(metavar="TEXT", help="Instruction for observations without one.")
     ] = None,
@@ -1187,6 +1193,7 @@ def serve(
 def export(
     run: PolicyArg,
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    task: OfStream = None,
     form: Annotated[
         PolicyFormat,
         Option("--format", help="The layout of LeRobot's policies, or that of a checkpoint."),
@@ -1211,11 +1218,15 @@ def export(
     A Hugging Face backbone is written in the type that it was stored in before it was trained;
     checkpoints have float32.
 
+    Of a stream of robot tasks the policy of one task is written, with its low-rank terms as part of
+    the weights. A task that weighs several experts at a map, as those of igsp may, is refused.
+
     \b
     Example: aegis export runs/x --format lerobot --out policies/x
     Example: aegis export runs/x --format aegis --dtype bfloat16 --out policies/x
+    Example: aegis export runs/bench --task open-drawer --out policies/drawer
     """
-    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, as_json=as_json)
+    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, task=task, as_json=as_json)
 
 
 @app.command(short_help="Send a trained policy to the Hugging Face hub.")

@@ -372,4 +372,8 @@ PolicyArg = Annotated[
         "the hub.",
     ),
 ]
+OfStream = Annotated[
+    str | None,
+    Option("--task", metavar="NAME", help="Which policy, if RUN is a stream of robot tasks."),
+]
 AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

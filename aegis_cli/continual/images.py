@@ -23,12 +23,13 @@ from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, learners
 from aegis_cli.continual.learners.base import Learner
 from aegis_cli.continual.report import ImageStreamReport, StreamReport, as_rows
-from aegis_cli.continual.state import StreamRun
+from aegis_cli.continual.state import WHOLE, StreamRun
 from aegis_cli.core import routing
 from aegis_cli.core.accuracy_matrix import scores
 from aegis_cli.core.gaussians import NONE, Gaussian, fit, infer
 from aegis_cli.core.routing import Routed, activate
 from aegis_cli.data import spread, streams
+from aegis_cli.data.batch import Share
 from aegis_cli.data.streams import folders, mtil
 from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.models import backbones
@@ -344,6 +345,8 @@ def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[S
 class ClassificationLoss:
     """Cross-entropy over a task's own classes, whose names stand in the first template."""
 
+    passes = calibration_passes = 1
+
     def __init__(self, task: StreamTask, encoder: DualEncoder, label_smoothing: float) -> None:
         self.name, self.size = task.name, len(task.train)
         self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
@@ -351,14 +354,14 @@ class ClassificationLoss:
         # the classes' features [C, D], as long as nothing that learns acts on them
         self._texts: Tensor | None = None
 
-    def fetch(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def fetch(self, rows: Tensor, step: int | None = None) -> tuple[Tensor, Tensor]:
         """Images [B, H, W, 3] uint8 and labels [B]."""
         return self._task.train.images(rows), self._task.train.labels[rows]
 
-    def loss(self, batch: tuple[Tensor, Tensor], step: int) -> Tensor:
+    def loss(self, batch: tuple[Tensor, Tensor], step: int, share: Share = WHOLE) -> Tensor:
         return self._loss(batch, self._class_features)
 
-    def calibration_loss(self) -> Tensor:
+    def calibration_loss(self, share: Share = WHOLE) -> Tensor:
         # Without the kept features: the text tower's routers are measured on this pass too.
         return self._loss(self._calibration, self._class_weights)
 

@@ -19,7 +19,8 @@ from aegis_cli.continual.learners.base import Constraint, Flows, TaskContext
 from aegis_cli.continual.report import SiteRouting, TaskRecord, history_mass, record_from, untouched
 from aegis_cli.continual.state import AnyStreamRun, Objective
 from aegis_cli.core.identification import Flow, flow, total_variation, where_read
-from aegis_cli.core.routing import activate, traced
+from aegis_cli.core.routing import Traced, activate, traced
+from aegis_cli.data.batch import Share
 from aegis_cli.training import folder
 from aegis_cli.training.schedule import BatchOrder, warmup_then_decay
 
@@ -47,6 +48,10 @@ class TaskTraining:
     slower: str
     constraint: Constraint | None = None
 
+    def fetch(self, step: int) -> Any:
+        """The examples of a step."""
+        return self.objective.fetch(torch.from_numpy(self.order.rows(step)), step)
+
 
 def learn(
     run: AnyStreamRun,
@@ -66,21 +71,18 @@ def learn(
         KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     current, settings = run.current, run.recipe.train
-    training = _prepare(run, prototypes, optimizer)
+    training = prepare(run, prototypes, optimizer)
     loss: float | None = None
     started = time.perf_counter()
 
-    def fetch(step: int) -> Any:
-        return training.objective.fetch(torch.from_numpy(training.order.rows(step)))
-
     steps = settings.steps if run.learner.trains != "nothing" else 0
-    ahead = prefetch.ahead(fetch, range(current.step, steps))
+    ahead = prefetch.ahead(training.fetch, range(current.step, steps))
     stage = f"task {current.task + 1} {training.objective.name}"
     with ahead as batches, interrupts.saved_first(stage, on_event) as signaled:
         if current.step < steps:
             on_event(Progress(stage, current.step, steps, "steps"))
         for step in range(current.step, steps):
-            loss = _step(run, training, step, next(batches))
+            loss = take(run, training, step, next(batches))
             current.window.append(loss)
             current.step = step + 1
             if current.phase == 1:
@@ -102,7 +104,7 @@ def learn(
 # --- before ---------------------------------------------------------------------------------------
 
 
-def _prepare(
+def prepare(
     run: AnyStreamRun, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
 ) -> TaskTraining:
     """Let the learner begin the task, unless it has done so before the run was interrupted."""
@@ -144,7 +146,7 @@ def _learning_maps(run: AnyStreamRun) -> dict[str, int]:
 # --- a step ---------------------------------------------------------------------------------------
 
 
-def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> float:
+def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> float:
     """Take one step, and return the task's own loss before it.
 
     Raises:
@@ -159,15 +161,23 @@ def _step(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> f
     # A measurement may have left another task's routers active.
     activate(run.sites, run.learner.router(current.task))
     identification = run.learner.identification if current.phase == 1 else None
-    with devices.autocast(run.device, settings.precision):
-        if identification is None:
-            loss = total = training.objective.loss(batch, step)
-        else:
-            with traced(run.sites) as traces:
-                loss = training.objective.loss(batch, step)
-            total = loss + identification.penalty(training.context, traces)
-    # Outside autocast, as PyTorch advises: the way back is in the types of the way there anyway.
-    total.backward()
+    losses, passes = [], training.objective.passes
+    for share in (Share(number, passes) for number in range(passes)):
+        with devices.autocast(run.device, settings.precision):
+            if identification is None:
+                loss = total = training.objective.loss(batch, step, share)
+            else:
+                with traced(run.sites) as traces:
+                    loss = training.objective.loss(batch, step, share)
+                # A pass charges its own positions, by its frames' share of the price.
+                rows = share.rows(settings.batch_size)
+                paid = (rows.stop - rows.start) / settings.batch_size
+                total = loss + identification.penalty(training.context, traces, paid)
+        # Outside autocast, as PyTorch advises: the way back is in the types of the way there
+        # anyway.
+        total.backward()
+        losses.append(loss.detach())
+    loss = torch.stack(losses).sum()
     learning = []
     for group in optimizer.param_groups:
         learning += group["params"]
@@ -263,17 +273,26 @@ def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
     task = run.learner.router(run.current.task)
     activate(run.sites, task)
     run.model.eval()
-    # With its graph: `where_read` goes back from the loss to find the positions that it reads.
-    with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
-        loss = training.objective.calibration_loss()
-    run.model.train()
     used = {}
     for name, site in run.sites.items():
         router = site.router(task)
         if router is not None:
             used[name] = site.of(router.experts)
-    passes = where_read({name: traces[name] for name in used}, loss)
+    passes: dict[str, list[Traced]] = {name: [] for name in used}
+    count = training.objective.calibration_passes
+    for share in (Share(number, count) for number in range(count)):
+        # With its graph: `where_read` goes back from the loss to find the positions that it reads.
+        with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
+            loss = training.objective.calibration_loss(share)
+        for name, found in where_read({name: traces[name] for name in used}, loss).items():
+            passes[name] += map(_without_graph, found)
+    run.model.train()
     return {name: flow(passed, used[name]) for name, passed in passes.items()}
+
+
+def _without_graph(passed: Traced) -> Traced:
+    """What `flow` reads of a pass, which keeps neither the graph nor the outputs in memory."""
+    return Traced(passed.weights.detach(), passed.codes.detach(), passed.outputs.detach()[:0])
 
 
 # --- after ----------------------------------------------------------------------------------------

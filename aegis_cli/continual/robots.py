@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,7 +23,7 @@ from torch import Tensor, nn
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import Event, OnEvent, Progress, ignore
+from aegis_cli.common.events import Event, OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
@@ -37,28 +38,29 @@ from aegis_cli.continual.report import (
     SuccessMatrix,
     vqa_scores,
 )
-from aegis_cli.continual.state import StreamRun, changed_inputs
+from aegis_cli.continual.state import WHOLE, StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.routing import Routed
-from aegis_cli.data import demonstrations, mixture, renaming, spread, task_episodes
-from aegis_cli.data.batch import Normalizer, RobotBatch
+from aegis_cli.data import augment, demonstrations, mixture, renaming, spread, task_episodes
+from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.metrics import score
 from aegis_cli.models import backbones, policy_meta
-from aegis_cli.models.acting import Acting, play
+from aegis_cli.models.acting import Acting, longest_s, play
 from aegis_cli.models.asking import ask
-from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
-from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe
+from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe, RobotTrain
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
 from aegis_cli.training.up_to_date import Made, StageRecords
+from aegis_cli.training.validation_time import expected_s
 
 # Training frames, evenly spaced, on which routers are measured, always with the same noise.
 CALIBRATION_FRAMES = 32
@@ -169,6 +171,30 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         sizes = checkpoint.sizes_of(view)
         return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
 
+    @property
+    def origin(self) -> dict[str, str]:
+        """Of a policy's meta what the backbone was before the stream: `stored`, `base_model`."""
+        backbone, found = self.model.backbone, dict[str, str]()
+        if backbone.hub_id is not None:
+            found["base_model"] = backbone.hub_id
+        if backbone.stored != FLOAT32:
+            found["stored"] = backbone.stored
+        return found
+
+    def meta(self, task: int) -> PolicyMeta:
+        """What a user of the policy of the task of that number has to know."""
+        recipe = self.recipe
+        found: dict[str, Any] = {
+            "method": recipe.train.method,
+            "task": self.names[task] if recipe.simulated else None,
+            "replan": recipe.rollout.replan,
+            "normalization": recipe.train.normalization,
+        }
+        chosen = recipes.selected(recipe)
+        if "only" in chosen:
+            chosen["only"] = chosen["only"][task]
+        return cast(PolicyMeta, {**found, **chosen, **self.views[task], **self.origin})
+
     def activate(self, task: int | None) -> None:
         """Let every map compute for the task of that number; None: the bare backbone."""
         routing.activate(self.sites, None if task is None else self.learner.router(task))
@@ -200,7 +226,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         if not self.recipe.simulated:
             current.intervals.append(self.measuring.intervals(current.task))
         current.vqa.append(self.measuring.vqa())
-        loss = self._validation_loss()
+        loss = self.validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
         if not self.recipe.simulated:
             figures["action error"] = current.oracle[-1][-1]
@@ -208,13 +234,14 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         check_finite(figures, where, self.slower(self.parameters()), self.recipe.train.steps)
         return {"validation_loss": loss}
 
-    def _validation_loss(self) -> float:
+    def validation_loss(self, on_event: OnEvent = ignore) -> float:
         """The loss of the task just learned, on held-out episodes."""
         number, settings = self.current.task, self.recipe.train
         self.activate(number)
         noise = _seed(self.recipe.seed, number * settings.steps, VALIDATION_NOISE)
         policy = self.policies[number].eval()
-        return train.validation_loss(policy, self.demos[number], settings, noise)
+        demos = self.demos[number]
+        return train.validation_loss(policy, demos, settings, noise, on_event=on_event)
 
     def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
         """Every task is tried once: with frozen experts a column has one policy in all rows."""
@@ -269,6 +296,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             "tasks": list(self.names),
             "shape": self.model.expert.shape.to_json(),
         }
+        meta |= self.origin
         if any(self.views):
             meta["views"] = list(self.views)
         if self.sites:
@@ -301,9 +329,11 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         else:
             sim.check(task)
     backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    if recipe.train.gradient_checkpointing:
+        backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
-    _check_given(recipe)
+    _check_given(recipe, on_event)
     for task in recipe.tasks if recipe.simulated else ():
         _check_words(backbone, task)
     # Only now, when all else has been found to fit: recording takes long.
@@ -313,8 +343,9 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    views = [_view(recipe, shown, backbone) for shown in demos]
+    views = [_view(recipe, *each, backbone) for each in zip(demos, scales, strict=True)]
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
+    run.model.expert.recomputes = recipe.train.gradient_checkpointing
     run.measure_with(source, on_event)
     return run
 
@@ -469,7 +500,7 @@ def no_simulator(run: Path, task: str) -> AegisError:
         f"'{task}' of the stream in '{run}', a task that no simulator has",
         "a simulated task, to be played",
         f"let the robot act: {commands.aegis('serve', run, '--task', task)}; how far its actions "
-        f"are from held-out ones, {commands.aegis('inspect', run)} shows",
+        f"are from held-out ones, {commands.aegis('evaluate', run, '--task', task)} shows",
     )
 
 
@@ -477,9 +508,11 @@ def number_of(path: Path, task: str | None) -> int:
     """The number of one of a run's tasks.
 
     Raises:
-        AegisError: a task that the run has not learned, or none named.
+        AegisError: a task that the run has not learned, or none named where it has several.
     """
     known = files.read(path).tasks
+    if task is None and len(known) == 1:
+        return 0
     if task not in known:
         named = "no --task" if task is None else f"task '{task}'"
         raise AegisError(
@@ -534,9 +567,13 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
     return views
 
 
-def _view(recipe: RobotStreamRecipe, shown: Demonstrations, backbone: Backbone) -> PolicyMeta:
+def _view(
+    recipe: RobotStreamRecipe, shown: Demonstrations, scales: Scales, backbone: Backbone
+) -> PolicyMeta:
     """How a task's policy looks; of a robot that is not simulated also what its numbers are."""
     found = assemble.view(shown, backbone)
+    if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
+        found["action_std"] = shown.action_std
     if recipe.demos.rename is not None:
         found["rename"] = recipe.demos.rename
     if recipe.simulated:
@@ -597,7 +634,7 @@ def _check_words(backbone: Backbone, task: str) -> None:
         backbone.prepare(picture, [template.format(color=COLORS[0])])
 
 
-def _check_given(recipe: RobotStreamRecipe) -> None:
+def _check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
     """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
 
     To decode the first task's frames can take hours.
@@ -614,6 +651,34 @@ def _check_given(recipe: RobotStreamRecipe) -> None:
         if not recipe.simulated:
             robot = mixture.robot_of(path, selection)  # with its cameras and features
             _check_task(robot.task, recipe.tasks[number], path)
+    if not recipe.simulated:
+        _check_own_episodes(recipe, on_event)
+
+
+def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
+    """Refuse tasks that learn from the same episodes, and warn of those that share some.
+
+    Raises:
+        AegisError: two tasks have all of their episodes in common.
+    """
+    seen: list[tuple[str, Path, set[int]]] = []
+    for number, task in enumerate(recipe.tasks):
+        path, selection = given(recipe, number)
+        count = demonstrations.count_episodes(path)
+        own = set(demonstrations.learned_from(path, count, selection.only).tolist())
+        place = demonstrations.locate(path).resolve()  # a folder may be named in two ways
+        for other, elsewhere, theirs in seen:
+            if elsewhere != place or not own & theirs:
+                continue
+            if own == theirs:
+                raise AegisError(
+                    f"the same {len(own)} episodes of '{path}' for '{other}' and '{task}'",
+                    "episodes of its own for each task",
+                    "correct demos.only, or demos.paths",
+                )
+            shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
+            on_event(Warned("train", f"{shared}, which learn from them twice"))
+        seen.append((task, place, own))
 
 
 def _demos(
@@ -679,9 +744,9 @@ def _source(
     """
     if recipe.demos.paths is not None:
         return given(recipe, number)
-    home = out.parent / "demos"
-    make_folder(home)
-    made = record(recipe, number, StageRecords(home, on_event))
+    records = _records(out, on_event)
+    make_folder(records.folder)
+    made = record(recipe, number, records)
     return made.path, recipe.demos.selection(only=None)
 
 
@@ -691,28 +756,66 @@ def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
     Raises:
         AegisError: nothing is there, or it cannot be told which episodes are the task's.
     """
-    demos, named = recipe.demos, recipe.demos.of_task(number)
-    path = demonstrations.at(named)
+    demos = recipe.demos
+    path = demonstrations.at(demos.of_task(number))
     if demos.only is not None:
         return path, demos.selection(demos.only[number])
-    of_each = [demos.of_task(i) for i in range(len(recipe.tasks))]
-    shared = of_each.count(named) > 1
-    if shared and not recipe.simulated:
+    if _is_shared(recipe, number) and not recipe.simulated:
         raise AegisError(
             f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
             "would learn",
             "demonstrations of its own for each task, or which of these episodes are whose",
             "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
         )
-    only = demonstrations.part_of(path, recipe.tasks[number], shared)
+    only = demonstrations.part_of(path, recipe.tasks[number], _is_shared(recipe, number))
     return path, demos.selection(only)
+
+
+def _is_shared(recipe: RobotStreamRecipe, number: int) -> bool:
+    """Whether other tasks learn from the same demonstrations as the task of that number."""
+    of_each = [recipe.demos.of_task(i) for i in range(len(recipe.tasks))]
+    return of_each.count(of_each[number]) > 1
+
+
+def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, Any]:
+    """What the task of that number would have learned of demonstrations, as `recipes.selected`.
+
+    Args:
+        path: where they lie by now; also others than it learned from.
+    """
+    chosen, demos = recipes.selected(recipe), recipe.demos
+    only = None
+    if demos.only is not None:
+        only = demos.only[number]
+    elif demos.paths is not None:
+        try:
+            shared = _is_shared(recipe, number)
+            only = demonstrations.part_of(path, recipe.tasks[number], shared)
+        except AegisError:  # others, whose episodes cannot be told apart: then all are meant
+            only = None
+    return chosen if only is None else {**chosen, "only": only}
+
+
+def place_of(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
+    """Where the demonstrations that the task of that number learned from lie, or lay."""
+    if recipe.demos.paths is not None:
+        return Path(recipe.demos.of_task(number))
+    return _records(run, ignore).recorded(recipe.tasks[number], _to_record(recipe))
 
 
 def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
     """The demonstrations of one task, recorded as the recipe says unless they are there."""
+    return records.demonstrations(recipe.tasks[number], _to_record(recipe))
+
+
+def _records(run: Path, on_event: OnEvent) -> StageRecords:
+    """What is recorded for a run, beside it."""
+    return StageRecords(run.parent / "demos", on_event)
+
+
+def _to_record(recipe: RobotStreamRecipe) -> Demos:
     settings = recipe.demos
-    asked = Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
-    return records.demonstrations(recipe.tasks[number], asked)
+    return Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
 
 
 def share(
@@ -788,24 +891,53 @@ class FlowMatchingLoss:
         self._settings, self._seed = recipe.train, recipe.seed
         self._policy, self._demos = policy, demos
         self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_FRAMES))
+        self.passes = recipe.train.accumulate
+        self.calibration_passes = calibration_passes(recipe.train, len(self._calibration))
 
-    def fetch(self, rows: Tensor) -> RobotBatch:
-        return self._demos.batch(self._demos.train[rows], self._settings.chunk)
+    def fetch(self, rows: Tensor, step: int | None = None) -> RobotBatch:
+        settings, frames = self._settings, self._demos.train[rows]
+        batch = self._demos.batch(frames, settings.chunk)
+        if step is None or settings.augment is None:
+            return batch
+        numbers, drawn = frames.tolist(), (settings.augment, settings.augment_count, self._seed)
+        # By the step of the whole stream: two tasks may have frames of the same numbers.
+        at, repeats = self._first_step + step, augment.earlier(numbers)
+        images = augment.augmented(batch.images, numbers, *drawn, at, repeats)
+        return dataclasses.replace(batch, images=images)
 
-    def loss(self, batch: RobotBatch, step: int) -> Tensor:
-        return self._loss(batch, generator(self._seed, self._first_step + step, TRAINING_NOISE))
+    def loss(self, batch: RobotBatch, step: int, share: Share = WHOLE) -> Tensor:
+        draws = generator(self._seed, self._first_step + step, TRAINING_NOISE)
+        return self._loss(batch, draws, share)
 
-    def calibration_loss(self) -> Tensor:
+    def calibration_loss(self, share: Share = WHOLE) -> Tensor:
         # The same noise at each check, so that routers that stand still are seen to.
         draws = generator(self._seed, self._first_step, CALIBRATION_NOISE)
-        return self._loss(self._calibration, draws)
+        return self._loss(self._calibration, draws, share)
 
     def trainable_changed(self) -> None:
         """Nothing is kept from step to step."""
 
-    def _loss(self, batch: RobotBatch, draws: torch.Generator) -> Tensor:
-        encoding = self._policy.encode(batch.images, batch.instructions)
-        return self._policy.flow_loss(batch, encoding, self._settings.flow_samples, draws)
+    def _loss(self, batch: RobotBatch, draws: torch.Generator, share: Share) -> Tensor:
+        # Each pass draws the whole batch's noise, and takes its own frames' of it.
+        of = WholeBatch(len(batch), int((~batch.is_pad).sum()), share)
+        part = batch if share == WHOLE else batch.rows(share.rows(len(batch)))
+        encoding = self._policy.encode(part.images, part.instructions)
+        samples = self._settings.flow_samples
+        return self._policy.flow_loss(part, encoding, samples, draws, of=of)
+
+
+def calibration_passes(settings: RobotTrain, frames: int) -> int:
+    """In how many passes routers are measured on so many frames, for no more memory than a step's.
+
+    What is measured is no training, in which alone a Hugging Face model checkpoints gradients: one
+    frame at a time takes less than a step with them.
+    """
+    if settings.gradient_checkpointing:
+        return frames
+    if settings.accumulate == 1:
+        return 1  # as it always was
+    of_a_pass = max(1, settings.batch_size // settings.accumulate)
+    return -(-frames // of_a_pass)  # rounded up
 
 
 def generator(seed: int, index: int, purpose: int) -> torch.Generator:
@@ -829,10 +961,13 @@ class RobotEvaluator(ABC):
     """How tasks are done with the task told, and questions with no task active.
 
     The questions are the same every time, and so is what a task is tried on.
+
+    Attributes:
+        on_event: hears of its progress.
     """
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
-        self._run, self._on_event = run, on_event
+        self._run, self.on_event = run, on_event
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
         # settings are chosen by other questions than those that figures are of
         part = "validation" if run.recipe.rollout.split == "validation" else "probe"
@@ -859,18 +994,38 @@ class RobotEvaluator(ABC):
     def tried(self, task: int) -> float:
         """How the task of that number is done now."""
 
+    def tried_s(self, task: int) -> float:
+        """About how many seconds `tried` takes, by its first parts."""
+        return expected_s(self._heard_by(partial(self.tried, task)))
+
+    def vqa_s(self) -> float:
+        """About how many seconds `vqa` takes."""
+        return expected_s(self._heard_by(self.vqa))
+
+    def _heard_by(self, work: Callable[[], object]) -> Callable[[OnEvent], None]:
+        """Some of its work, of whose progress somebody else hears."""
+
+        def heard(on_event: OnEvent) -> None:
+            before, self.on_event = self.on_event, on_event
+            try:
+                work()
+            finally:
+                self.on_event = before
+
+        return heard
+
     def vqa(self) -> list[float]:
         """Accuracy and cross-entropy of the backbone with no task active."""
         self._run.activate(None)
         model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
-        found = score(ask(model, self._asked, batch_size, self._on_event))
+        found = score(ask(model, self._asked, batch_size, self.on_event))
         return [found.accuracy, found.cross_entropy]
 
     def _named(self, task: str) -> OnEvent:
         """Events of a rollout, with the task's name."""
 
         def passed_on(event: Event) -> None:
-            self._on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
+            self.on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
 
         return passed_on
 
@@ -878,15 +1033,24 @@ class RobotEvaluator(ABC):
 class ClosedLoopEvaluator(RobotEvaluator):
     """Lets policies act in simulated tasks."""
 
+    def tried_s(self, task: int) -> float:
+        """About how many seconds `tried` takes if no episode ends early."""
+        acting, settings = self._run.acting(task), self._run.recipe.rollout
+        return longest_s(acting, settings.episodes, settings.colors, self._split, settings.seed)
+
+    @property
+    def _split(self) -> int:
+        named = {"evaluation": EVALUATION, "validation": VALIDATION}
+        return named[self._run.recipe.rollout.split]
+
     def tried(self, task: int) -> float:
         """Share of successes of the task of that number, or of the highest return."""
         acting, settings = self._run.acting(task), self._run.recipe.rollout
-        split = {"evaluation": EVALUATION, "validation": VALIDATION}[settings.split]
         found = play(
             acting,
             settings.episodes,
             settings.colors,
-            split,
+            self._split,
             on_event=self._named(acting.task),
             seed=settings.seed,
         )

@@ -28,11 +28,13 @@ from aegis_cli.continual.report import StreamReport, minutes, record_from, sums
 from aegis_cli.core import routing
 from aegis_cli.core.gaussians import Gaussian
 from aegis_cli.core.routing import Routed
+from aegis_cli.data.batch import Share
 from aegis_cli.recipes import RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import optimizer_state
 
 S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)
 STATE = "state.safetensors"
+WHOLE = Share()  # a batch in a single pass
 _GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
 
@@ -117,21 +119,31 @@ class Objective(Protocol):
     Attributes:
         name: the task's name.
         size: number of training examples.
+        passes, calibration_passes: in how many a step's loss is taken, and that of a calibration.
     """
 
     name: str
     size: int
+    passes: int
+    calibration_passes: int
 
-    def fetch(self, rows: Tensor) -> Any:
-        """The training examples with these numbers [B]."""
+    def fetch(self, rows: Tensor, step: int | None = None) -> Any:
+        """The training examples with these numbers [B].
 
-    def loss(self, batch: Any, step: int) -> Tensor:
+        Args:
+            step: that trains on them, for which they may be changed; None: as they are.
+        """
+
+    def loss(self, batch: Any, step: int, share: Share = WHOLE) -> Tensor:
         """The task's own loss of a batch of `fetch`, with its graph.
 
         Whatever is drawn at random follows from `step`, so that a resumed run draws it again.
+
+        Args:
+            share: the part of the batch that passes; what all contribute adds up to its loss.
         """
 
-    def calibration_loss(self) -> Tensor:
+    def calibration_loss(self, share: Share = WHOLE) -> Tensor:
         """The loss of the same few examples every time, on which routers are measured."""
 
     def trainable_changed(self) -> None:
@@ -391,6 +403,17 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
+
+
+def place_in(path: Path) -> TaskInProgress:
+    """Where a state is in its stream, by its header alone.
+
+    Raises:
+        AegisError: it is damaged.
+    """
+    meta = artifacts.read_header(path).meta
+    with reading_meta(path):
+        return TaskInProgress(**meta["place"])
 
 
 def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:

@@ -66,7 +66,7 @@ def _run(
     overwrite: bool,
     on_event: OnEvent,
 ) -> StreamReport:
-    folder.check(out, recipe, resume, overwrite, _read(recipe))
+    folder.check(out, recipe, resume, overwrite, read_by(recipe))
     if files.is_done(out) and not overwrite:
         _check_same_recording(out, recipe)
         return files.read(out)
@@ -90,7 +90,7 @@ def _run(
     return report
 
 
-def _read(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
+def read_by(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
     """The model and the data that a stream is made from."""
     if isinstance(recipe, StreamRecipe):
         return (recipe.encoder, recipe.path)

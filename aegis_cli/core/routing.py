@@ -270,6 +270,22 @@ class RoutedLinear(nn.Module):
         for number in set(self.numbers) - used:
             del self.experts[str(number)]
 
+    @torch.no_grad()
+    def merged(self, task: int) -> nn.Linear:
+        """The map with the task's only expert in its weights; bare where the task has no router.
+
+        Raises:
+            ValueError: the router weighs several, each by what is read, as no weights do.
+        """
+        router = self.router(task)
+        if router is None:
+            return self.base
+        if len(router.experts) > 1:
+            raise ValueError(f"a router over {len(router.experts)} experts")
+        (expert,) = self.of(router.experts)  # whose weight is 1
+        self.base.weight.addmm_(expert.b, expert.a, alpha=float(router.scale))
+        return self.base
+
     def count(self) -> int:
         """How many numbers it stores beside the map: experts, routers and scales."""
         return sum(p.numel() for part in (self.experts, self.routers) for p in part.parameters())
@@ -321,6 +337,23 @@ def route(root: nn.Module, sites: Mapping[str, nn.Linear]) -> dict[str, RoutedLi
         routed[name] = RoutedLinear(linear)
         setattr(root.get_submodule(parent), leaf, routed[name])
     return routed
+
+
+def merge(root: nn.Module, sites: Routed, task: int) -> None:
+    """Put a plain map in the place of each routed one, which computes what the task has there.
+
+    The routed maps are of no use afterwards.
+
+    Args:
+        sites: by their dotted names in `root`, as `route` gave them.
+
+    Raises:
+        ValueError: as `RoutedLinear.merged`; nothing has been replaced then.
+    """
+    plain = {name: site.merged(task) for name, site in sites.items()}
+    for name, linear in plain.items():
+        parent, _, leaf = name.rpartition(".")
+        setattr(root.get_submodule(parent), leaf, linear)
 
 
 def activate(sites: Routed, task: int | None) -> None:

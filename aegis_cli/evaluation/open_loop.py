@@ -180,6 +180,7 @@ def run(
     on_event: OnEvent = ignore,
     keep: bool = False,
     rename: Renaming = (),
+    task: str | None = None,
 ) -> OpenLoopReport:
     """Compare a run's predictions with demonstrations, frame by frame.
 
@@ -196,23 +197,66 @@ def run(
         keep: write the report into the run's folder, if it is that of a run or a checkpoint of it.
         rename: what the policy calls cameras, features and joints of these demonstrations, besides
             what the training renamed.
+        task: the policy's own, if any is named.
 
     Raises:
-        AegisError: no such run, demonstrations that do not fit the policy, or episodes that cannot
-            be told from those that it was trained on.
+        AegisError: no such run, another task than its own, demonstrations that do not fit the
+            policy, or episodes that cannot be told from those that it was trained on.
     """
     run_path, data = Path(run_path), Path(data)
-    source = _Source.find(run_path)
+    source, place = Source.find(run_path)
     with loading_told(_STAGE, on_event):
-        policy, meta = checkpoint.load_policy(source.checkpoint)
-    mixture.check_rename((data,), rename)
-    learned = source.selection(meta, data, rename)
+        policy, meta = checkpoint.load_policy(place)
+    checkpoint.check_task(meta, task)
+    asked = Asked(episodes, frames, seed, batch_size, traced, rename)
+    report = evaluated(source, policy, meta, data, asked, source.before(), on_event)
+    if keep:
+        kept = {"episodes": None if episodes is None else list(episodes), "frames": frames}
+        kept |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
+        kept |= {"rename": dict(rename)} if rename else {}
+        name = f"{results.OPEN_LOOP}-{report.split}-{data.absolute().name}"
+        results.keep_if_possible(run_path, name, report.kept(), kept, on_event)
+    return report
+
+
+class Asked(NamedTuple):
+    """What `aegis evaluate` is asked for beside the policy and the demonstrations: see `run`."""
+
+    episodes: Sequence[int] | None = None
+    frames: int = 1000
+    seed: int = 0
+    batch_size: int = 64
+    traced: bool = False
+    rename: Renaming = ()
+
+
+def evaluated(
+    source: Source,
+    policy: Policy,
+    meta: PolicyMeta,
+    data: Path,
+    asked: Asked,
+    earlier: Sequence[Earlier] = (),
+    on_event: OnEvent = ignore,
+) -> OpenLoopReport:
+    """Compare a policy's predictions with demonstrations, frame by frame.
+
+    Args:
+        source: what is known of its training.
+        earlier: what it may have learned from besides.
+
+    Raises:
+        AegisError: demonstrations that do not fit the policy, or episodes that cannot be told from
+            those that it was trained on.
+    """
+    mixture.check_rename((data,), asked.rename)
+    learned = source.selection(meta, data, asked.rename)
     _check_robot(policy, meta, data, learned, on_event)
-    chosen = source.choose(learned, data, episodes)
-    _warn_of_earlier_learning(source, data, rename, chosen.episodes, on_event)
+    chosen = source.choose(learned, data, asked.episodes)
+    _warn_of_earlier_learning(earlier, data, asked.rename, chosen.episodes, on_event)
     shown = _shown(policy, meta, data, learned, chosen, on_event)
-    at = _spread(shown, chosen.episodes, frames)
-    policy = policy.to(devices.pick())
+    at = _spread(shown, chosen.episodes, asked.frames)
+    policy, seed, batch_size = policy.to(devices.pick()), asked.seed, asked.batch_size
     predicted = predict(policy, shown, at, seed, batch_size, _STAGE, on_event)
     found = compare(shown, at, predicted, _training_std(policy, meta, on_event))
     report = dataclasses.replace(
@@ -221,15 +265,9 @@ def run(
         split=chosen.split,
         trained_on=[one for one in chosen.trained_on if one in found.episodes],
         seed=seed,
-        traces=_traces(policy, meta, shown, chosen, seed, batch_size) if traced else [],
+        traces=_traces(policy, meta, shown, chosen, seed, batch_size) if asked.traced else [],
     )
     _warn_of_standing_still(report, on_event)
-    if keep:
-        asked = {"episodes": None if episodes is None else list(episodes), "frames": frames}
-        asked |= {"seed": seed, "path": str(data.absolute() if data.exists() else data)}
-        asked |= {"rename": dict(rename)} if rename else {}
-        name = f"{results.OPEN_LOOP}-{chosen.split}-{data.absolute().name}"
-        results.keep_if_possible(run_path, name, report.kept(), asked, on_event)
     return report
 
 
@@ -266,47 +304,102 @@ def _refuse_stream(run: Path) -> None:
     if recipes.is_stream_run(run):
         raise AegisError(
             f"'{run}', the run of a stream",
-            "the run of one policy",
+            "the run of one policy, or of a stream of robot tasks with --task",
             "evaluate a run that aegis train wrote from a recipe of kind policy",
         )
 
 
-@dataclass(frozen=True)
-class _Source:
-    """A checkpoint, and what is known of its training.
+class Learned(NamedTuple):
+    """What a training read of its demonstrations, and which of them it held out.
 
-    Outside a run `recipe` is None; a folder in LeRobot's layout does not have the `digests` of the
+    Attributes:
+        read: of the recipe's section `demos` what `recipes.selected` tells.
+        camera: as the recipe has it.
+        share, seed: by which episodes were held out.
+        starts: the models that the training began with, as the recipe names them.
+    """
+
+    read: dict[str, Any]
+    camera: str | tuple[str, ...] | None
+    share: float
+    seed: int
+    starts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, recipe: recipes.Recipe) -> Learned:
+        """What the training of one policy has read and held out."""
+        demos, share = recipe.demos, recipe.train.validation_share
+        starts = (recipe.expert.start, backbones.divided(recipe.backbone)[0])
+        named = tuple(name for name in starts if name is not None)
+        return cls(recipes.selected(recipe), demos.camera, share, recipe.seed, named)
+
+
+class Earlier(NamedTuple):
+    """A training that a policy may owe something to besides its own.
+
+    Attributes:
+        said: by whom or as what episodes were trained on, and what that means.
+    """
+
+    said: str
+    source: Source
+    meta: PolicyMeta
+
+
+@dataclass(frozen=True)
+class Source:
+    """A policy, and what is known of its training.
+
+    Outside a run `learned` is None; a folder in LeRobot's layout does not have the `digests` of the
     demonstrations either.
 
     Attributes:
-        name: what the checkpoint is called in an error.
+        words: what names the policy in a command, its folder first.
         places: where the run found its demonstrations, as far as it says so.
     """
 
-    name: str
-    checkpoint: Path
-    recipe: recipes.Recipe | None
+    words: tuple[str, ...]
+    learned: Learned | None
     digests: frozenset[str]
     places: frozenset[Path] = frozenset()
 
     @classmethod
-    def find(cls, run: Path) -> _Source:
-        """The checkpoint of a run or policy, and what its run, if it lies in one, tells of it.
+    def find(cls, run: Path) -> tuple[Source, Path]:
+        """What is known of a run or policy, and the checkpoint to load.
 
         Raises:
             AegisError: no such run, or that of a stream.
         """
         _refuse_stream(run)
-        name, run = str(run), download.locate(run)
+        words, run = (str(run),), download.locate(run)
         if lerobot_folder.is_policy(run):
-            return cls(name, run, None, frozenset())
+            return cls(words, None, frozenset()), run
         chosen = checkpoint.chosen(run)
         folder = run if (run / "recipe.yaml").is_file() else checkpoint.run_of(run)
         recipe = None if folder is None else recipes.load(folder / "recipe.yaml")
         header = artifacts.read_header(chosen / checkpoint.EXPERT)
         kept = None if folder is None else inputs.of(folder)
         places = frozenset(Path(place).resolve() for place in kept.demos) if kept else frozenset()
-        return cls(name, chosen, recipe, mixture.digests(header.inputs), places)
+        learned = None if recipe is None else Learned.of(recipe)
+        return cls(words, learned, mixture.digests(header.inputs), places), chosen
+
+    @property
+    def name(self) -> str:
+        """What the policy is called in an error."""
+        return self.words[0]
+
+    def before(self) -> list[Earlier]:
+        """The trainings that this one began with, and theirs, as far as they are still whole."""
+        found = []
+        for run in [] if self.learned is None else _began_with(self.learned):
+            try:
+                source, place = Source.find(run)
+                meta = artifacts.read_header(place / checkpoint.EXPERT).meta
+            except AegisError:
+                continue
+            said = f"by '{run}', with which '{self.name}' began: the policy has learned from them"
+            found.append(Earlier(f"{said} already", source, cast(PolicyMeta, meta)))
+        return found
 
     def selection(self, meta: PolicyMeta, data: Path, rename: Renaming = ()) -> Selection:
         """What training read of demonstrations like these, as far as it is known.
@@ -319,8 +412,8 @@ class _Source:
         """
         own = ("only", "state", "action", "rename")
         known: dict[str, Any] = {name: meta[name] for name in own if name in meta}
-        if self.recipe is not None:
-            known = recipes.selected(self.recipe)
+        if self.learned is not None:
+            known = self.learned.read
         known = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
         known["rename"] = renaming.of(known.get("rename", {}) | dict(rename))
         at = demonstrations.locate(data)
@@ -333,9 +426,9 @@ class _Source:
         """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
         own = layout.read_info(data).cameras
         known = [renaming.feature(rename, name) for name in own]
-        if self.recipe is not None and self.recipe.demos.camera is not None:
-            _check_cameras(self.recipe.demos.camera, known, data)
-            return self.recipe.demos.camera
+        if self.learned is not None and self.learned.camera is not None:
+            _check_cameras(self.learned.camera, known, data)
+            return self.learned.camera
         named = meta.get("cameras", ())
         by_name = {layout.short(camera): camera for camera in known}
         short = [layout.short(camera) for camera in named]
@@ -360,11 +453,11 @@ class _Source:
         # Told apart by what the data holds, and not by where it lies.
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
             if asked is None and data.resolve() in self.places:
-                raise _has_changed(self.name, data, count)
+                raise _has_changed(self.words, data, count)
             everything = OTHER if self.digests else UNKNOWN
             split = everything if asked is None else CHOSEN
             return _Chosen(split, _existing(asked, count, data), [])
-        if self.recipe is None:
+        if self.learned is None:
             if asked is not None:
                 return _Chosen(CHOSEN, _existing(asked, count, data), [])
             raise AegisError(
@@ -373,10 +466,10 @@ class _Source:
                 "give the run's folder, choose the episodes (--episodes 6,7), or give "
                 "demonstrations that it was not trained on",
             )
-        share = self.recipe.train.validation_share
+        share, seed = self.learned.share, self.learned.seed
         # Drawn again as the training drew them: from the episodes that it learned from, by seed.
-        own = demonstrations.learned_from(data, count, self.recipe.demos.only)
-        held_out = own[demonstrations.held_out(len(own), share, self.recipe.seed)].tolist()
+        own = demonstrations.learned_from(data, count, self.learned.read.get("only"))
+        held_out = own[demonstrations.held_out(len(own), share, seed)].tolist()
         if asked is None:
             return _Chosen(VALIDATION, sorted(held_out), [])
         chosen = _existing(asked, count, data)
@@ -385,36 +478,34 @@ class _Source:
 
 
 def _warn_of_earlier_learning(
-    source: _Source, data: Path, rename: Renaming, episodes: Sequence[int], on_event: OnEvent
+    earlier: Sequence[Earlier],
+    data: Path,
+    rename: Renaming,
+    episodes: Sequence[int],
+    on_event: OnEvent,
 ) -> None:
-    """Warn where a run that the policy began with was trained on some of these episodes."""
-    for run in [] if source.recipe is None else _began_with(source.recipe):
+    """Warn where the policy owes something to another training on some of these episodes."""
+    for said, source, meta in earlier:
         try:
-            earlier = _Source.find(run)
-            meta = artifacts.read_header(earlier.checkpoint / checkpoint.EXPERT).meta
-            learned = earlier.selection(cast(PolicyMeta, meta), data, rename)
-            known = earlier.choose(learned, data, episodes).trained_on
+            learned = source.selection(meta, data, rename)
+            known = source.choose(learned, data, episodes).trained_on
         except AegisError:
-            # It is no longer whole, or these lack the cameras and features that it learned from.
+            # These lack the cameras and features that it learned from.
             continue
         if known:
-            text = (
-                f"{len(known)} of these {len(episodes)} episodes were trained on by '{run}', with "
-                f"which '{source.name}' began: the policy has learned from them already"
-            )
+            text = f"{len(known)} of these {len(episodes)} episodes were trained on {said}"
             on_event(Warned(_STAGE, text))
 
 
-def _began_with(recipe: recipes.Recipe) -> list[Path]:
+def _began_with(learned: Learned) -> list[Path]:
     """The runs whose backbone or expert a training began with, and theirs, as far as still here."""
-    found, waiting = list[Path](), [recipe]
+    found, waiting = list[Path](), [learned]
     while waiting:
-        own = waiting.pop()
-        for name in (own.expert.start, backbones.divided(own.backbone)[0]):
-            run = None if name is None else _run_here(Path(name))
+        for name in waiting.pop().starts:
+            run = _run_here(Path(name))
             if run is not None and run not in found:
                 found.append(run)
-                waiting.append(recipes.load(run / "recipe.yaml"))
+                waiting.append(Learned.of(recipes.load(run / "recipe.yaml")))
     return found
 
 
@@ -446,14 +537,14 @@ def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: P
     )
 
 
-def _has_changed(run: str, data: Path, count: int) -> AegisError:
+def _has_changed(words: Sequence[str], data: Path, count: int) -> AegisError:
     """The place is the training's, so most of its episodes may be those of the training."""
     return AegisError(
-        f"'{data}' is not as it was when '{run}' learned from it: episodes were added, removed or "
-        f"changed, and now there are {count}",
+        f"'{data}' is not as it was when '{words[0]}' learned from it: episodes were added, "
+        f"removed or changed, and now there are {count}",
         "the demonstrations as they were, whose held-out episodes are known, or episodes of your "
         "choice",
-        f"choose those that are new: {commands.aegis('evaluate', run, '--demos', data)} "
+        f"choose those that are new: {commands.aegis('evaluate', *words, '--demos', data)} "
         f"--episodes {count - 1}",
     )
 

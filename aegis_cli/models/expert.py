@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -139,6 +139,21 @@ class ActionExpert(nn.Module):
         self.final_norm = nn.LayerNorm(width)
         self.action_out = nn.Linear(width, shape.actions)
         self.float()
+
+    @torch.no_grad()
+    def of_robot(self, proprio: int, actions: int) -> ActionExpert:
+        """The expert of a robot with the first so many positions and actions alone.
+
+        It predicts what this one does where the others are 0.
+        """
+        found = ActionExpert(replace(self.shape, proprio=proprio, actions=actions))
+        tensors = self.state_dict()
+        for name, count in (("proprio_in", proprio), ("action_in", actions)):
+            tensors[f"{name}.weight"] = tensors[f"{name}.weight"][:, :count]
+        for name in ("action_out.weight", "action_out.bias"):
+            tensors[name] = tensors[name][:actions]
+        found.load_state_dict(tensors)
+        return found
 
     def compile_layers(self, backend: str = "inductor") -> None:
         """Compile the layers, which share what was compiled for the first of them."""

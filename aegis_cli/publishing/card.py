@@ -17,6 +17,9 @@ from typing import Any, cast
 from aegis_cli import inspection, methods, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.version import __version__
+from aegis_cli.continual import files as stream_files
+from aegis_cli.continual import learners, robots
+from aegis_cli.continual.report import ErrorMatrix, SuccessMatrix
 from aegis_cli.evaluation.results import (
     PlayedResult,
     Result,
@@ -27,7 +30,7 @@ from aegis_cli.evaluation.results import (
 from aegis_cli.inspection import InspectReport
 from aegis_cli.models import lerobot_folder
 from aegis_cli.models.policy_meta import PolicyMeta
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.sim import libero_table
 from aegis_cli.training import checkpoint, freezing
 from aegis_cli.training.card import model, without_folders, without_places
@@ -59,6 +62,39 @@ fine-tuned by Aegis {version} with the method `{method}`:
 
 {steps} steps, of {batch} frames each, seed {seed}; learning rate {backbone_lr:g} for the backbone
 and {expert_lr:g} for the expert. Options of the method: {options}.{frozen}{averaged}{merged}
+
+{stored}
+
+By sha256:
+
+{inputs}
+
+## Use
+
+{use}
+"""
+
+_CARD_OF_TASK = """---
+{front}
+---
+
+# {title}
+
+A robot policy made of the vision-language model {model} and an action expert that reads it.
+It is the policy of one task, {task}, of a stream that Aegis {version} let one model learn task
+after task with the method `{method}`: {tasks}.
+
+## What the VLM still knows
+
+{knowledge}
+
+## How the policy acts
+
+{acting}
+
+## Training
+
+{steps} steps a task, of {batch} frames each, seed {seed}. Options of the method: {options}.{frozen}
 
 {stored}
 
@@ -158,6 +194,87 @@ def text(
     )
 
 
+def of_stream(
+    run: Path,
+    number: int,
+    form: str,
+    repo: str,
+    stored: Stored,
+    meta: PolicyMeta,
+    cameras: Sequence[str] = (),
+) -> str:
+    """The card of the policy of the task of that number, of a stream of robot tasks.
+
+    Args:
+        form, repo, stored, cameras: as of `text`.
+        meta: of the policy.
+
+    Raises:
+        AegisError: a run that is damaged.
+    """
+    recipe = recipes.load(run / "recipe.yaml", kind=RobotStreamRecipe)
+    found, task = stream_files.read(run), recipe.tasks[number]
+    assert isinstance(found, SuccessMatrix | ErrorMatrix)
+    options = without_places(recipes.options(recipe))
+    header = artifacts.read_header(run / robots.ACTION_EXPERT)
+    digests = sorted(inputs_of_task(header.inputs, task).items())
+    looks_by = _looks_by(meta, meta["task"])
+    return _CARD_OF_TASK.format(
+        front=_front_matter(form, meta.get("base_model"), meta.get("dataset")),
+        title=f"{recipe.name}: {task} by {recipe.train.method}",
+        model=model(recipe, None),
+        task=task,
+        version=__version__,
+        method=recipe.train.method,
+        tasks=", ".join(recipe.tasks),
+        knowledge="\n".join(_known_after_stream(found, recipe, repo)),
+        acting="\n".join(_acting_of_task(found, number)),
+        steps=f"{recipe.train.steps:,}",
+        batch=recipe.train.batch_size,
+        seed=recipe.seed,
+        options=f"`{json.dumps(options, sort_keys=True)}`" if options else "none",
+        frozen=freezing.sentence(recipe.train.freeze, before=" "),
+        stored=stored,
+        inputs="\n".join(f"- {name}: `{digest}`" for name, digest in digests),
+        use=_use(form, repo, recipe, meta["task"], cameras, looks_by, meta.get("fps")),
+    )
+
+
+def inputs_of_task(inputs: Mapping[str, str], task: str) -> dict[str, str]:
+    """Of the inputs of a stream's run those of one of its tasks, named as those of one policy."""
+    found = {"backbone": inputs["backbone"]} if "backbone" in inputs else {}
+    demos = inputs.get(f"demos of {task}")
+    return found if demos is None else {**found, "demos": demos}
+
+
+def _known_after_stream(
+    found: SuccessMatrix | ErrorMatrix, recipe: RobotStreamRecipe, repo: str
+) -> Iterator[str]:
+    """What the stream has measured of the VLM, where it is the one that this policy has."""
+    if learners.get(recipe.train.method).trains != "model":
+        yield "Not measured: the task's low-rank terms are part of its weights here, and the stream"
+        yield f"asked it without them. `{_probe_command(repo, recipe)}` does it."
+        return
+    before, after = found.vqa[0].accuracy, found.vqa[-1].accuracy
+    asked = without_folders(recipe.probe.only_set)
+    yield f"Accuracy on questions of `{asked}`: {_percent(before)} before the stream,"
+    yield f"{_percent(after)} after its last task."
+
+
+def _acting_of_task(found: SuccessMatrix | ErrorMatrix, number: int) -> Iterator[str]:
+    """What the stream has measured of the task after its last one."""
+    figure = found.measured_rows[-1][number]
+    if isinstance(found, SuccessMatrix):
+        yield f"Success, or a suite task's share of the highest return: {_percent(figure)}."
+        return
+    ends, held = found.error_intervals[-1][number], found.hold_errors[number]
+    within = "" if ends is None else f" ({ends[0]:.3f} to {ends[1]:.3f})"
+    hold = "" if held is None else f"; that of holding the position is {held:.3f}"
+    yield f"The open-loop error at held-out frames is {figure:.3f}{within}{hold}. Each prediction"
+    yield "begins at a recorded frame, and nothing is executed. The error is squared, over the"
+    yield "variance of the training's actions: their mean has 1."
+
+
 def _asked(found: InspectReport, recipe: Recipe) -> recipes.Probe:
     """The probe that the card's first figures are of; the recipe's where none was made."""
     first = recipe.probe.of_each_set()[0]
@@ -191,7 +308,7 @@ def _looks_by(meta: PolicyMeta, task: str | None) -> Sequence[str]:
 def _use(
     form: str,
     repo: str,
-    recipe: recipes.Recipe,
+    recipe: Recipe | RobotStreamRecipe,
     task: str | None,
     cameras: Sequence[str] = (),
     looks_by: Sequence[str] = (),
@@ -212,7 +329,7 @@ def _use(
     )
 
 
-def _probe_command(repo: str, recipe: Recipe) -> str:
+def _probe_command(repo: str, recipe: Recipe | RobotStreamRecipe) -> str:
     """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
     probe = recipe.probe.of_each_set()[0]
     # Nobody else has this machine's folders: of a path, only the last part is said.

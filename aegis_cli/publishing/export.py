@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import yaml
@@ -20,6 +20,7 @@ from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
+from aegis_cli.continual import plain, robots
 from aegis_cli.data.lerobot import layout
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
@@ -27,6 +28,7 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.publishing import card
+from aegis_cli.recipes import RobotStreamRecipe
 from aegis_cli.recipes.strict_yaml import dump
 from aegis_cli.training import checkpoint
 from aegis_cli.training import folder as run_folder
@@ -73,6 +75,7 @@ def run(
     repo: str | None = None,
     dtype: str = SOURCE,
     on_event: OnEvent = ignore,
+    task: str | None = None,
 ) -> ExportReport:
     """Write a run's policy, or that of a checkpoint, as a folder for others.
 
@@ -86,13 +89,16 @@ def run(
             training, `top` where it had no name.
         repo: where others will find the policy, for the card.
         dtype: of the backbone's weights, SOURCE or one of `STORED_TYPES`.
+        task: whose policy, of a stream of robot tasks.
 
     Raises:
-        AegisError: no policy, the run of a stream, a folder that is there already, a camera's
-            name where none is to be given, or a type that the backbone cannot have.
+        AegisError: no policy, a task of a stream that is none of plain weights, a folder that is
+            there already, a camera's name where none is to be given, or a type that the backbone
+            cannot have.
     """
     # All that can be refused by looking is, before a model of gigabytes is loaded.
-    refuse_stream(run_path)
+    of_stream = recipes.is_robot_stream_run(run_path)
+    number = plain.check(run_path, task) if of_stream else None
     if os.path.lexists(out):  # a link that leads nowhere too
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
     check_utf8(out, "choose another --out")
@@ -102,11 +108,17 @@ def run(
             "a name for LeRobot",
             "leave --camera out, or give --format lerobot",
         )
-    run_path = download.locate(run_path)
+    if number is None:
+        run_path = download.locate(run_path)
     with loading_told("export", on_event):
-        policy, meta = checkpoint.load_policy(run_path)
-    steps, planned = warn_of_steps_left(run_path, "export", on_event)
-    warn_of_a_merge(run_path, "export", on_event)
+        loaded = _Loaded.of(run_path, number)
+    policy, meta = loaded.policy, loaded.meta
+    if loaded.stream is None:
+        checkpoint.check_task(meta, task)
+        steps, planned = warn_of_steps_left(run_path, "export", on_event)
+        warn_of_a_merge(run_path, "export", on_event)
+    else:
+        steps = planned = loaded.stream.train.steps
     meta, rounded = _rounded(policy.backbone, meta, dtype)
     if "merge" in meta:  # which models it was between, without where they lie here
         meta["merge"] = without_places(meta["merge"])
@@ -119,9 +131,14 @@ def run(
         if form == card.LEROBOT:
             lerobot_folder.write(aside, policy, meta, cameras)
         else:
-            _write_checkpoint(aside, run_path, policy, meta)
+            _write_checkpoint(aside, run_path, policy, meta, loaded.task)
         stored = card.Stored(meta.get("stored", FLOAT32), rounded)
-        _write_card(aside, run_path, form, repo or f"ORG/{_hub_name(out.name)}", stored, cameras)
+        called = repo or f"ORG/{_hub_name(out.name)}"
+        if number is None:
+            _write_card(aside, run_path, form, called, stored, cameras)
+        else:
+            text = card.of_stream(run_path, number, form, called, stored, meta, cameras)
+            _write_texts(aside, run_path, form, text)
         put(aside, out)
     return ExportReport(
         str(out),
@@ -137,6 +154,29 @@ def run(
         steps,
         planned,
     )
+
+
+class _Loaded(NamedTuple):
+    """A policy to be written.
+
+    Attributes:
+        stream: the recipe of the stream that it is of; None of the run of one policy.
+        task: whose policy it is, of a stream.
+    """
+
+    policy: Policy
+    meta: PolicyMeta
+    stream: RobotStreamRecipe | None = None
+    task: str | None = None
+
+    @classmethod
+    def of(cls, run: Path, number: int | None) -> _Loaded:
+        """The policy of a run, or of the task of that number of a stream's."""
+        if number is None:
+            return cls(*checkpoint.load_policy(run))
+        stream = robots.load_to_act(run)
+        policy, meta = plain.policy(stream, number), stream.meta(number)
+        return cls(policy, meta, stream.recipe, stream.names[number])
 
 
 def warn_of_steps_left(
@@ -226,12 +266,13 @@ def _renamed(meta: PolicyMeta, camera: str) -> PolicyMeta:
 
 
 def refuse_stream(run: Path) -> None:
-    """Raise AegisError for the run of a stream of robot tasks."""
+    """Raise AegisError for the run of a stream of robot tasks, which has a policy for each."""
     if recipes.is_robot_stream_run(run):
+        export = commands.aegis("export", run, "--task", "NAME", "--out", "FOLDER")
         raise AegisError(
-            f"the run of a stream in '{run}', whose policies share experts",
-            "the run of one policy",
-            "act with aegis_cli.load_policy(run, task=...), or train the task by itself",
+            f"the run of a stream in '{run}', with a policy for each task",
+            "one policy",
+            f"write that of a task, and send its folder: {export}",
         )
 
 
@@ -265,12 +306,21 @@ def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMe
     return now, lost
 
 
-def _write_checkpoint(folder: Path, run: Path, policy: Policy, meta: PolicyMeta) -> None:
-    """Write a policy as our checkpoints are, without what a training needs to go on."""
+def _write_checkpoint(
+    folder: Path, run: Path, policy: Policy, meta: PolicyMeta, task: str | None = None
+) -> None:
+    """Write a policy as our checkpoints are, without what a training needs to go on.
+
+    Args:
+        task: whose policy it is, in the run of a stream.
+    """
     # A folder in LeRobot's layout keeps no record of what its policy was made from.
     inputs: Mapping[str, str] = {}
     seed, about = None, ""
-    if not lerobot_folder.is_policy(run):
+    if task is not None:
+        header = artifacts.read_header(run / robots.ACTION_EXPERT)
+        inputs, seed = card.inputs_of_task(header.inputs, task), header.seed
+    elif not lerobot_folder.is_policy(run):
         at = checkpoint.chosen(run)
         header = artifacts.read_header(at / checkpoint.EXPERT)
         inputs, seed = header.inputs, header.seed
@@ -293,17 +343,19 @@ def _hub_name(name: str) -> str:
 def _write_card(
     folder: Path, run: Path, form: str, repo: str, stored: card.Stored, cameras: Sequence[str]
 ) -> None:
-    """Write the model card of a run's policy; a policy without a run has nothing to say.
-
-    In our own layout the card names the recipe, which is written beside it.
-    """
+    """Write the model card of a run's policy; a policy without a run has nothing to say."""
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
     home = checkpoint.run_of(at)
     if home is None:
         return
-    write_text(folder / card.NAME, card.text(home, at, form, repo, stored, cameras))
+    _write_texts(folder, home, form, card.text(home, at, form, repo, stored, cameras))
+
+
+def _write_texts(folder: Path, home: Path, form: str, text: str) -> None:
+    """Write a card, and in our own layout beside it the recipe of the run, which it names."""
+    write_text(folder / card.NAME, text)
     if form == card.AEGIS:
         write_text(folder / RECIPE, _recipe(home))
 

@@ -20,7 +20,13 @@ from aegis_cli.recipes.policy import (
     Train,
 )
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
-from aegis_cli.recipes.streams import RobotDemos, RobotRollout, RobotStreamRecipe, StreamRecipe
+from aegis_cli.recipes.streams import (
+    RobotDemos,
+    RobotRollout,
+    RobotStreamRecipe,
+    RobotTrain,
+    StreamRecipe,
+)
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, refuse
 
 _NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
@@ -129,6 +135,10 @@ def _train_checks(train: Train) -> Iterator[Problem]:
         found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
         fix = "set it, or delete train.relative_exclude"
         yield Problem(found, "it with train.relative_actions: true", fix)
+    yield from _augment_checks(train)
+
+
+def _augment_checks(train: Train | RobotTrain) -> Iterator[Problem]:
     if train.augment is None and "augment_count" in changed(train):
         found = f"train.augment_count: {train.augment_count} without train.augment"
         fix = "e.g. train.augment: [brightness, contrast], or delete train.augment_count"
@@ -161,6 +171,14 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _demos_checks(recipe.demos, len(recipe.tasks))
     yield from _task_checks(recipe)
+    train = recipe.train
+    yield from _augment_checks(train)
+    if train.batch_size < train.accumulate:
+        yield Problem(
+            f"train.batch_size: {train.batch_size} with train.accumulate: {train.accumulate}",
+            "at least one frame in each pass of a step",
+            f"set train.accumulate to at most {train.batch_size}",
+        )
     plain = [task for task in recipe.tasks if task not in TASKS]
     if recipe.expert.start is not None:
         found = f"expert.start: {recipe.expert.start} with a stream"

@@ -25,6 +25,7 @@ from aegis_cli.recipes.keys import (
     section,
 )
 from aegis_cli.recipes.policy import (
+    AUGMENTATIONS,
     COLOR_SETS,
     NORMALIZATIONS,
     PART,
@@ -160,6 +161,31 @@ class RobotTrain:
         default="auto",
         doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
         "float32.",
+    )
+    augment: tuple[str, ...] | None = key(
+        choice(*AUGMENTATIONS),
+        default=None,
+        later=True,
+        doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
+        "none. What is measured, routers too, sees frames as they are.",
+    )
+    augment_count: int = key(
+        POSITIVE,
+        default=3,
+        later=True,
+        doc="How many of `augment` change one image, drawn anew each time.",
+    )
+    gradient_checkpointing: bool = key(
+        default=False,
+        later=True,
+        doc="Hugging Face backbones only: less memory, at the price of a second forward pass, of "
+        "the action expert too.",
+    )
+    accumulate: int = key(
+        POSITIVE,
+        default=1,
+        later=True,
+        doc="Passes in which a step's frames are taken, for less memory.",
     )
 
 

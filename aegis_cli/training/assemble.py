@@ -23,7 +23,7 @@ from aegis_cli.common.watched_files import WatchedFiles
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.data import demonstrations, mixture
-from aegis_cli.data.batch import Share
+from aegis_cli.data.batch import Normalizer, Share
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa.images import tensors
@@ -151,12 +151,9 @@ class TrainingRun:
         found |= self.demos.recorded
         if self.policy.origins.places:
             found["relative"] = list(self.policy.origins.places)
-        spread = self.demos.action_std
-        by_spread = "relative" not in found and found["normalization"] == "mean_std"
-        # An action that hardly varies beside its mean has a scale of 1, or 0.
-        scale = self.policy.action_scale.std.cpu().double()
-        if not by_spread or not torch.allclose(scale, torch.tensor(spread).double(), rtol=1e-4):
-            found["action_std"] = spread
+        scale, normalization = self.policy.action_scale, found["normalization"]
+        if "relative" in found or not is_spread(scale, normalization, self.demos):
+            found["action_std"] = self.demos.action_std
         if self.demos.datasets:
             one, *others = self.demos.datasets
             found["dataset"] = [one, *others] if others else one
@@ -493,6 +490,13 @@ def _policy(
         begun = loading.begun_expert(recipe, shape, relative, demos.recorded, on_event)
         expert.load_state_dict(begun.state_dict())
     return Policy(backbone, expert, proprio, action, relative).to(backbone.device)
+
+
+def is_spread(scale: Normalizer, normalization: str, demos: Demonstrations) -> bool:
+    """Whether a scale of absolute actions is how far these vary over the training frames."""
+    # An action that hardly varies beside its mean has a scale of 1, or 0.
+    found, spread = scale.std.cpu().double(), torch.tensor(demos.action_std).double()
+    return normalization == "mean_std" and torch.allclose(found, spread, rtol=1e-4)
 
 
 def view(demos: Demonstrations, backbone: Backbone) -> PolicyMeta:

@@ -12,10 +12,10 @@ from aegis_cli import recipes
 from aegis_cli.common.version import __version__
 from aegis_cli.core.ledger import Ledger
 from aegis_cli.methods.base import Method
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Recipe, RobotStreamRecipe
 from aegis_cli.training import freezing
 
-_PLACES = {"backbone", "base", "path", "start", "vqa"}  # keys of models and data
+_PLACES = {"backbone", "base", "path", "paths", "start", "vqa"}  # keys of models and data
 
 _CARD = """---
 library_name: transformers
@@ -122,7 +122,7 @@ def text(
     )
 
 
-def model(recipe: Recipe, began_as: str | None) -> str:
+def model(recipe: Recipe | RobotStreamRecipe, began_as: str | None) -> str:
     """What a card calls the model that a run began with, which another run may have trained.
 
     Args:

@@ -392,6 +392,13 @@ def load_policy(folder: str | Path) -> tuple[Policy, PolicyMeta]:
     return Policy(backbone, expert, proprio, action, relative).eval(), _executed_now(path, meta)
 
 
+def check_task(meta: PolicyMeta, task: str | None) -> None:
+    """Raise AegisError for a task that is asked of a policy and is not the one that it has."""
+    if task not in (None, meta["task"]):
+        said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
+        raise AegisError(said, "its own", "leave out the task")
+
+
 def _executed_now(path: Path, meta: PolicyMeta) -> PolicyMeta:
     """A checkpoint's meta with `replan` and `ensemble` as its run's recipe says them by now."""
     run = run_of(path)

@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,10 +23,12 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
 from aegis_cli.models import structure
 from aegis_cli.models.buffers import WrittenBuffers
-from aegis_cli.recipes import Recipe, Train
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import (
     assemble,
     checkpoint,
@@ -45,9 +48,9 @@ from aegis_cli.training.assemble import TrainingRun
 
 T = TypeVar("T")
 
-_MB = 1e6
-_WRITTEN = 3  # copies of a tensor while it is checked, hashed and written, as measured
-_TIMED = 3  # steps, after a first one that pays for what is done once
+MB = 1e6
+WRITTEN_COPIES = 3  # copies of a tensor while it is checked, hashed and written, as measured
+TIMED_STEPS = 3  # steps, after a first one that pays for what is done once
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,14 @@ def _planned(
         recipe, training.policy, training.demos, training.meta
     )
     held = _held(training, there)
-    tokens, activations = _pass_kept(training, _frames_of_a_pass(recipe.train, ranks), told)
+    passing = Passing(
+        training.policy,
+        training.demos,
+        recipe.train,
+        training.method.stop_gradient,
+        training.masters.rounded,
+    )
+    tokens, activations = pass_kept(passing, _frames_of_a_pass(recipe.train, ranks), told)
     parts = _memory(training, held, activations)
     written = [] if overwrite else checkpoint.whole(out)
     disk = _disk(training, written)
@@ -217,8 +227,8 @@ def _report(
         epochs=recipe.train.steps * recipe.train.batch_size / frames,
         sets=_sets(training),
         tokens_per_frame=tokens,
-        memory_mb={name: size / _MB for name, size in needs.parts.items()},
-        memory_total_mb=sum(needs.parts.values()) / _MB,
+        memory_mb={name: size / MB for name, size in needs.parts.items()},
+        memory_total_mb=sum(needs.parts.values()) / MB,
         memory_measured_mb=_in_mb(needs.measured),
         memory_together_mb=_in_mb(needs.together),
         memory_free_mb=_in_mb(free),
@@ -227,8 +237,8 @@ def _report(
         validation_s=needs.validation_s,
         hours=_hours(recipe.train, needs, done),
         checkpoints=disk.checkpoints,
-        disk_mb=disk.needed / _MB,
-        disk_free_mb=disk.free / _MB,
+        disk_mb=disk.needed / MB,
+        disk_free_mb=disk.free / MB,
         disk_fits=disk.needed <= disk.free,
         out=str(training.out),
     )
@@ -245,7 +255,7 @@ def _hours(settings: Train, needs: _Needs, done: int) -> float | None:
 
 
 def _in_mb(size: int | None) -> float | None:
-    return None if size is None else size / _MB
+    return None if size is None else size / MB
 
 
 def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
@@ -299,21 +309,21 @@ def _needs(
         free: bytes before anything was built; `base` are those that the process had then.
     """
     device, needed = training.policy.backbone.device, sum(parts.values())
-    fits = _fits(needed, free, device, ranks)
+    fits = fits_in(needed, free, device, ranks)
     step_s, validation_s, measured = None, None, None
     if fits is not False:
-        step_s = _where_it_fits(partial(_timed, training, on_event), ranks)
+        step_s = where_it_fits(partial(_timed, training, on_event), ranks)
         if step_s is not None:
             # After the steps, for gradients and what the optimizer keeps are there while it
             # validates: together they are part of the training's peak.
             measure = partial(validation_time.measured, training, on_event)
-            validation_s = _where_it_fits(measure, ranks)
+            validation_s = where_it_fits(measure, ranks)
         fits = False  # unless both show that it does
     if validation_s is not None:
         # No checkpoint was written: its share is still the estimate's.
         needed = memory.peak(device) - base + parts["checkpoint"]
         measured = max(ranks.gathered(needed))
-        fits = _fits(needed, free, device, ranks)
+        fits = fits_in(needed, free, device, ranks)
     largest = max(ranks.gathered(parts), key=lambda found: sum(found.values()))
     together = _together(needed, device, ranks)
     return _Needs(largest, measured, together, fits, step_s, validation_s)
@@ -336,7 +346,7 @@ def _together(needed: int, device: torch.device, ranks: Ranks) -> int | None:
     return sum(ranks.gathered(needed)[first : first + here])
 
 
-def _fits(needed: int, free: int | None, device: torch.device, ranks: Ranks) -> bool | None:
+def fits_in(needed: int, free: int | None, device: torch.device, ranks: Ranks) -> bool | None:
     """Whether every process has what it needs; None where it is not known what is free."""
     together = _together(needed, device, ranks)
     short = free is not None and (needed if together is None else together) > free
@@ -348,20 +358,16 @@ def shortage(report: DryRunReport) -> str | None:
     """What does not fit, on one line, and what to do about it; None where everything does."""
     missing = []
     if report.memory_fits is False:
-        free_mb = report.memory_free_mb
-        assert free_mb is not None  # else nobody knows whether it fits
+        assert report.memory_free_mb is not None  # else nobody knows whether it fits
         # Activations alone shrink with the batch.
         shared = 1 if report.memory_together_mb is None else report.processes
         rest = report.memory_needed_mb - shared * report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"
         if report.processes > 1:
             smaller += ", or --set train.parallel=fsdp"
-        if rest < free_mb:
+        if rest < report.memory_free_mb:
             smaller = "lower train.batch_size"
-        needs = f"about {report.memory_needed_mb:,.0f} MB of memory, and"
-        if report.memory_needed_mb <= free_mb:  # a step has shown that it is more
-            needs = f"more memory than the estimate of {report.memory_needed_mb:,.0f} MB, and"
-        missing.append(f"training needs {needs} {free_mb:,.0f} MB are free: {smaller}")
+        missing.append(too_little(report.memory_needed_mb, report.memory_free_mb, smaller))
     if not report.disk_fits:
         missing.append(
             f"the checkpoints need {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
@@ -369,6 +375,14 @@ def shortage(report: DryRunReport) -> str | None:
             "train.keep_checkpoints, or train.checkpoint_every higher"
         )
     return "; ".join(missing) or None
+
+
+def too_little(needed_mb: float, free_mb: float, smaller: str) -> str:
+    """What is said of memory that does not suffice."""
+    needs = f"about {needed_mb:,.0f} MB of memory, and"
+    if needed_mb <= free_mb:  # a step has shown that it is more
+        needs = f"more memory than the estimate of {needed_mb:,.0f} MB, and"
+    return f"training needs {needs} {free_mb:,.0f} MB are free: {smaller}"
 
 
 def _count(parameters: Iterable[Tensor]) -> int:
@@ -388,26 +402,41 @@ def _bytes_here(tensors: Iterable[Tensor]) -> int:
 # --- memory ---------------------------------------------------------------------------------------
 
 
-def _pass_kept(training: TrainingRun, frames: int, on_event: OnEvent) -> tuple[int, int]:
+class Passing(NamedTuple):
+    """What passes through which policy.
+
+    Attributes:
+        detach: whether the gradient stops at the keys and values.
+        seen: a context in which the weights are those that a pass sees.
+    """
+
+    policy: Policy
+    demos: Demonstrations
+    settings: Train | RobotTrain
+    detach: bool = False
+    seen: Callable[[], AbstractContextManager[object]] = nullcontext
+
+
+def pass_kept(passing: Passing, frames: int, on_event: OnEvent) -> tuple[int, int]:
     """Tokens of one frame, and bytes that the forward pass of some keeps for the backward.
 
     Passes of two and of three frames tell what grows with the frames from what does not (weights
     that autocast has rounded). A pass of a single frame would keep less, being no batch.
     """
     on_event(Progress("dry run (memory)", 0, 2, "passes"))
-    tokens, of_two = _pass_some(training, 2)
+    tokens, of_two = _pass_some(passing, 2)
     on_event(Progress("dry run (memory)", 1, 2, "passes"))
-    _, of_three = _pass_some(training, 3)
+    _, of_three = _pass_some(passing, 3)
     on_event(Progress("dry run (memory)", 2, 2, "passes"))
     per_frame = of_three - of_two
     return tokens, of_two + (frames - 2) * per_frame
 
 
-def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
+def _pass_some(passing: Passing, frames: int) -> tuple[int, int]:
     """Tokens of a frame, and bytes that a pass keeps of the first frame, so many times over."""
-    settings, policy = training.recipe.train, training.policy.train()
+    settings, policy = passing.settings, passing.policy.train()
     # One frame over and over, so that passes differ in nothing but how many they are.
-    batch = training.demos.batch(training.demos.train[:1].repeat(frames), settings.chunk)
+    batch = passing.demos.batch(passing.demos.train[:1].repeat(frames), settings.chunk)
     own: set[int] = set()
     # The storages are held, so that no address is given to another one meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
@@ -420,15 +449,12 @@ def _pass_some(training: TrainingRun, frames: int) -> tuple[int, int]:
         return tensor.detach()
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
-    rounded = training.masters.rounded()
-    with rounded, hooks, devices.autocast(policy.backbone.device, settings.precision):
+    with passing.seen(), hooks, devices.autocast(policy.backbone.device, settings.precision):
         # A weight that the graph saves takes no memory of its own.
         own.update(rows_here(p).untyped_storage().data_ptr() for p in policy.parameters())
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
-        loss = policy.flow_loss(
-            batch, encoding, settings.flow_samples, generator, training.method.stop_gradient
-        )
+        loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, passing.detach)
     if not loss.isfinite():
         found = f"a loss of {loss.item():g} before the first step"
         raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
@@ -511,16 +537,16 @@ def _while_saving(training: TrainingRun) -> int:
     if parallel.is_sharded(training.policy):
         # One weight after the other is gathered, by all; the first process keeps them on its CPU.
         on_cpu = training.policy.backbone.device.type == "cpu" and training.ranks.first
-        return _state_bytes(training) + _WRITTEN * largest if on_cpu else largest
+        return _state_bytes(training) + WRITTEN_COPIES * largest if on_cpu else largest
     # A method that has added something takes it out of a copy.
     copied = 0 if training.method.export is None else _plain_bytes(training)
-    return copied + _WRITTEN * largest
+    return copied + WRITTEN_COPIES * largest
 
 
 # --- time -----------------------------------------------------------------------------------------
 
 
-def _where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
+def where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
     """What was found; None where a GPU has no memory left for what takes it.
 
     With several processes that is an error, for the others wait in the same step.
@@ -543,7 +569,7 @@ def _timed(training: TrainingRun, on_event: OnEvent) -> float:
     # The first step pays for what is done once, and batches are fetched meanwhile: those that a
     # GPU finds ready say nothing of how long they took, and as many may come together.
     ready = train.fetched_ahead(training)
-    timed = max(_TIMED, parts.every, parts.refresh, ready)
+    timed = max(TIMED_STEPS, parts.every, parts.refresh, ready)
     ahead = 1 + ready
     steps = range(min(ahead + timed, settings.steps))
     first = steps[ahead : ahead + 1] or steps  # the first that counts
@@ -585,7 +611,7 @@ def _disk(training: TrainingRun, written: Sequence[Path]) -> _Disk:
     to_come, kept = _to_come(training.recipe, written), training.recipe.train.keep_checkpoints
     checkpoints = retention.most_at_once(to_come, len(written), kept)
     # What is free changes meanwhile: all report what the first, which writes, has seen.
-    free = training.ranks.agree(_free_disk(training.out))
+    free = training.ranks.agree(free_disk(training.out))
     return _Disk(checkpoints, checkpoints * _checkpoint_bytes(training), free)
 
 
@@ -647,7 +673,7 @@ def _tensors(module: nn.Module) -> Iterable[Tensor]:
     return found.values()
 
 
-def _free_disk(out: Path) -> int:
+def free_disk(out: Path) -> int:
     """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
     whole = out.absolute()
     there = next(path for path in (whole, *whole.parents) if path.exists())

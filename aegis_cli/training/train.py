@@ -970,7 +970,7 @@ def validation_loss(
         """This process's frames of a batch, who shares it, and in how many passes."""
         # Where there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
-        passes = getattr(settings, "accumulate", 1)  # a stream of robot tasks has no such key
+        passes = settings.accumulate
         passes = passes if len(part) >= sharing.count * passes else 1
         numbers = step.own_rows(part, sharing, passes)
         own = demos.batch(numbers, settings.chunk)

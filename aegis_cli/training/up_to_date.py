@@ -82,6 +82,17 @@ class Made(NamedTuple):
     sha256: str
 
 
+def _recording(task: str, settings: Demos) -> dict[str, Any]:
+    """What demonstrations of a simulated task follow from."""
+    return {"task": task, **recipes.changed(settings)}
+
+
+def _recorded_as(task: str, key: Mapping[str, Any]) -> str:
+    """The name of their file, by which task and settings are told apart."""
+    # A slash, as in `suite/cartpole-swingup`, would be a folder.
+    return f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
+
+
 class StageRecords:
     """Which stages below a folder are up to date.
 
@@ -137,7 +148,7 @@ class StageRecords:
         Args:
             name: of their file; default: one that tells task and settings apart.
         """
-        key = {"task": task, **recipes.changed(settings)}
+        key = _recording(task, settings)
 
         def make(out: Path, on_event: OnEvent) -> object:
             return record.run(
@@ -150,10 +161,11 @@ class StageRecords:
                 drop_below=settings.drop_below,
             )
 
-        if name is None:
-            # A slash, as in `suite/cartpole-swingup`, would be a folder.
-            name = f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
-        return self.shared(name, key, make)
+        return self.shared(name or _recorded_as(task, key), key, make)
+
+    def recorded(self, task: str, settings: Demos) -> Path:
+        """Where `demonstrations` keeps those of a task, whether or not they are there."""
+        return self.folder / f"{_recorded_as(task, _recording(task, settings))}.safetensors"
 
     def key_of(self, stage: str) -> str | None:
         """Digest of what the stage read when it ran; None if it never did."""

@@ -354,7 +354,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
     command = ("evaluate", "runs/x", "--demos", "d", "--episodes", "0,3-5", "--plot", plot)
     _, _, err = aegis(*command, "--json")
     asked = (Path("runs/x"), Path("d"), [0, 3, 4, 5], 1000, 0, 64, True)
-    assert calls == [(asked, {"keep": True, "rename": ()})]
+    assert calls == [(asked, {"keep": True, "task": None, "rename": ()})]
     assert drawn == [plot] and "trained on: 3, 4; " in err
     calls, saved = stage("pipeline"), []
     monkeypatch.setattr(render, "save_table", lambda report, view: saved.append((report.out, view)))

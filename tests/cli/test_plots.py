@@ -241,6 +241,14 @@ def test_routing_writes_its_values_and_marks_what_was_pruned() -> None:
     assert {text.get_color() for text in marks} == {plots._PRUNED}
 
 
+def test_what_lay_in_memory_before_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even where there is no expert: matplotlib scales what is masked, too, and warns."""
+    most = np.finfo(float).max  # as what has no value may be
+    unset = lambda shape: np.ma.array(np.full(shape, most), mask=True)  # noqa: E731
+    monkeypatch.setattr(np.ma, "masked_all", unset)
+    routing_figure().draw_without_rendering()
+
+
 def test_experts_of_tasks_that_had_not_come_are_grey() -> None:
     for task, panel in enumerate(routing_figure().axes[:3]):
         grey = [p for p in panel.patches if to_hex(p.get_facecolor()) == plots._IMPOSSIBLE]

@@ -342,8 +342,7 @@ def test_demonstrations_are_asked_for_of_a_policy_alone(place: Path, bad: Bad) -
     """Who mistypes a run has to look for the run, and not for its demonstrations."""
     bad("evaluate", "./mistyped", says=("no checkpoint in 'mistyped'",))
     (place / "stream").mkdir()
-    recipe = "kind: robot-stream\nname: s\ntasks: [reach, point]\n"
-    (place / "stream" / "recipe.yaml").write_text(recipe)
+    (place / "stream" / "recipe.yaml").write_text("kind: stream\nname: s\nstream: primer-1\n")
     bad("evaluate", "stream", says=("the run of a stream",))
 
 

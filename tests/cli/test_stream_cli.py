@@ -94,7 +94,7 @@ def test_an_interrupted_stream_says_how_to_go_on(
 ) -> None:
     from aegis_cli.continual import loop
 
-    step = loop._step
+    step = loop.take
 
     def stops(run: Any, training: Any, number: int, *rest: Any) -> float:
         if number == 7:
@@ -102,7 +102,7 @@ def test_an_interrupted_stream_says_how_to_go_on(
         return step(run, training, number, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "_step", stops)
+        patch.setattr(loop, "take", stops)
         code, _, err = aegis("train", "stream.yaml", "--out", "run")
     assert code == 130 and err.endswith("resume with: aegis train run\n")
     log = place / "run" / "metrics.jsonl"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import pytest
 import torch
 from samples.interrupted import at_each, stop
 from samples.lerobot import frame_cache, save  # noqa: F401
+from samples.own_robots import FRAMES, JOINTS, TASKS, TEXTS, Done, robot
 from samples.robots import Make
 from samples.training_runs import contents
 
@@ -23,83 +24,14 @@ from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Warned
 from aegis_cli.continual import files, probe, robots, state, train
 from aegis_cli.continual.held_out import HeldOut
-from aegis_cli.continual.report import RecordedStreamReport
 from aegis_cli.data import demonstrations, spread
 from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.deploy import load_acting, load_policy
 from aegis_cli.evaluation import open_loop
 from aegis_cli.models.action_errors import predict
-from aegis_cli.recipes import RobotDemos, RobotRollout, RobotStreamRecipe, to_yaml
+from aegis_cli.recipes import RobotDemos, to_yaml
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
-
-Done = Callable[[str], tuple[RecordedStreamReport, Path]]
-TASKS = ("pick", "open-drawer")
-JOINTS = {"pick": 3, "open-drawer": 2}  # two robots
-TEXTS = {"pick": "go to the red target", "open-drawer": "move the finger to the red target"}
-FRAMES = 9  # of those that are held out
-
-
-def robot(
-    folder: Path,
-    task: str = "pick",
-    cameras: Sequence[str] = ("top",),
-    scale: float = 1.0,
-    actions: Sequence[str] | None = None,
-    count: int = 6,
-) -> Path:
-    """A dataset of a real robot's, whose actions are the positions to take.
-
-    Args:
-        scale: of all numbers.
-        actions: their names; by default those of the positions.
-    """
-    rng = np.random.default_rng(len(task))
-    made = []
-    for number in range(count):
-        length = 6 + number % 3
-        path = scale * rng.normal(size=(length + 1, JOINTS[task])).cumsum(0).astype(np.float32)
-        shown = rng.integers(0, 256, (length, 16, 16, 3), dtype=np.uint8)
-        made.append(NewEpisode(dict.fromkeys(cameras, shown), path[:-1], path[1:], TEXTS[task]))
-    names = tuple(f"joint {n}.pos" for n in range(JOINTS[task]))
-    return save(folder, made, state_names=names, action_names=tuple(actions or names))
-
-
-@pytest.fixture(scope="module")
-def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A dataset of each task; read only."""
-    folder = tmp_path_factory.mktemp("robots")
-    return {task: robot(folder / task, task) for task in TASKS}
-
-
-@pytest.fixture(scope="module")
-def real(make: Make, paths: dict[str, Path]) -> Make:
-    """A recipe; `changes` replace keys of `train`, or whole keys."""
-
-    def recipe(method: str = "igsp", **changes: Any) -> RobotStreamRecipe:
-        own = {"demos": RobotDemos(paths=tuple(str(paths[task]) for task in TASKS))}
-        own |= {"rollout": RobotRollout(replan=2, frames=FRAMES)}
-        settings = {"chunk": 4, "validation_share": 0.4}
-        return dataclasses.replace(make(method, **settings | own | changes), tasks=TASKS)
-
-    return recipe
-
-
-@pytest.fixture(scope="module")
-def done(real: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """A finished run of a learner; read only."""
-    made: dict[str, tuple[RecordedStreamReport, Path]] = {}
-
-    def get(method: str) -> tuple[RecordedStreamReport, Path]:
-        if method not in made:
-            out = tmp_path_factory.mktemp("recorded") / method
-            report = train.run(real(method), out)
-            assert isinstance(report, RecordedStreamReport)
-            made[method] = report, out
-        return made[method]
-
-    return get
-
 
 # --- what is measured -----------------------------------------------------------------------------
 
@@ -414,3 +346,37 @@ def test_a_recipe_says_whether_its_tasks_are_simulated(real: Make, make: Make) -
     assert recipes.training_part(make())["rollout"].keys() == {
         *("episodes", "colors", "replan", "split")
     }
+
+
+# --- tasks with the same episodes -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("only", [("0-2", "0-2"), ("0-2", "2,1,0"), None])
+def test_two_tasks_with_the_same_episodes_are_refused_before_anything_is_decoded(
+    only: tuple[str, ...] | None,
+    real: Make,
+    paths: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also where the dataset is named in two ways."""
+    (tmp_path / "link").symlink_to(paths["pick"])
+    monkeypatch.setattr(demonstrations, "load", lambda *given, **options: pytest.fail("decoded"))
+    demos = RobotDemos(paths=(str(paths["pick"]), str(tmp_path / "link")), only=only)
+    says = "the same [36] episodes of .* for 'pick' and 'open-drawer'"
+    with pytest.raises(AegisError, match=says):
+        train.build(real("sequential", demos=demos), tmp_path / "run")
+
+
+def test_tasks_that_share_some_episodes_are_warned_of(
+    real: Make, paths: dict[str, Path], tmp_path: Path
+) -> None:
+    demos = RobotDemos(paths=str(paths["pick"]), only=("0-3", "2-5"))
+    told: list[Any] = []
+    train.build(real("sequential", demos=demos), tmp_path / "run", told.append)
+    warned = [event.text for event in told if isinstance(event, Warned)]
+    assert any("2 episodes of" in text and "'pick' and 'open-drawer'" in text for text in warned)
+    apart = RobotDemos(paths=str(paths["pick"]), only=("0-2", "3-5"))
+    told.clear()
+    train.build(real("sequential", demos=apart), tmp_path / "run", told.append)
+    assert not [e for e in told if isinstance(e, Warned) and "episodes of" in e.text]

@@ -85,7 +85,7 @@ def test_a_task_that_ends_in_no_numbers_ends_the_stream(
     evaluator = ClosedLoopEvaluator
     monkeypatch.setattr(evaluator, "row", lambda self, done: [0.0] * (done + 1))
     if where == "validation":
-        monkeypatch.setattr(robots.train, "validation_loss", lambda *_: math.nan)
+        monkeypatch.setattr(robots.train, "validation_loss", lambda *_, **__: math.nan)
     else:
         found = iter([[0.5, 1.0], [0.5, math.inf]])  # before the first task and after it
         monkeypatch.setattr(evaluator, "vqa", lambda self: next(found))
@@ -108,7 +108,7 @@ def test_what_to_lower_are_the_rates_of_what_learns(
 ) -> None:
     built = train.build(make(method), tmp_path)
     learn(built, task)
-    assert loop._prepare(built, [], None).slower == f"try a lower {keys}"
+    assert loop.prepare(built, [], None).slower == f"try a lower {keys}"
 
 
 # --- what is kept ---------------------------------------------------------------------------------
@@ -311,10 +311,10 @@ def test_each_part_learns_at_its_own_rate(
     method: str, still: str, rates: dict[str, Any], make: Make, tmp_path: Path
 ) -> None:
     built = train.build(make(method, **rates), tmp_path)
-    objective, arrived = built.objective(0), loop._prepare(built, [], None)
+    objective, arrived = built.objective(0), loop.prepare(built, [], None)
     before = snapshot(iter(built.parameters().items()))
     for step in range(3):
-        loop._step(built, arrived, step, objective.fetch(torch.arange(4)))
+        loop.take(built, arrived, step, objective.fetch(torch.arange(4)))
     moved = {name for name, p in built.parameters().items() if not same_bits(before[name], p)}
     inside = {
         n

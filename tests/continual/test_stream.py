@@ -659,7 +659,7 @@ def test_a_training_that_diverges_says_where_and_which_rates_it_read(
     run = train.build(
         load(write(tmp_path, recipe(method)), overrides, StreamRecipe), tmp_path / "still"
     )
-    loop._prepare(run, [torch.zeros(16)], None)
+    loop.prepare(run, [torch.zeros(16)], None)
     assert run.learning() and {run.rate(name) for name in run.learning()} == {0.0}
 
 

@@ -333,7 +333,7 @@ def test_what_a_pass_keeps_is_gone_before_the_steps_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """An operation that saves its own result would hold its graph for good."""
-    passed, left = dry_run._pass_kept, []
+    passed, left = dry_run.pass_kept, []
 
     def alive() -> int:
         return sum(storage.nbytes() for storage in dry_run._alive(torch.device("cpu")).values())
@@ -344,7 +344,7 @@ def test_what_a_pass_keeps_is_gone_before_the_steps_are_measured(
         left.append(alive() - before)
         return found
 
-    monkeypatch.setattr(dry_run, "_pass_kept", watched)
+    monkeypatch.setattr(dry_run, "pass_kept", watched)
     backbone = tiny_folder if kind == "tiny" else hf_folder(kind)
     dry_run.run(small(backbone), "naive", demos_file, None, tmp_path / "out")
     assert left == [0]

@@ -35,7 +35,8 @@ def open_loop(report: Any) -> RenderableType:
         error += f" ({low} to {high})"
     if report.hold_error is not None:
         error += f"; hold's {fixed(report.hold_error, 3)}"
-    facts = {
+    facts = {"task": report.task} if hasattr(report, "task") else {}
+    facts |= {
         "data": report.data,
         # A lone number would be read as how many there are.
         "episodes" if len(report.episodes) > 1 else "episode": report.episodes,

@@ -237,7 +237,8 @@ def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any
     """One task's panel, with a row per map and a column per earlier or later task."""
     import numpy as np
 
-    mass = np.ma.masked_all((len(sites), count))  # percent [maps, owners]; masked: no expert
+    # Percent [maps, owners]; masked: no expert. With zeros there, for matplotlib scales them too.
+    mass = np.ma.array(np.zeros((len(sites), count)), mask=True)
     for row, site in enumerate(sites):
         pruned = 0 if site is None else len(site.pruned)
         for owner in range(count):

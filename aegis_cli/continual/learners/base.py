@@ -49,12 +49,12 @@ class Identification:
     less than `tolerance` (total variation, mean over maps) in that many checks on end.
 
     Attributes:
-        penalty: what is added to the task's loss; what it charges the traces, it adds to the
-            gradient on the way back.
+        penalty: what is added to the task's loss, of a pass that is that share of a step; what it
+            charges the traces, it adds to the gradient on the way back.
         settle: fixes the structure for what is left of the steps, given what flows where.
     """
 
-    penalty: Callable[[TaskContext, Traces], Tensor]
+    penalty: Callable[[TaskContext, Traces, float], Tensor]
     settle: Callable[[TaskContext, Flows], None]
 
 

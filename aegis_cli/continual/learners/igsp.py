@@ -78,8 +78,12 @@ def start(router: Router, old: int, new: int, share: float) -> None:
     router.scale.fill_(new / (1 - share) if old else new)
 
 
-def penalty(context: TaskContext, traces: Traces) -> Tensor:
-    """What phase 1 adds to the loss: the norms; the mass is charged on the way back."""
+def penalty(context: TaskContext, traces: Traces, share: float = 1.0) -> Tensor:
+    """What phase 1 adds to the loss: the norms; the mass is charged on the way back.
+
+    Args:
+        share: that a pass is of a step, whose passes pay it together.
+    """
     used = {name: _used(site, context.task) for name, site in context.sites.items()}
     # Where a map has no history, there is nothing to prefer to new experts.
     sizes = {}
@@ -89,14 +93,14 @@ def penalty(context: TaskContext, traces: Traces) -> Tensor:
     for name, size in sizes.items():
         history, new = used[name]
         columns = range(len(history), len(history) + len(new))  # new experts come last in a router
-        price = context.options["reuse"] * size / sum(sizes.values())
+        price = share * context.options["reuse"] * size / sum(sizes.values())
         # A map that is passed several times in a step pays as much as one that is passed once.
         for passed in traces[name]:
             charge(passed, columns, price / len(traces[name]))
     norms = []
     for name, (_, new) in used.items():
         norms += [squared_norm(expert) for expert in context.sites[name].of(new)]
-    return context.options["norm"] * torch.stack(norms).sum()
+    return share * context.options["norm"] * torch.stack(norms).sum()
 
 
 def settle(context: TaskContext, flows: Flows) -> None:

@@ -1,0 +1,434 @@
+"""`aegis train --dry-run` of robot tasks: what a stream needs, by steps of its first and last task.
+
+The last task is as large as it can be: of every task before it all experts are there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from aegis_cli.common import commands, devices, launch, memory, prefetch
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
+from aegis_cli.common.ranks import ALONE
+from aegis_cli.continual import files, loop, robots, state, train
+from aegis_cli.continual.loop import TaskTraining
+from aegis_cli.continual.robots import RobotStreamRun
+from aegis_cli.continual.state import TaskInProgress
+from aegis_cli.core.routing import traced
+from aegis_cli.recipes import RobotStreamRecipe
+from aegis_cli.training import folder, optimizers
+from aegis_cli.training.dry_run import (
+    MB,
+    TIMED_STEPS,
+    WRITTEN_COPIES,
+    Passing,
+    fits_in,
+    free_disk,
+    pass_kept,
+    too_little,
+    where_it_fits,
+)
+from aegis_cli.training.validation_time import expected_s
+
+_STAGE = "dry run"
+
+
+@dataclass(frozen=True)
+class StreamDryRunReport:
+    """What a stream of robot tasks would do.
+
+    Megabytes are estimates, but for those measured. Both are of the task that needs most.
+
+    Attributes:
+        parameters: of backbone and action expert, before the first task.
+        steps: of each task.
+        tasks: by name: `training_frames`, `epochs`, `trainable` (parameters that learn at its
+            beginning), and `step_s`, seconds of a step, which of the tasks between the first and
+            the last is what lies between theirs; None where memory does not suffice.
+        tokens_per_frame: of one frame (of all cameras) with its instruction, of the task that has
+            most.
+        memory_mb: by what takes it.
+        memory_measured_mb: the most that building, these steps and the measuring took, and what
+            writing the state takes more; None where no step was taken.
+        memory_free_mb: where training would run, None if that is not known.
+        memory_fits: by what was measured, else by the estimate.
+        measuring_s: seconds of all that is measured after the last task, by what takes them:
+            `questions`, each `task TASK`, the validation `loss`, and of a learner with experts
+            `routing`, each time that it is looked at; None where memory does not suffice.
+        hours: of what is left of the stream.
+        disk_mb: of the state and of what a finished run keeps; disk_free_mb: where they would be.
+    """
+
+    method: str
+    backbone: str
+    device: str
+    precision: str
+    parameters: int
+    steps: int
+    cameras: list[str]
+    tasks: dict[str, dict[str, float | None]]
+    tokens_per_frame: int
+    memory_mb: dict[str, float]
+    memory_total_mb: float
+    memory_measured_mb: float | None
+    memory_free_mb: float | None
+    memory_fits: bool | None
+    measuring_s: dict[str, float] | None
+    hours: float | None
+    disk_mb: float
+    disk_free_mb: float
+    disk_fits: bool
+    out: str
+
+    @property
+    def memory_needed_mb(self) -> float:
+        """What was measured, else the estimate."""
+        measured = self.memory_measured_mb
+        return self.memory_total_mb if measured is None else measured
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def run(
+    recipe: RobotStreamRecipe,
+    out: Path,
+    resume: bool = False,
+    on_event: OnEvent = ignore,
+    overwrite: bool = False,
+) -> StreamDryRunReport:
+    """Build the stream, take some steps of its first and its last task, and write nothing.
+
+    Raises:
+        AegisError: what `train` would raise before its first step, or demonstrations that it would
+            have to record.
+    """
+    launch.check_one()
+    out, device = Path(out), devices.pick()
+    folder.check(out, recipe, resume, overwrite, train.read_by(recipe))
+    recipe = _recorded(recipe, out)
+    # Before this process itself takes some.
+    free, base = memory.free(device), memory.restart_peak(device)
+    with loading_told(_STAGE, on_event):
+        stream = robots.build(recipe, out, on_event)
+    devices.warn_of_slow_bf16(device, recipe.train.precision, on_event)
+    parameters = sum(p.numel() for p in stream.model.parameters())
+    left = _left(stream, overwrite)
+    frames = _frames_of_a_pass(stream)
+    begun = _Begun.at(stream, 0)
+    found = [_estimated(begun, frames, on_event)]
+    fits = fits_in(found[0].needed, free, device, ALONE)
+    measured: _Measured | None = None
+    if fits is not False:
+        taking = partial(_measured, begun, frames, found, free, on_event)
+        measured = where_it_fits(taking, ALONE)
+        fits = False  # unless what was taken shows that it does
+    most = max(found, key=lambda one: one.needed)
+    if measured is not None:
+        # Nothing was written: that share is still the estimate's.
+        needed = memory.peak(device) - base + most.parts["state"]
+        fits = fits_in(needed, free, device, ALONE)
+        measured = measured._replace(needed=needed)
+    return _report(stream, parameters, found, most, measured, free, fits, left)
+
+
+def shortage(report: StreamDryRunReport) -> str | None:
+    """What does not fit, on one line, and what to do about it; None where everything does."""
+    missing = []
+    if report.memory_fits is False:
+        assert report.memory_free_mb is not None  # else nobody knows whether it fits
+        smaller = "use a smaller backbone"
+        if report.memory_needed_mb - report.memory_mb["activations"] < report.memory_free_mb:
+            smaller = "take a step in more passes: set train.accumulate"
+        missing.append(too_little(report.memory_needed_mb, report.memory_free_mb, smaller))
+    if not report.disk_fits:
+        missing.append(
+            f"the stream needs {report.disk_mb:,.0f} MB on the disk of '{report.out}', and "
+            f"{report.disk_free_mb:,.0f} MB are free: free some, or choose another --out"
+        )
+    return "; ".join(missing) or None
+
+
+def _recorded(recipe: RobotStreamRecipe, out: Path) -> RobotStreamRecipe:
+    """The recipe with the demonstrations that are recorded already as its own.
+
+    Raises:
+        AegisError: there are none yet.
+    """
+    if recipe.demos.paths is not None:
+        return recipe
+    places = [robots.place_of(recipe, number, out) for number in range(len(recipe.tasks))]
+    for task, place in zip(recipe.tasks, places, strict=True):
+        if not place.is_file():
+            record = ("demos", task, "--episodes", str(recipe.demos.episodes), "--out", "FILE")
+            raise AegisError(
+                f"no demonstrations of '{task}' yet, which training would record as '{place}'",
+                "demonstrations of every task: a dry run records none",
+                f"record them, and name them in demos.paths: {commands.aegis(*record)}",
+            )
+    paths = tuple(map(str, places))
+    return dataclasses.replace(recipe, demos=dataclasses.replace(recipe.demos, paths=paths))
+
+
+def _left(stream: RobotStreamRun, overwrite: bool) -> list[int]:
+    """How many steps of each task are still to be taken."""
+    steps, count, place = stream.recipe.train.steps, len(stream.names), TaskInProgress()
+    saved = stream.out / state.STATE
+    if files.is_done(stream.out) and not overwrite:
+        return [0] * count
+    if saved.is_file() and not overwrite:
+        place = state.place_in(saved)
+    before = [0] * place.task
+    return [*before, *([steps - place.step] if place.task < count else []), *[steps] * count][
+        :count
+    ]
+
+
+def _frames_of_a_pass(stream: RobotStreamRun) -> int:
+    """The most frames that pass at once: of a step, or where routers are looked at, of that."""
+    settings = stream.recipe.train
+    frames = -(-settings.batch_size // settings.accumulate)  # rounded up
+    looked_at = robots.CALIBRATION_FRAMES
+    whole = robots.calibration_passes(settings, looked_at) == 1
+    return max(frames, looked_at) if stream.sites and whole else frames
+
+
+# --- tasks that have begun ------------------------------------------------------------------------
+
+
+class _Begun(NamedTuple):
+    """A task that has begun, and what learns then."""
+
+    stream: RobotStreamRun
+    number: int
+    training: TaskTraining
+    trainable: int
+
+    @classmethod
+    def at(cls, stream: RobotStreamRun, number: int) -> _Begun:
+        """The stream at the beginning of the task of that number, after those before it."""
+        stream.current = TaskInProgress(task=number)
+        training = loop.prepare(stream, (), None)
+        trainable = sum(p.numel() for p in stream.learning().values())
+        return cls(stream, number, training, trainable)
+
+    def ended(self) -> None:
+        """End the task, with every expert that it has begun with."""
+        self.stream.learner.finish(self.training.context, {})
+        self.stream.model.requires_grad_(False).zero_grad()
+
+
+class _Estimated(NamedTuple):
+    """What a task needs at its beginning: bytes by what takes them, and of the files."""
+
+    trainable: int
+    tokens: int
+    parts: dict[str, int]
+    state: int
+
+    @property
+    def needed(self) -> int:
+        """Bytes of memory."""
+        return sum(self.parts.values())
+
+
+def _estimated(begun: _Begun, frames: int, on_event: OnEvent) -> _Estimated:
+    stream, number, optimizer = begun.stream, begun.number, begun.training.optimizer
+    stream.activate(number)
+    seen = partial(traced, stream.sites)
+    passing = Passing(stream.policies[number], stream.demos[number], stream.recipe.train, seen=seen)
+    tokens, activations = pass_kept(passing, frames, on_event)
+    moments = 0 if optimizer is None else optimizers.state_bytes([optimizer])
+    largest = max(p.nbytes for p in stream.model.parameters())
+    parts = {
+        "weights": _bytes(stream.model.parameters()),
+        "gradients": _bytes(stream.learning().values()),
+        "optimizer": moments,
+        "activations": activations,
+        "state": 0,
+    }
+    # It is written between two steps, when what a step takes is free again.
+    parts["state"] = max(0, WRITTEN_COPIES * largest - activations)
+    state_bytes = _bytes(stream.parameters().values()) + moments
+    return _Estimated(begun.trainable, tokens, parts, state_bytes)
+
+
+def _bytes(tensors: Iterable[torch.Tensor]) -> int:
+    return sum(t.nbytes for t in tensors)
+
+
+# --- what is taken --------------------------------------------------------------------------------
+
+
+class _Measured(NamedTuple):
+    """What was taken, and how long it took.
+
+    Attributes:
+        step_s: of the first task and of the last.
+        looks_s: of one look at the routers; None of a learner without any.
+        needed: bytes at the peak.
+    """
+
+    step_s: tuple[float, float]
+    tried_s: list[float]
+    vqa_s: float
+    loss_s: float
+    looks_s: float | None
+    needed: int = 0
+
+
+def _measured(
+    begun: _Begun,
+    frames: int,
+    found: list[_Estimated],
+    free: int | None,
+    on_event: OnEvent,
+) -> _Measured | None:
+    """Take steps of the first task and the last, and what is measured after that.
+
+    Args:
+        begun: the first task.
+        found: gets what each later task needs.
+        free: bytes before anything was built.
+
+    Returns:
+        None where a later task does not fit by the estimate.
+    """
+    stream, count = begun.stream, len(begun.stream.names)
+    steps = 2 * (1 + min(TIMED_STEPS, stream.recipe.train.steps))
+    on_event(Progress(_STAGE, 0, steps, "steps"))
+    first_s = last_s = _steps_s(begun, on_event, 0, steps)
+    for number in range(1, count):
+        begun.ended()
+        begun = _Begun.at(stream, number)
+        found.append(_estimated(begun, frames, ignore))
+        if fits_in(found[-1].needed, free, stream.device, ALONE) is False:
+            return None
+    if count > 1:
+        last_s = _steps_s(begun, on_event, steps // 2, steps)
+    looks_s = None
+    if stream.sites:
+        started = time.perf_counter()
+        loop.measure(stream, begun.training)
+        looks_s = time.perf_counter() - started
+    evaluator = stream.measuring
+    tried_s = [evaluator.tried_s(number) for number in range(count)]
+    loss_s = expected_s(stream.validation_loss)
+    return _Measured((first_s, last_s), tried_s, evaluator.vqa_s(), loss_s, looks_s)
+
+
+def _steps_s(begun: _Begun, on_event: OnEvent, done: int, total: int) -> float:
+    """Seconds of a step: the mean of some, after one that pays for what is done once."""
+    stream, training = begun.stream, begun.training
+    steps = range(min(1 + TIMED_STEPS, stream.recipe.train.steps))
+    started = time.perf_counter()
+    stream.model.train()
+    with prefetch.ahead(training.fetch, steps) as batches:
+        for step in steps:
+            if step == 1:
+                started = time.perf_counter()
+            loop.take(stream, training, step, next(batches))
+            on_event(Progress(_STAGE, done + step + 1, total, "steps"))
+    return (time.perf_counter() - started) / max(1, len(steps) - 1)
+
+
+# --- what is said ---------------------------------------------------------------------------------
+
+
+def _report(
+    stream: RobotStreamRun,
+    parameters: int,
+    found: list[_Estimated],
+    most: _Estimated,
+    measured: _Measured | None,
+    free: int | None,
+    fits: bool | None,
+    left: list[int],
+) -> StreamDryRunReport:
+    recipe, names = stream.recipe, stream.names
+    steps = None if measured is None else _between(measured.step_s, len(names))
+    tasks = {}
+    for number, name in enumerate(names):
+        frames = len(stream.demos[number].train)
+        tasks[name] = {
+            "training_frames": frames,
+            "epochs": recipe.train.steps * recipe.train.batch_size / frames,
+            "trainable": found[number].trainable if number < len(found) else None,
+            "step_s": None if steps is None else steps[number],
+        }
+    disk, disk_free = _disk(stream, max(one.state for one in found)), free_disk(stream.out)
+    return StreamDryRunReport(
+        method=recipe.train.method,
+        backbone=recipe.backbone,
+        device=str(stream.device),
+        precision=devices.precision_taken(stream.device, recipe.train.precision),
+        parameters=parameters,
+        steps=recipe.train.steps,
+        cameras=list(stream.demos[0].cameras),
+        tasks=tasks,
+        tokens_per_frame=max(one.tokens for one in found),
+        memory_mb={name: size / MB for name, size in most.parts.items()},
+        memory_total_mb=most.needed / MB,
+        memory_measured_mb=None if measured is None else measured.needed / MB,
+        memory_free_mb=None if free is None else free / MB,
+        memory_fits=fits,
+        measuring_s=None if measured is None else _measuring_s(names, measured),
+        hours=None if measured is None else _hours(stream, measured, left),
+        disk_mb=disk / MB,
+        disk_free_mb=disk_free / MB,
+        disk_fits=disk <= disk_free,
+        out=str(stream.out),
+    )
+
+
+def _between(ends: tuple[float, float], count: int) -> list[float]:
+    """The first, the last, and evenly spaced what lies between them."""
+    first, last = ends
+    return [first + (last - first) * i / max(1, count - 1) for i in range(count)]
+
+
+def _measuring_s(names: tuple[str, ...], measured: _Measured) -> dict[str, float]:
+    found = {"questions": measured.vqa_s, "loss": measured.loss_s}
+    found |= {f"task {n}": s for n, s in zip(names, measured.tried_s, strict=True)}
+    return found if measured.looks_s is None else {**found, "routing": measured.looks_s}
+
+
+def _hours(stream: RobotStreamRun, measured: _Measured, left: list[int]) -> float:
+    """Hours of the steps that are left, and of what is measured after their tasks."""
+    seconds = measured.vqa_s if left[0] == stream.recipe.train.steps else 0.0  # before the first
+    looks_s = (measured.looks_s or 0.0) * _looks(stream)
+    for number, step_s in enumerate(_between(measured.step_s, len(left))):
+        if left[number]:
+            seconds += step_s * left[number] + looks_s
+            seconds += sum(measured.tried_s[: number + 1]) + measured.vqa_s + measured.loss_s
+    return seconds / 3600
+
+
+def _looks(stream: RobotStreamRun) -> int:
+    """How often a task's routers are looked at, at most: in its first phase, and at its end."""
+    if stream.learner.identification is None:
+        return 1
+    options = stream.options
+    limit = max(1, round(options["identify"] * stream.recipe.train.steps))
+    return limit // options["check_every"] + (limit % options["check_every"] > 0) + 1
+
+
+def _disk(stream: RobotStreamRun, kept: int) -> int:
+    """Bytes at the most: two states while one replaces the other, or one beside a finished run.
+
+    Args:
+        kept: of a state.
+    """
+    finished = _bytes(stream.parameters().values())
+    if stream.learner.trains == "model":
+        finished = _bytes(stream.model.parameters())
+    return max(2 * kept, kept + finished)

@@ -1,0 +1,110 @@
+"""`aegis evaluate --task`: open-loop errors of the policy of one task of a stream."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from aegis_cli import recipes
+from aegis_cli.common import commands, hub
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore, loading_told
+from aegis_cli.continual import files, learners, robots
+from aegis_cli.continual.robots import RobotStreamRun
+from aegis_cli.data.renaming import Renaming
+from aegis_cli.evaluation import open_loop
+from aegis_cli.evaluation.open_loop import Asked, Earlier, Learned, OpenLoopReport, Source
+from aegis_cli.models import backbones
+from aegis_cli.recipes import RobotStreamRecipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOpenLoopReport(OpenLoopReport):
+    """How far the predictions of one of a stream's policies are from what was recorded.
+
+    Attributes:
+        task: whose policy it is.
+    """
+
+    task: str
+
+
+def run(
+    run_path: Path,
+    task: str | None,
+    data: Path | None = None,
+    episodes: Sequence[int] | None = None,
+    frames: int = 1000,
+    seed: int = 0,
+    batch_size: int = 64,
+    traced: bool = False,
+    on_event: OnEvent = ignore,
+    rename: Renaming = (),
+) -> TaskOpenLoopReport:
+    """Compare the predictions of one of a stream's policies with demonstrations, frame by frame.
+
+    Args:
+        task: which one; None where the stream has a single task.
+        data: demonstrations; None: those that the task was learned from.
+        episodes: numbers from 0; None: the held-out ones of the task, or all of other data.
+        frames, seed, batch_size, traced, rename: as of `open_loop.run`.
+
+    Raises:
+        AegisError: a task that the run has not learned, or what `open_loop.run` finds wrong.
+    """
+    number = robots.number_of(run_path, task)
+    recipe = recipes.load(run_path / "recipe.yaml", kind=RobotStreamRecipe)
+    if data is None:
+        data = _own(recipe, number, run_path)
+    with loading_told("evaluate", on_event):
+        stream = robots.load_to_act(run_path)
+    stream.activate(number)
+    source = _source(stream, number, data)
+    earlier = [*_of_other_tasks(stream, number, data), *source.before()]
+    asked = Asked(episodes, frames, seed, batch_size, traced, rename)
+    policy, meta = stream.policies[number].eval(), stream.meta(number)
+    found = open_loop.evaluated(source, policy, meta, data, asked, earlier, on_event)
+    return TaskOpenLoopReport(task=stream.names[number], **vars(found))
+
+
+def _own(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
+    """The demonstrations that a task was learned from.
+
+    Raises:
+        AegisError: they are not where they were.
+    """
+    place, task = robots.place_of(recipe, number, run), recipe.tasks[number]
+    on_the_hub = recipe.demos.paths is not None and not hub.is_local(str(place))
+    if not place.exists() and not on_the_hub:
+        again = commands.aegis("evaluate", run, "--task", task, "--demos", "PATH")
+        raise AegisError(
+            f"'{place}' is gone, the demonstrations of '{task}' in the stream '{run}'",
+            "what the task was learned from",
+            f"bring it back, or say where it lies now, or give others: {again}",
+        )
+    return place
+
+
+def _source(stream: RobotStreamRun, number: int, data: Path) -> Source:
+    """What is known of how the task of that number was learned."""
+    recipe, task, run = stream.recipe, stream.names[number], stream.out
+    share, backbone = recipe.train.validation_share, backbones.divided(recipe.backbone)[0]
+    read = robots.learned_of(recipe, number, data)
+    learned = Learned(read, recipe.demos.camera, share, recipe.seed, (backbone,))
+    digests = frozenset({files.read(run).inputs.get(f"demos of {task}", "")})
+    place = robots.place_of(recipe, number, run).resolve()
+    return Source((str(run), "--task", task), learned, digests, frozenset({place}))
+
+
+def _of_other_tasks(stream: RobotStreamRun, number: int, data: Path) -> list[Earlier]:
+    """The other tasks of the stream that have shaped what serves the one of that number."""
+    # What is frozen once a task is learned owes nothing to those after it.
+    frozen = learners.get(stream.recipe.train.method).frozen
+    found = []
+    for other in range(number if frozen else len(stream.names)):
+        if other != number:
+            said = f"as '{stream.names[other]}' of the same stream, which '{stream.names[number]}'"
+            said += " may have learned from too"
+            found.append(Earlier(said, _source(stream, other, data), stream.meta(other)))
+    return found

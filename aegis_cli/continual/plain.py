@@ -1,0 +1,60 @@
+"""A stream's policy of one task by itself: plain weights, with what serves the task merged in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aegis_cli import recipes
+from aegis_cli.common import artifacts, commands
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.state_dicts import reading_meta
+from aegis_cli.continual import files, learners, robots
+from aegis_cli.continual.robots import RobotStreamRun
+from aegis_cli.core import routing
+from aegis_cli.models.policy import Policy
+from aegis_cli.recipes import RobotStreamRecipe
+
+
+def check(path: Path, task: str | None) -> int:
+    """The number of a task whose policy can be had in plain weights.
+
+    Only headers are read.
+
+    Raises:
+        AegisError: the run is not done, it has not learned the task, or a map of it weighs several
+            experts.
+    """
+    number = robots.number_of(path, task)
+    recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
+    learner, name = learners.get(recipe.train.method), recipe.tasks[number]
+    if learner.trains != "experts":
+        return number
+    saved, router = artifacts.read_header(path / files.EXPERTS), str(learner.router(number))
+    with reading_meta(path / files.EXPERTS):
+        of_maps = [said["routers"] for said in saved.meta["structure"].values()]
+        counts = [len(routers[router]["experts"]) for routers in of_maps if router in routers]
+    if several := sum(count > 1 for count in counts):
+        raise AegisError(
+            f"'{name}' of the stream in '{path}', which weighs several experts at {several} of "
+            f"{len(of_maps)} maps, anew at each position by what is read there: no single weight "
+            "does the same",
+            "a task with at most one expert at each map, which becomes part of its weights, as all "
+            "that isolated-lora and sequential learn",
+            f"let it act as it is: {commands.aegis('serve', path, '--task', name)}, or "
+            "aegis_cli.load_policy with task=; or train with --method isolated-lora",
+        )
+    return number
+
+
+def policy(run: RobotStreamRun, number: int) -> Policy:
+    """The policy of a task that `check` has found to be one of plain weights.
+
+    It takes the weights of the run, which is of no use afterwards. It has the positions and actions
+    of its own robot, whatever robots the stream's other tasks have.
+    """
+    found = run.policies[number]
+    # The policies share backbone and expert, so that the first one's are this one's.
+    routing.merge(run.model, run.sites, run.learner.router(number))
+    sizes = len(found.proprio_scale.mean), len(found.action_scale.mean)
+    expert = found.expert.of_robot(*sizes).to(found.backbone.device)
+    return Policy(found.backbone, expert, found.proprio_scale, found.action_scale).eval()
