@@ -21,7 +21,6 @@ FILES = (
     "campaign/test_damage.py",
     "cli/test_render.py",
     "common/test_artifacts.py",
-    "common/test_estimates.py",
     "common/test_files.py",
     "common/test_pictures.py",
     "continual/test_learners.py",
