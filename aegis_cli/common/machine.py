@@ -23,7 +23,7 @@ def describe() -> dict[str, str | int]:
         "aegis": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()}",
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
     }
@@ -31,7 +31,7 @@ def describe() -> dict[str, str | int]:
 
     if devices.on_gpu():
         found["gpu"] = torch.cuda.get_device_name()
-    return found | _versions()
+    return found | versions(_PACKAGES)
 
 
 def name() -> str:
@@ -45,16 +45,16 @@ def name() -> str:
 
 
 @cache
-def _versions() -> dict[str, str]:
-    """The installed packages' versions; to find one, its whole description is parsed."""
+def versions(packages: tuple[str, ...]) -> dict[str, str]:
+    """The versions of those that are installed; to find one, its whole description is parsed."""
     found: dict[str, str] = {}
-    for package in _PACKAGES:
+    for package in packages:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
     return found
 
 
-def _processor() -> str:
+def processor() -> str:
     """The processor's model, where the system tells it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-
 import torch
 
-from aegis_cli.common import devices, version
+from aegis_cli.common import devices, machine, version
 
-_LIBRARIES = (
-    "torch",
-    "transformers",
-    "tokenizers",
-    "pillow",
-    "numpy",
-    "mujoco",
-    "dm-control",
-    "metaworld",
-)
+_ANSWER = ("torch", "transformers", "tokenizers", "pillow", "numpy")
+_PLAY = (*_ANSWER, "mujoco", "dm-control", "metaworld", "hf-libero", "robosuite")
 
 
-def found() -> dict[str, str]:
-    """The code, the libraries, and the kind of device that computes."""
+def of_answers() -> dict[str, str]:
+    """The code, the libraries, and what computes; another processor may round otherwise."""
+    return _with(_ANSWER)
+
+
+def of_episodes(renderer: str) -> dict[str, str]:
+    """The same, with the simulators and what draws their pictures."""
+    return {"renderer": renderer, **_with(_PLAY)}
+
+
+def _with(libraries: tuple[str, ...]) -> dict[str, str]:
     device = devices.pick()
-    on = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-    return {"code": version.code(), "device": on} | {name: _version(name) for name in _LIBRARIES}
-
-
-def _version(library: str) -> str:
-    try:
-        return importlib.metadata.version(library)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+    on = torch.cuda.get_device_name(device) if device.type == "cuda" else machine.processor()
+    return {"code": version.code(), "device": on, **machine.versions(libraries)}

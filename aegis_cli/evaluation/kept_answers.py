@@ -47,7 +47,7 @@ def ask(
     own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
     own = own.sized(model.image_size)
     if backbones.model_files(name):
-        about = {"model": backbones.sha256(name), **circumstances.found()}
+        about = {"model": backbones.sha256(name), **circumstances.of_answers()}
         kept = KeptLines("answers", about, on_event)
         graded = _asked(model, own, batch_size, kept, on_event)
     else:  # random weights

@@ -116,7 +116,8 @@ def _circumstances(acting: Acting, *settings: Any) -> dict[str, Any]:
     """What the episodes depend on: the policy, where and how it acts, and what plays them."""
     policy = acting.policy.fingerprint()
     place = [acting.task, list(acting.cameras), [list(size) for size in acting.sizes]]
-    return {"policy": policy, "place": place, "how": list(settings), **circumstances.found()}
+    played = circumstances.of_episodes(gl.choose_backend())
+    return {"policy": policy, "place": place, "how": list(settings), **played}
 
 
 def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) -> None:

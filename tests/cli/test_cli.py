@@ -846,7 +846,7 @@ def test_of_several_processes_the_launcher_is_named_too(
 
 
 def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
-    for name in ("train", "dry-run", "pipeline", "demos"):
+    for name in ("train", "dry-run", "pipeline", "demos", "probe", "rollout"):
         stage(name, error=KeyboardInterrupt())
     code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
     assert (code, out) == (130, "") and "Traceback" not in err
@@ -857,6 +857,8 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
     again = aegis("run", recipe, "--overwrite")[2]
     assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
+    for command in ("probe", "rollout"):  # what they have measured is kept
+        assert aegis(command, "r")[2].endswith(f"interrupted; resume with: aegis {command} r\n")
     whole = "interrupted; no half-written file is left; begin again with: aegis"
     assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")
     dry = ("--demos", "d", "--out", "r", "--dry-run")
