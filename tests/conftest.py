@@ -31,7 +31,8 @@ from samples.command import command
 from samples.tiny import make_tiny
 
 from aegis_cli.anchors import measure
-from aegis_cli.common import garbage, kept_lines
+from aegis_cli.common import cache as cache_folders
+from aegis_cli.common import garbage
 from aegis_cli.data import record
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
@@ -42,6 +43,7 @@ TESTS = Path(__file__).parent
 MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 
 _TESTS_BEGUN = itertools.count()
+_CACHE, _MEASURED = cache_folders.folder, ("answers", "digests", "episodes")
 
 # An example may take longer on a machine that does something else, too.
 settings.register_profile("unhurried", deadline=None)
@@ -134,7 +136,7 @@ def what_is_measured_is_kept_apart(tmp_path_factory: pytest.TempPathFactory) -> 
     """What fixtures measure is none of the user's, nor of an earlier session."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_lines, "home", lambda kind: folder / kind)
+        _keep_in(folder, patch)
         yield folder
 
 
@@ -143,9 +145,17 @@ def every_test_measures(
     what_is_measured_is_kept_apart: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a test measures, maybe of a model that it has changed, no other one finds."""
-    number = next(_TESTS_BEGUN)
-    folder = what_is_measured_is_kept_apart / str(number)
-    monkeypatch.setattr(kept_lines, "home", lambda kind: folder / kind)
+    _keep_in(what_is_measured_is_kept_apart / str(next(_TESTS_BEGUN)), monkeypatch)
+
+
+def _keep_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Let measurements and digests lie there; large pictures are shared by all tests."""
+
+    def chosen(name: str) -> Path:
+        asked_for = "AEGIS_CACHE" in os.environ
+        return _CACHE(name) if asked_for or name not in _MEASURED else folder / name
+
+    patch.setattr(cache_folders, "folder", chosen)
 
 
 @pytest.fixture

@@ -847,7 +847,7 @@ def _beyond(points: float, max_drop: float) -> str:
     return f"{points:.{decimals}f}"
 
 
-@app.command(short_help="Say what a file, recipe, run, study, dataset or set of questions is.")
+@app.command(short_help="Say what a file, run, dataset or set of questions is.")
 def inspect(
     path: Annotated[
         Path,

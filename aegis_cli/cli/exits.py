@@ -30,14 +30,11 @@ from aegis_cli.common.home import word_at_home
 from aegis_cli.recipes import Recipe
 from aegis_cli.recipes.decoding import below
 
-# What a command that goes on needs beside its own words. `run` skips what is up to date, and the
-# last two what they have answered or played.
-_WITH_RESUME = {
-    "train": " --resume",
-    "pretrain": " --resume",
-    "run": "",
-    "probe": "",
-    "rollout": "",
+# What a command that goes on needs beside its own words; `run` skips what is up to date.
+_WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
+_KEEPS = {  # what others do not measure again, where the cache can be written
+    "probe": "answers so far are kept",
+    "rollout": "groups of episodes are kept that were played to their end (of 64, or LIBERO's 10)",
 }
 # What pydantic calls a value of the wrong type, and what it is then.
 _NO_NUMBER = {
@@ -278,6 +275,8 @@ def _what_now(meta: Mapping[str, Any]) -> str:
     flag = _WITH_RESUME.get(args[0])
     if flag is None or "--dry-run" in args:
         again = f"{_program()} {shlex.join(args)}"
+        if args[0] in _KEEPS:
+            return f"{_KEEPS[args[0]]}; go on with: {again}"
         return f"no half-written file is left; begin again with: {again}"
     alone = _alone(meta.get(GOES_ON))
     if alone is not None:

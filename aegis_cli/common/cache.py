@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import time
 from pathlib import Path
+
+_KEPT_S = 30 * 86_400.0  # small files that nobody has used for so long are removed
 
 
 def folder(name: str) -> Path:
@@ -11,3 +15,17 @@ def folder(name: str) -> Path:
     if own := os.environ.get("AEGIS_CACHE"):
         return Path(own) / name
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aegis" / name
+
+
+def sweep(folder: Path) -> None:
+    """Remove the files of a folder that nobody has used for a long time."""
+    with contextlib.suppress(OSError):  # of another user, or not there yet
+        for path in folder.iterdir():
+            if time.time() - path.stat().st_mtime > _KEPT_S:
+                path.unlink()
+
+
+def touch(path: Path) -> None:
+    """Say that a file of the cache is in use."""
+    with contextlib.suppress(OSError):  # another user's, who says so too
+        os.utime(path)

@@ -56,20 +56,29 @@ def of_files(
     return {path: _known[key] for path, key in keys.items()}
 
 
+def stamp(path: Path) -> Stamp:
+    """What tells the file that a path leads to now from what it may become.
+
+    Raises:
+        OSError: nothing is there.
+    """
+    state = path.stat()
+    return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+
+
 def _key(path: Path, fix: str) -> tuple[Path, Stamp]:
-    """The file that a path leads to, as it is now."""
     with files.reading(path, fix):
-        state = path.stat()
-    stamp = (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
-    return path.resolve(), stamp
+        return path.resolve(), stamp(path)
 
 
 def _know(large: Mapping[Path, tuple[Path, Stamp]], home: Path, on_event: OnEvent) -> None:
     """Learn the digests of large files, from those that are kept or by reading them."""
     store = cache.folder("digests") / f"{files.sha256_value(str(home.resolve()))[:32]}.json"
+    cache.sweep(store.parent)
     try:
         with _locked(store):  # others who begin with the same data set wait for what this one reads
             kept = _kept(store)
+            cache.touch(store)
             _known.update({key: kept[key] for key in large.values() if key in kept})
             fresh = _read({p: key for p, key in large.items() if key not in kept}, on_event)
             if fresh:
@@ -97,6 +106,7 @@ def _locked(store: Path) -> Generator[None]:
         raise _Unkept(error.strerror or str(error)) from error
     try:
         with contextlib.suppress(OSError):  # a file system without locks: each reads for itself
+            os.utime(lock)
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
     finally:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,6 @@ from typing import Any
 from aegis_cli.common import cache, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
-
-_KEPT_S = 30 * 86_400.0  # a file that nobody has used for so long is removed
-
-
-def home(kind: str) -> Path:
-    """The folder in which lines of a kind are kept."""
-    return cache.folder(kind)
 
 
 class KeptLines:
@@ -37,18 +29,18 @@ class KeptLines:
     """
 
     def __init__(self, kind: str, about: Mapping[str, Any], on_event: OnEvent) -> None:
-        self.path = home(kind) / f"{files.sha256_value(about)[:32]}.jsonl"
+        self.path = cache.folder(kind) / f"{files.sha256_value(about)[:32]}.jsonl"
         self._on_event = on_event
         self._can_keep = True
-        _sweep(self.path.parent)
+        cache.sweep(self.path.parent)
 
     def read(self) -> Iterator[dict[str, Any]]:
         """What is kept. A line that was cut off, as by a full disk, is left out."""
         try:
             raw = self.path.read_bytes()
-            os.utime(self.path)  # it is in use
         except OSError:  # nothing is kept, or not for this user: it is measured
             return
+        cache.touch(self.path)
         for line in raw.splitlines():
             with contextlib.suppress(ValueError):
                 found = json.loads(line)
@@ -56,7 +48,7 @@ class KeptLines:
                     yield found
 
     def add(self, lines: Iterable[Mapping[str, Any]]) -> None:
-        """Keep some lines, all of them or none."""
+        """Keep some lines."""
         if not self._can_keep:
             return
         text = "".join(json.dumps(line) + "\n" for line in lines)
@@ -80,11 +72,3 @@ def _ends_a_line(path: Path) -> bool:
             return True
         file.seek(-1, os.SEEK_END)
         return file.read(1) == b"\n"
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what nobody has used for a long time."""
-    with contextlib.suppress(OSError):  # of another user, or not there yet
-        for path in folder.glob("*.jsonl"):
-            if time.time() - path.stat().st_mtime > _KEPT_S:
-                path.unlink()

@@ -677,7 +677,11 @@ def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
                     "correct demos.only, or demos.paths",
                 )
             shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
-            on_event(Warned("train", f"{shared}, which learn from them twice"))
+            text = (
+                f"{shared}: what one holds out the other may learn from, so that their errors on "
+                "held-out episodes tell too little"
+            )
+            on_event(Warned("train", text))
         seen.append((task, place, own))
 
 

@@ -348,7 +348,7 @@ def merge(root: nn.Module, sites: Routed, task: int) -> None:
         sites: by their dotted names in `root`, as `route` gave them.
 
     Raises:
-        ValueError: as `RoutedLinear.merged`; nothing has been replaced then.
+        ValueError: as `RoutedLinear.merged`; the weights of other maps may have changed by then.
     """
     plain = {name: site.merged(task) for name, site in sites.items()}
     for name, linear in plain.items():

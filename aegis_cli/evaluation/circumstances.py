@@ -6,7 +6,7 @@ import torch
 
 from aegis_cli.common import devices, machine, version
 
-_ANSWER = ("torch", "transformers", "tokenizers", "pillow", "numpy")
+_ANSWER = ("torch", "torchvision", "transformers", "tokenizers", "pillow", "numpy")
 _PLAY = (*_ANSWER, "mujoco", "dm-control", "metaworld", "hf-libero", "robosuite")
 
 

@@ -1,19 +1,23 @@
 """Answers that a model has given before, so that an interrupted probe goes on.
 
-So does one of more questions, and a baseline is asked once. An answer is that of the model's files,
-a question and its image, and of the code, the libraries and the kind of device that computed it.
+So does one of more questions, and a baseline is asked once. An answer is that of a model, a
+question and its image, and of the code, the libraries and the device that computed it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from aegis_cli.common import files, kept_digests
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.ranks import Ranks
@@ -27,9 +31,42 @@ from aegis_cli.models.backbones.base import Backbone
 Said = tuple[str, float]  # and its cross-entropy
 
 
+class Loaded(NamedTuple):
+    """A model, and a digest of all that its answers depend on in it.
+
+    The digest is None of random weights, and where somebody wrote to the files meanwhile: then
+    nobody knows which weights were loaded.
+    """
+
+    model: Backbone
+    digest: str | None
+
+
+def load(name: str) -> Loaded:
+    """Load a backbone, as `backbones.load` does, and learn whose answers are its."""
+    before = _places(name)
+    model = backbones.load(name)
+    if not before:
+        return Loaded(model, None)
+    home = next(iter(before)).parent
+    weights = kept_digests.of_files(before, home)
+    if _places(name) != before:  # a training lets `last` lead to another folder, too
+        return Loaded(model, None)
+    content = [weights[path] for path in sorted(weights)]
+    return Loaded(model, files.sha256_value({"weights": content, "settings": model.settings()}))
+
+
+def _places(name: str) -> dict[Path, object]:
+    """The files of a model, where they lie by now, as they are; none where it does not load."""
+    try:
+        paths = [Path(os.path.realpath(path)) for path in backbones.model_files(name)]
+        return {path: kept_digests.stamp(path) for path in paths if path.is_file()}
+    except (AegisError, OSError):  # what is wrong, the load says better
+        return {}
+
+
 def ask(
-    model: Backbone,
-    name: str,
+    loaded: Loaded,
     asked: VQASet,
     batch_size: int,
     ranks: Ranks,
@@ -41,17 +78,18 @@ def ask(
     same bit for bit whether the work was interrupted or not. What is answered is kept at once.
 
     Args:
-        name: what the model was loaded from.
         ranks: the processes that ask a part of the questions each.
     """
+    model = loaded.model
     own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
     own = own.sized(model.image_size)
-    if backbones.model_files(name):
-        about = {"model": backbones.sha256(name), **circumstances.of_answers()}
-        kept = KeptLines("answers", about, on_event)
-        graded = _asked(model, own, batch_size, kept, on_event)
-    else:  # random weights
-        graded = grade(model.answers, own, batch_size, on_event)
+    with torch.no_grad():
+        if loaded.digest is None:
+            graded = grade(model.answers, own, batch_size, on_event)
+        else:
+            about = {"model": loaded.digest, **circumstances.of_answers()}
+            kept = KeptLines("answers", about, on_event)
+            graded = _asked(model, own, batch_size, kept, on_event)
     return [one for part in ranks.gathered(graded) for one in part]
 
 

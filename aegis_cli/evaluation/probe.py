@@ -132,8 +132,10 @@ def run(
         models = [name for name in (target, baseline) if name is not None]
         _check_predictions(predictions, source.files, models, anchor)
     with loading_told("probe", on_event):
-        model = backbones.load(target)
-        before = None if baseline is None else backbones.load(baseline)
+        loaded = kept_answers.load(target)
+        reference_model = None if baseline is None else kept_answers.load(baseline)
+    model = loaded.model
+    before = None if reference_model is None else reference_model.model
     if before is not None:
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
@@ -142,11 +144,12 @@ def run(
     asked = source.choose("probe", questions, seed, checks, on_event)
     with joined() as ranks:
         # One model after the other: each is on the device only while it answers.
-        after, now = _answered(model, target, asked, measured, batch_size, ranks, on_event)
+        after, now = _answered(loaded, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
-        if before is not None and baseline is not None:
+        if reference_model is not None:
+            of_baseline = _of_baseline(on_event)
             reference, then = _answered(
-                before, baseline, asked, measured, batch_size, ranks, _of_baseline(on_event)
+                reference_model, asked, measured, batch_size, ranks, of_baseline
             )
     layers = _layers(now, then)
     between = None if anchor is None else two_sets(anchor, source.name, ask)
@@ -204,8 +207,7 @@ def _of_baseline(on_event: OnEvent) -> OnEvent:
 
 
 def _answered(
-    model: Backbone,
-    name: str,
+    loaded: kept_answers.Loaded,
     asked: VQASet,
     anchor: Anchor | None,
     batch_size: int,
@@ -216,8 +218,8 @@ def _answered(
 
     It is on the device meanwhile, and on the CPU again afterwards: two models may not fit.
     """
-    model.to(devices.pick())
-    graded = kept_answers.ask(model, name, asked, batch_size, ranks, on_event)
+    model = loaded.model.to(devices.pick())
+    graded = kept_answers.ask(loaded, asked, batch_size, ranks, on_event)
     found = [] if anchor is None else _distances(model, asked, anchor, batch_size, ranks)
     model.to("cpu")
     return graded, found

@@ -146,8 +146,13 @@ class Policy(nn.Module):
         return flow.masked_mse(velocity, target, send(batch.is_pad, device), shown)
 
     def fingerprint(self) -> str:
-        """sha256 of all weights, of the precision, and of what decides what the backbone reads."""
-        settings = {"acts_in": str(self.acts_in), **self.backbone.settings()}
+        """sha256 of all weights, and of what else decides how it acts."""
+        settings = {
+            "acts_in": str(self.acts_in),
+            "expert": repr(self.expert.shape),
+            "relative_to": repr(self.origins.places),
+            **self.backbone.settings(),
+        }
         return sha256_value({"weights": digest(self.state_dict()), **settings})
 
     def act(

@@ -97,6 +97,11 @@ def is_stream_run(path: Path) -> bool:
     return _kind_of_run(path) in _STREAMS
 
 
+def is_policy_run(path: Path) -> bool:
+    """Whether it is the run of one policy."""
+    return _kind_of_run(path) is Recipe
+
+
 def is_robot_stream_run(path: Path) -> bool:
     """Whether it is one of robot tasks."""
     return _kind_of_run(path) is RobotStreamRecipe

@@ -294,8 +294,12 @@ def _is_run(path: Path) -> bool:
 
 def _runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
     """The runs right in a folder by their names, as far as they have a checkpoint."""
-    runs = sorted(saved.parent for saved in folder.glob("*/recipe.yaml"))
-    runs = [run for run in runs if _is_run(run)]
+    runs: list[Path] = []
+    for saved in sorted(folder.glob("*/recipe.yaml")):
+        try:
+            runs += [saved.parent] * recipes.is_policy_run(saved.parent)
+        except AegisError as error:  # a recipe that cannot be read
+            on_event(Warned("compare", f"left out is '{saved.parent}': {error.found}"))
     begun = [run for run in runs if not (run / "ledger.safetensors").is_file()]
     if begun:
         listed = ", ".join(str(run) for run in begun)

@@ -122,13 +122,19 @@ def _demonstrations(
     decodes = launch.local_rank() == 0
     found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
     ranks.wait()
-    return load_demonstrations(recipe, backbone, demos, on_event) if found is None else found
+    if found is not None:
+        return found
+    return load_demonstrations(recipe, backbone, demos, on_event, decides=False)
 
 
 def load_demonstrations(
-    recipe: Recipe, backbone: Backbone, paths: Paths, on_event: OnEvent
+    recipe: Recipe, backbone: Backbone, paths: Paths, on_event: OnEvent, decides: bool = True
 ) -> demonstrations.Demonstrations:
     """Load what the backbone is to learn from.
+
+    Args:
+        decides: whether to look if the disk has room for decoded frames, where the recipe does not
+            say; else another process has, and kept frames are taken if there are any.
 
     Raises:
         AegisError: demonstrations of another task, with words that the backbone does not know, or
@@ -143,7 +149,7 @@ def load_demonstrations(
         recipe.demos.selection,
         backbone.image_size,
         on_event=on_event,
-        cache=recipe.demos.cache,
+        cache=recipe.demos.cache if decides else bool(recipe.demos.cache),
         check_text=backbone.check_prompt,
     )
     if found.task is None:

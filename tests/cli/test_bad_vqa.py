@@ -441,9 +441,11 @@ def test_rows_of_several_images(bad: Callable[..., str], place: Path) -> None:
 @pytest.mark.parametrize(
     ("turns", "says"),
     [
-        ("red", "no conversation"),
-        ([], "no conversation"),
-        (["red"], "no conversation"),
+        ("red", "a conversation that is a str"),
+        ([], "an empty conversation"),
+        (["red"], "a conversation that is a list of str"),
+        (None, "a conversation that is nothing"),
+        ({"from": "human"}, "a conversation that is a dict"),
         ([{"user": "what color is it"}], "a turn with user"),
         ([{"from": "human", "value": "what color is it"}], "a conversation of human"),
         ([{"from": "gpt", "value": "red"}], "a conversation of gpt"),

@@ -857,8 +857,9 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
     again = aegis("run", recipe, "--overwrite")[2]
     assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
-    for command in ("probe", "rollout"):  # what they have measured is kept
-        assert aegis(command, "r")[2].endswith(f"interrupted; resume with: aegis {command} r\n")
+    for command, kept in (("probe", "answers so far"), ("rollout", "groups of episodes")):
+        said = aegis(command, "r")[2]
+        assert f"interrupted; {kept}" in said and said.endswith(f"go on with: aegis {command} r\n")
     whole = "interrupted; no half-written file is left; begin again with: aegis"
     assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")
     dry = ("--demos", "d", "--out", "r", "--dry-run")

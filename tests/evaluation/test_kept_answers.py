@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from samples.vqa_files import picture, write_jsonl
 from torch import Tensor
 
-from aegis_cli.common import kept_lines
+from aegis_cli.common import cache
 from aegis_cli.common.events import Event, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.data.vqa import sets
@@ -72,13 +73,15 @@ def ask(tiny: EmbeddedVLM, model: str) -> Ask:
         ranks: Ranks = ALONE,
         name: str = model,
     ) -> list[Graded]:
-        return kept_answers.ask(tiny, name, of, batch, ranks, on_event)
+        loaded = kept_answers.load(name)
+        assert loaded.digest is not None
+        return kept_answers.ask(loaded._replace(model=tiny), of, batch, ranks, on_event)
 
     return ask
 
 
 def store() -> Path:
-    (path,) = kept_lines.home("answers").glob("*.jsonl")
+    (path,) = cache.folder("answers").glob("*.jsonl")
     return path
 
 
@@ -157,6 +160,50 @@ def test_another_probe_is_asked(
     same = sets.read(str(path)).choose("probe", 18, 0)
     ask(same)
     assert sum(batches) > 0
+
+
+def test_nothing_is_kept_for_a_backward_pass(
+    ask: Ask, asked: VQASet, tiny: EmbeddedVLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A graph of every batch would not fit beside a large model."""
+    seen: list[bool] = []
+    plain = tiny.answers
+
+    def noted(given: Iterator[Any]) -> Iterator[tuple[list[str], Tensor]]:
+        for said, likelihood in plain(given):
+            seen.append(torch.is_grad_enabled() or likelihood.requires_grad)
+            yield said, likelihood
+
+    monkeypatch.setattr(tiny, "answers", noted)
+    ask(asked)
+    assert seen and not any(seen)
+
+
+@pytest.mark.parametrize("when", ["link", "file"])
+def test_answers_of_weights_that_nobody_knows_are_not_kept(
+    when: str, tmp_path: Path, tiny: EmbeddedVLM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a training writes its next checkpoint while the last one is loaded."""
+    for name in ("a", "b"):
+        tiny.save(tmp_path / name)
+        with torch.no_grad():
+            next(iter(tiny.parameters())).add_(0.1)
+    link = tmp_path / "last"
+    link.symlink_to("a")
+    plain = kept_answers.backbones.load
+
+    def loaded_meanwhile(name: str) -> Any:
+        found = plain(name)
+        if when == "link":
+            link.unlink()
+            link.symlink_to("b")
+        else:
+            shutil.copy(tmp_path / "b" / "model.safetensors", tmp_path / "a")
+        return found
+
+    assert kept_answers.load(str(link)).digest is not None
+    monkeypatch.setattr(kept_answers.backbones, "load", loaded_meanwhile)
+    assert kept_answers.load(str(link)).digest is None
 
 
 def test_people_may_be_graded_by_other_answers(

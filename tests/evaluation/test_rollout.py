@@ -21,7 +21,7 @@ import torch
 from samples.small_run import recipe
 
 from aegis_cli import sim
-from aegis_cli.common import artifacts, kept_lines, media
+from aegis_cli.common import artifacts, cache, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.common.palette import HELD_OUT, RGB, SEEN
@@ -448,7 +448,7 @@ def test_episodes_are_the_same_for_every_policy_and_number(
 
 def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[Seen]) -> None:
     first = rollout.run(run_folder, "reach", 3, "seen")
-    shutil.rmtree(kept_lines.home("episodes"))  # or the second would be the first
+    shutil.rmtree(cache.folder("episodes"))  # or the second would be the first
     second = rollout.run(run_folder, None, 3, "seen")
     assert timeless(first) == timeless(second) and first.episodes_per_s > 0
     paths = [[s.proprio.tobytes() for s in env.shown] for env in envs]
@@ -482,7 +482,7 @@ def test_an_interrupted_rollout_goes_on_to_the_same_report(
     again = rollout.run(run_folder, None, 5, "seen")
     assert envs == [] and timeless(again) == timeless(resumed)
     assert again.episodes_per_s < 1000  # as fast as they were played, and not as they were found
-    shutil.rmtree(kept_lines.home("episodes"))
+    shutil.rmtree(cache.folder("episodes"))
     assert timeless(rollout.run(run_folder, None, 5, "seen")) == timeless(resumed)
 
 
@@ -511,7 +511,7 @@ def test_several_processes_play_the_same_episodes(
 ) -> None:
     """To the bytes of the video."""
     alone = rollout.run(run_folder, None, 3, "seen", tmp_path / "v.mp4")
-    shutil.rmtree(kept_lines.home("episodes"))
+    shutil.rmtree(cache.folder("episodes"))
     film = (tmp_path / "v.mp4").read_bytes()
     monkeypatch.setattr(sim, "workers", lambda *_: 2)
     shared = rollout.run(run_folder, None, 3, "seen", tmp_path / "v.mp4")
@@ -603,7 +603,7 @@ def test_another_seed_plays_other_episodes(aegis, run_folder: Path) -> None:
             return begin(*given)
 
         patch.setattr(acting, "_begin", noted)
-        shutil.rmtree(kept_lines.home("episodes"))
+        shutil.rmtree(cache.folder("episodes"))
         assert aegis("rollout", run_folder, "--episodes", 2, "--seed", 7)[0] == 0
     assert begun == [(7, 0), (7, 1)]
 

@@ -39,6 +39,9 @@ def test_a_folder_stands_for_the_runs_in_it(job: Path, tmp_path: Path) -> None:
     stream = folder / "stream" / "recipe.yaml"
     stream.parent.mkdir()
     files.write_text(stream, "kind: robot-stream\n")
+    for name, recipe in (("pretraining", "kind: pretrain\n"), ("damaged", "- 1\n")):
+        (folder / name).mkdir()
+        files.write_text(folder / name / "recipe.yaml", recipe)
     begun = folder / "c"
     shutil.copytree(job / "naive", begun, symlinks=True)
     (begun / "ledger.safetensors").unlink()
@@ -46,7 +49,10 @@ def test_a_folder_stands_for_the_runs_in_it(job: Path, tmp_path: Path) -> None:
     found = compare.run([folder], events.append)
     assert [row.run for row in found.rows] == [str(folder / "a"), str(folder / "b")]
     warned = [event.text for event in events if isinstance(event, Warned)]
-    assert warned == [f"left out, for they have no checkpoint yet: {begun}"]
+    assert [text for text in warned if "have no checkpoint" in text] == [
+        f"left out, for they have no checkpoint yet: {begun}"
+    ]
+    assert [text for text in warned if "damaged" in text] == warned[:1] and len(warned) == 2
 
 
 def test_figures_are_those_of_the_jobs_table(job: Path) -> None:

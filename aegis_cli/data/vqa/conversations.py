@@ -72,8 +72,13 @@ def one_picture(where: str, pictures: Any) -> Any:
 
 def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
     """Question, answer and source of each turn."""
+    if isinstance(turns, dict) and all(isinstance(column, list) for column in turns.values()):
+        # So a column of lists of objects comes that an older version of `datasets` has declared.
+        rows = zip(*turns.values(), strict=False)
+        turns = [dict(zip(turns, row, strict=True)) for row in rows]
     if not isinstance(turns, list) or not turns or not all(isinstance(t, dict) for t in turns):
-        raise bad(where, "no conversation", _EXPECTED, "correct the row")
+        found = "an empty conversation" if turns == [] else f"a conversation that is {_kind(turns)}"
+        raise bad(where, found, _EXPECTED, "correct the row")
     if all("user" in turn and "assistant" in turn for turn in turns):
         return [(_text(t["user"]), _text(t["assistant"]), t.get("source")) for t in turns]
     said = [_said(where, turn) for turn in turns]
@@ -99,6 +104,13 @@ def _said(where: str, turn: dict[str, Any]) -> tuple[str, Any]:
             str(piece.get("text") or "") for piece in content if isinstance(piece, dict)
         )
     return speaker, _text(content)
+
+
+def _kind(turns: Any) -> str:
+    """What stands in a conversation's place."""
+    if isinstance(turns, list):
+        return f"a list of {type(turns[0]).__name__}"
+    return "nothing" if turns is None else f"a {type(turns).__name__}"
 
 
 def _text(said: Any) -> Any:

@@ -193,7 +193,11 @@ def _with_whole_images(found: sets.Listed, on_event: OnEvent) -> sets.Listed:
 
 
 def _read(name: str) -> sets.Listed:
-    found = sets.read(name, skip_bad=True)
+    try:
+        found = sets.read(name, skip_bad=True)
+    except AegisError as error:
+        known = "aegis inspect takes .jsonl and .parquet files, and lists in .json, for questions"
+        raise AegisError(error.found, error.expected, f"{error.fix}; {known}") from error
     if not isinstance(found, sets.Listed):
         raise AegisError(f"'{name}', which is rendered", "questions of files", "aegis probe MODEL")
     return found

@@ -118,9 +118,10 @@ class HFBackbone(Backbone):
         return self.get_submodule(f"{self._language}.rotary_emb")
 
     def settings(self) -> dict[str, str]:
-        """Digests of the model's configuration and of its processor's files."""
+        """Digests of the model's configuration and processor, and the tokens that end answers."""
         contents = {"config.json": self.vlm.config.to_json_string().encode(), **self._files}
-        return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+        digests = {name: hashlib.sha256(own).hexdigest() for name, own in contents.items()}
+        return {"ends": str(self.vlm.generation_config.eos_token_id), **digests}
 
     def _measure_keys(self) -> tuple[int, int]:
         """Number and size of the heads of keys, from a pass over one black image.

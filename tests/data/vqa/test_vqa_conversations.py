@@ -97,6 +97,24 @@ def test_rows_of_a_data_set_have_conversations(
     assert (decode(source.entries[-1].picture, None) == np.asarray(shown[-1])).all()
 
 
+def test_columns_of_lists_are_conversations_too(tmp_path: Path) -> None:
+    """As `datasets` gives a column that was declared as a sequence of objects."""
+    turns = FORMS["llava"]["conversations"]
+    said = [{name: [turn[name] for turn in turns] for name in ("from", "value")}]
+    features = datasets.Features(
+        {
+            "image": datasets.Image(),
+            "conversations": datasets.Sequence(
+                {name: datasets.Value("string") for name in ("from", "value")}
+            ),
+        }
+    )
+    rows = {"image": [picture(0)], "conversations": said}
+    made = datasets.Dataset.from_dict(rows, features=features)
+    made.save_to_disk(tmp_path / "data")
+    assert [text for _, text, *_ in asked(tmp_path / "data")] == [ask for ask, _ in SAID]
+
+
 def test_a_single_turn_keeps_the_id_and_its_source_is_its_family(pictures: Path) -> None:
     turn = {"user": "what color is it?", "assistant": "red", "source": "vqav2"}
     rows = [
