@@ -19,7 +19,7 @@ from aegis_cli.common import commands, devices, launch, memory, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import ALONE
-from aegis_cli.continual import files, loop, robots, state, train
+from aegis_cli.continual import files, loop, robot_demos, robots, state, train
 from aegis_cli.continual.loop import TaskTraining
 from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.continual.state import TaskInProgress
@@ -166,7 +166,7 @@ def _recorded(recipe: RobotStreamRecipe, out: Path) -> RobotStreamRecipe:
     """
     if recipe.demos.paths is not None:
         return recipe
-    places = [robots.place_of(recipe, number, out) for number in range(len(recipe.tasks))]
+    places = [robot_demos.place_of(recipe, number, out) for number in range(len(recipe.tasks))]
     for task, place in zip(recipe.tasks, places, strict=True):
         if not place.is_file():
             record = ("demos", task, "--episodes", str(recipe.demos.episodes), "--out", "FILE")

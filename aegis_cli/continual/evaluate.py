@@ -10,7 +10,7 @@ from aegis_cli import recipes
 from aegis_cli.common import commands, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore, loading_told
-from aegis_cli.continual import files, learners, robots
+from aegis_cli.continual import files, learners, robot_demos, robots
 from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.evaluation import open_loop
@@ -74,7 +74,7 @@ def _own(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
     Raises:
         AegisError: they are not where they were.
     """
-    place, task = robots.place_of(recipe, number, run), recipe.tasks[number]
+    place, task = robot_demos.place_of(recipe, number, run), recipe.tasks[number]
     on_the_hub = recipe.demos.paths is not None and not hub.is_local(str(place))
     if not place.exists() and not on_the_hub:
         again = commands.aegis("evaluate", run, "--task", task, "--demos", "PATH")
@@ -90,10 +90,10 @@ def _source(stream: RobotStreamRun, number: int, data: Path) -> Source:
     """What is known of how the task of that number was learned."""
     recipe, task, run = stream.recipe, stream.names[number], stream.out
     share, backbone = recipe.train.validation_share, backbones.divided(recipe.backbone)[0]
-    read = robots.learned_of(recipe, number, data)
+    read = robot_demos.learned_of(recipe, number, data)
     learned = Learned(read, recipe.demos.camera, share, recipe.seed, (backbone,))
     digests = frozenset({files.read(run).inputs.get(f"demos of {task}", "")})
-    place = robots.place_of(recipe, number, run).resolve()
+    place = robot_demos.place_of(recipe, number, run).resolve()
     return Source((str(run), "--task", task), learned, digests, frozenset({place}))
 
 

@@ -10,10 +10,8 @@ what the backbone knows with no task active.
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,12 +21,9 @@ from torch import Tensor, nn
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import Event, OnEvent, Progress, Warned, ignore
-from aegis_cli.common.files import make_folder
-from aegis_cli.common.palette import COLORS
+from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
-from aegis_cli.continual import files, learners
-from aegis_cli.continual.held_out import HeldOut
+from aegis_cli.continual import files, learners, robot_demos
 from aegis_cli.continual.report import (
     Ends,
     ErrorMatrix,
@@ -38,29 +33,29 @@ from aegis_cli.continual.report import (
     SuccessMatrix,
     vqa_scores,
 )
+from aegis_cli.continual.robot_evaluators import (
+    ClosedLoopEvaluator,
+    HeldOutEvaluator,
+    Questions,
+    RobotEvaluator,
+)
 from aegis_cli.continual.state import WHOLE, StreamRun, changed_inputs
 from aegis_cli.core import routing
 from aegis_cli.core.routing import Routed
-from aegis_cli.data import augment, demonstrations, mixture, renaming, spread, task_episodes
+from aegis_cli.data import augment, spread
 from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
-from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa import sets
-from aegis_cli.data.vqa.metrics import score
 from aegis_cli.models import backbones, policy_meta
-from aegis_cli.models.acting import Acting, longest_s, play
-from aegis_cli.models.asking import ask
+from aegis_cli.models.acting import Acting
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
-from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe, RobotTrain
-from aegis_cli.sim.contract import EVALUATION, VALIDATION
+from aegis_cli.recipes import RobotStreamRecipe, RobotTrain
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
-from aegis_cli.training.up_to_date import Made, StageRecords
-from aegis_cli.training.validation_time import expected_s
 
 # Training frames, evenly spaced, on which routers are measured, always with the same noise.
 CALIBRATION_FRAMES = 32
@@ -72,7 +67,6 @@ ACTION_EXPERT, BACKBONE = "expert.safetensors", "backbone"
 QUESTION_FILE = "vqa/"  # the name of a question file among a run's inputs begins so
 
 Scales = tuple[Normalizer, Normalizer]  # of positions and of actions
-Questions = sets.Scenes | sets.Listed
 
 
 # --- the run --------------------------------------------------------------------------------------
@@ -333,11 +327,12 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
         backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
-    _check_given(recipe, on_event)
+    robot_demos.check_given(recipe, on_event)
     for task in recipe.tasks if recipe.simulated else ():
-        _check_words(backbone, task)
+        robot_demos.check_words(backbone, task)
     # Only now, when all else has been found to fit: recording takes long.
-    demos = tuple(_demos(recipe, i, backbone, out, on_event) for i in range(len(recipe.tasks)))
+    numbers = range(len(recipe.tasks))
+    demos = tuple(robot_demos.load(recipe, i, backbone, out, on_event) for i in numbers)
     scales = [d.scales(recipe.train.normalization) for d in demos]
     # One action expert serves all robots: it reads and moves as many joints as any has.
     proprio = max(len(positions.mean) for positions, _ in scales)
@@ -386,7 +381,7 @@ def _as_learned(
         AegisError: they are gone, or others than the run learned from.
     """
     count, backbone = len(recipe.tasks), run.model.backbone
-    demos = tuple(_demos(recipe, i, backbone, run.out, on_event) for i in range(count))
+    demos = tuple(robot_demos.load(recipe, i, backbone, run.out, on_event) for i in range(count))
     now = {f"demos of {task}": d.sha256 for task, d in zip(recipe.tasks, demos, strict=True)}
     then = {name: before.inputs.get(name, "") for name in now}
     if changed := changed_inputs(then, now):
@@ -626,202 +621,6 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
     still.warn_of_tied(on_event)
 
 
-def _check_words(backbone: Backbone, task: str) -> None:
-    """Raise AegisError unless the backbone knows the words of a simulated task's instructions."""
-    size = backbone.image_size or 64
-    picture = torch.zeros(1, size, size, 3, dtype=torch.uint8)
-    for template in sim.make(task).spec.templates:
-        backbone.prepare(picture, [template.format(color=COLORS[0])])
-
-
-def _check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
-
-    To decode the first task's frames can take hours.
-    """
-    if recipe.demos.paths is None:
-        return
-    sets = [demonstrations.at(name) for name in recipe.demos.named]
-    mixture.check_rename(sets, renaming.of(recipe.demos.rename))
-    for number in range(len(recipe.tasks)):
-        path, selection = given(recipe, number)
-        if selection.only is not None:
-            count = demonstrations.count_episodes(path)
-            demonstrations.learned_from(path, count, selection.only)
-        if not recipe.simulated:
-            robot = mixture.robot_of(path, selection)  # with its cameras and features
-            _check_task(robot.task, recipe.tasks[number], path)
-    if not recipe.simulated:
-        _check_own_episodes(recipe, on_event)
-
-
-def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
-    """Refuse tasks that learn from the same episodes, and warn of those that share some.
-
-    Raises:
-        AegisError: two tasks have all of their episodes in common.
-    """
-    seen: list[tuple[str, Path, set[int]]] = []
-    for number, task in enumerate(recipe.tasks):
-        path, selection = given(recipe, number)
-        count = demonstrations.count_episodes(path)
-        own = set(demonstrations.learned_from(path, count, selection.only).tolist())
-        place = demonstrations.locate(path).resolve()  # a folder may be named in two ways
-        for other, elsewhere, theirs in seen:
-            if elsewhere != place or not own & theirs:
-                continue
-            if own == theirs:
-                raise AegisError(
-                    f"the same {len(own)} episodes of '{path}' for '{other}' and '{task}'",
-                    "episodes of its own for each task",
-                    "correct demos.only, or demos.paths",
-                )
-            shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
-            text = (
-                f"{shared}: what one holds out the other may learn from, so that their errors on "
-                "held-out episodes tell too little"
-            )
-            on_event(Warned("train", text))
-        seen.append((task, place, own))
-
-
-def _demos(
-    recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
-) -> Demonstrations:
-    """The demonstrations of one task, whose instructions the backbone can read.
-
-    Raises:
-        AegisError: they cannot be read, are those of another task, or hold an unknown word.
-    """
-    task = recipe.tasks[number]
-    path, selection = _source(recipe, number, out, on_event)
-    found = demonstrations.load(
-        path,
-        recipe.train.validation_share,
-        recipe.seed,
-        selection,
-        image_size=backbone.image_size,
-        on_event=on_event,
-        cache=recipe.demos.cache,
-        check_text=backbone.check_prompt,
-    )
-    if found.task is None:
-        found = loading.of_named_task(found, task, recipe.demos.rename or {})
-    _check_task(found.task, task, path)
-    if sim.of_datasets(task) is not None:
-        task_episodes.check_own(found.texts, task, f"'{path}'")
-    # An unknown word must end no training half-way.
-    backbone.check_prompts(found.images(found.read[:1]), found.texts)
-    if not recipe.simulated:
-        loading.warn_of_outliers(path, found, recipe.train, on_event)
-    return found
-
-
-def _check_task(recorded: str | None, task: str, path: Path) -> None:
-    """Raise AegisError unless what was recorded is a task of the stream, or no simulated one.
-
-    Args:
-        recorded: the simulated task that the demonstrations are of; None of any other.
-        task: the recipe's.
-    """
-    if recorded == (task if TASK.accepts(task) else None):
-        return
-    of = "no simulated task" if recorded is None else f"'{recorded}'"
-    fix = f"record with: aegis demos {task}"
-    if not TASK.accepts(task):
-        fix = f"call the task '{recorded}' in tasks, or correct demos.paths"
-    elif sim.of_datasets(task) is not None:
-        fix = "correct tasks, or demos.paths"
-    elif recorded is None:
-        fix += "; or give the task, if it is another robot's, a name of your own in tasks"
-    raise AegisError(
-        f"demonstrations of {of} in '{path}' for the task '{task}'", "one and the same task", fix
-    )
-
-
-def _source(
-    recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent
-) -> tuple[Path, Selection]:
-    """Where a task's demonstrations lie, and what it learns of them.
-
-    They are recorded if the recipe names none.
-    """
-    if recipe.demos.paths is not None:
-        return given(recipe, number)
-    records = _records(out, on_event)
-    make_folder(records.folder)
-    made = record(recipe, number, records)
-    return made.path, recipe.demos.selection(only=None)
-
-
-def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
-    """The demonstrations that a recipe names for a task, and what it learns of them.
-
-    Raises:
-        AegisError: nothing is there, or it cannot be told which episodes are the task's.
-    """
-    demos = recipe.demos
-    path = demonstrations.at(demos.of_task(number))
-    if demos.only is not None:
-        return path, demos.selection(demos.only[number])
-    if _is_shared(recipe, number) and not recipe.simulated:
-        raise AegisError(
-            f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
-            "would learn",
-            "demonstrations of its own for each task, or which of these episodes are whose",
-            "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
-        )
-    only = demonstrations.part_of(path, recipe.tasks[number], _is_shared(recipe, number))
-    return path, demos.selection(only)
-
-
-def _is_shared(recipe: RobotStreamRecipe, number: int) -> bool:
-    """Whether other tasks learn from the same demonstrations as the task of that number."""
-    of_each = [recipe.demos.of_task(i) for i in range(len(recipe.tasks))]
-    return of_each.count(of_each[number]) > 1
-
-
-def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, Any]:
-    """What the task of that number would have learned of demonstrations, as `recipes.selected`.
-
-    Args:
-        path: where they lie by now; also others than it learned from.
-    """
-    chosen, demos = recipes.selected(recipe), recipe.demos
-    only = None
-    if demos.only is not None:
-        only = demos.only[number]
-    elif demos.paths is not None:
-        try:
-            shared = _is_shared(recipe, number)
-            only = demonstrations.part_of(path, recipe.tasks[number], shared)
-        except AegisError:  # others, whose episodes cannot be told apart: then all are meant
-            only = None
-    return chosen if only is None else {**chosen, "only": only}
-
-
-def place_of(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
-    """Where the demonstrations that the task of that number learned from lie, or lay."""
-    if recipe.demos.paths is not None:
-        return Path(recipe.demos.of_task(number))
-    return _records(run, ignore).recorded(recipe.tasks[number], _to_record(recipe))
-
-
-def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
-    """The demonstrations of one task, recorded as the recipe says unless they are there."""
-    return records.demonstrations(recipe.tasks[number], _to_record(recipe))
-
-
-def _records(run: Path, on_event: OnEvent) -> StageRecords:
-    """What is recorded for a run, beside it."""
-    return StageRecords(run.parent / "demos", on_event)
-
-
-def _to_record(recipe: RobotStreamRecipe) -> Demos:
-    settings = recipe.demos
-    return Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
-
-
 def share(
     backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
 ) -> tuple[Policy, ...]:
@@ -956,136 +755,3 @@ def _seed(seed: int, index: int, purpose: int) -> int:
     # Purposes are below 4, so those of one step share no generator; nor do two seeds, in streams of
     # up to a million steps.
     return (seed * 1_000_003 + index) * 4 + purpose
-
-
-# --- what is measured -----------------------------------------------------------------------------
-
-
-class RobotEvaluator(ABC):
-    """How tasks are done with the task told, and questions with no task active.
-
-    The questions are the same every time, and so is what a task is tried on.
-
-    Attributes:
-        on_event: hears of its progress.
-    """
-
-    def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
-        self._run, self.on_event = run, on_event
-        count, check = run.recipe.probe.questions, run.model.backbone.check_text
-        # settings are chosen by other questions than those that figures are of
-        part = "validation" if run.recipe.rollout.split == "validation" else "probe"
-        seed = run.recipe.probe.seed
-        self._asked = source.choose(part, count, seed, [check], on_event)
-
-    @property
-    def hold_errors(self) -> Sequence[float | None]:
-        """Of each task the error of holding the position; none where a success is measured."""
-        return ()
-
-    def intervals(self, done: int) -> list[list[float] | None]:
-        """Of each error of the tasks 0 to `done` its interval, as it was measured last.
-
-        A success has none.
-        """
-        return []
-
-    def row(self, done: int) -> list[float]:
-        """What was measured after tasks 0 to t = `done`, of these alone."""
-        return [self.tried(i) for i in range(done + 1)]
-
-    @abstractmethod
-    def tried(self, task: int) -> float:
-        """How the task of that number is done now."""
-
-    def tried_s(self, task: int) -> float:
-        """About how many seconds `tried` takes, by its first parts."""
-        return expected_s(self._heard_by(partial(self.tried, task)))
-
-    def vqa_s(self) -> float:
-        """About how many seconds `vqa` takes."""
-        return expected_s(self._heard_by(self.vqa))
-
-    def _heard_by(self, work: Callable[[], object]) -> Callable[[OnEvent], None]:
-        """Some of its work, of whose progress somebody else hears."""
-
-        def heard(on_event: OnEvent) -> None:
-            before, self.on_event = self.on_event, on_event
-            try:
-                work()
-            finally:
-                self.on_event = before
-
-        return heard
-
-    def vqa(self) -> list[float]:
-        """Accuracy and cross-entropy of the backbone with no task active."""
-        self._run.activate(None)
-        model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
-        found = score(ask(model, self._asked, batch_size, self.on_event))
-        return [found.accuracy, found.cross_entropy]
-
-    def _named(self, task: str) -> OnEvent:
-        """Events of a rollout, with the task's name."""
-
-        def passed_on(event: Event) -> None:
-            self.on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
-
-        return passed_on
-
-
-class ClosedLoopEvaluator(RobotEvaluator):
-    """Lets policies act in simulated tasks."""
-
-    def tried_s(self, task: int) -> float:
-        """About how many seconds `tried` takes if no episode ends early."""
-        acting, settings = self._run.acting(task), self._run.recipe.rollout
-        return longest_s(acting, settings.episodes, settings.colors, self._split, settings.seed)
-
-    @property
-    def _split(self) -> int:
-        named = {"evaluation": EVALUATION, "validation": VALIDATION}
-        return named[self._run.recipe.rollout.split]
-
-    def tried(self, task: int) -> float:
-        """Share of successes of the task of that number, or of the highest return."""
-        acting, settings = self._run.acting(task), self._run.recipe.rollout
-        found = play(
-            acting,
-            settings.episodes,
-            settings.colors,
-            self._split,
-            on_event=self._named(acting.task),
-            seed=settings.seed,
-        )
-        # A task of dm_control's suite has no success, but a return.
-        share = found.return_share if found.success is None else found.success
-        assert share is not None
-        return share
-
-
-class HeldOutEvaluator(RobotEvaluator):
-    """Lets policies predict at held-out frames of tasks that no simulator has."""
-
-    def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
-        super().__init__(run, source, on_event)
-        most, train = run.recipe.rollout.frames, run.recipe.train
-        self._frames = [
-            HeldOut(task, shown, most, train.batch_size, train.chunk)
-            for task, shown in zip(run.names, run.demos, strict=True)
-        ]
-        self._intervals: dict[int, list[float] | None] = {}
-
-    @property
-    def hold_errors(self) -> Sequence[float | None]:
-        return [frames.hold_error for frames in self._frames]
-
-    def tried(self, task: int) -> float:
-        """The error of the actions that are predicted in the task of that number."""
-        self._run.activate(task)
-        policy, on_event = self._run.policies[task].eval(), self._named(self._run.names[task])
-        error, self._intervals[task] = self._frames[task].error(policy, on_event)
-        return error
-
-    def intervals(self, done: int) -> list[list[float] | None]:
-        return [self._intervals[task] for task in range(done + 1)]

@@ -148,7 +148,7 @@ class Policy(nn.Module):
     def fingerprint(self) -> str:
         """sha256 of all weights, and of what else decides how it acts."""
         settings = {
-            "acts_in": str(self.acts_in),
+            "acts_in": self.acts_in,
             "expert": repr(self.expert.shape),
             "relative_to": repr(self.origins.places),
             **self.backbone.settings(),

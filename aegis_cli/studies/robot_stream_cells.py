@@ -10,7 +10,7 @@ from typing import Any
 from aegis_cli import recipes, sim
 from aegis_cli.common import gl, version
 from aegis_cli.common.events import OnEvent
-from aegis_cli.continual import robots
+from aegis_cli.continual import robot_demos, robots
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.data import demonstrations
 from aegis_cli.data.selection import Selection
@@ -138,7 +138,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
             self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
         given = list[str]()
         if recipe.demos.paths is not None:
-            sources = (robots.given(recipe, i) for i in range(len(recipe.tasks)))
+            sources = (robot_demos.given(recipe, i) for i in range(len(recipe.tasks)))
             given = [self._digest(*source) for source in sources]
         state = self.questions(recipe.probe).state
         return cell_key(cell, self._fingerprints[recipe.backbone], given, state)
@@ -159,7 +159,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         """Where the tasks' demonstrations lie; they are recorded unless they are given."""
         if recipe.demos.paths is not None:
             return recipe.demos.paths
-        made = [robots.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
+        made = [robot_demos.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
         return tuple(str(one.path) for one in made)
 
     def _digest(self, path: Path, chosen: Selection) -> str:

@@ -22,7 +22,7 @@ from samples.training_runs import contents
 from aegis_cli import recipes, sim
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
-from aegis_cli.continual import robots, train
+from aegis_cli.continual import robot_demos, robots, train
 from aegis_cli.data import demonstrations
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot.on_demand import FramesOnDemand
@@ -79,7 +79,7 @@ def stream(tasks: Sequence[str], paths: Path | Sequence[Path], **demos: Any) -> 
 
 def learned(recipe: RobotStreamRecipe, number: int) -> Demonstrations:
     """The demonstrations of a task, as its training has them."""
-    return robots._demos(recipe, number, ANY, Path("unused"), ignore)
+    return robot_demos.load(recipe, number, ANY, Path("unused"), ignore)
 
 
 def taken(recipe: RobotStreamRecipe, number: int) -> list[int]:
@@ -139,7 +139,7 @@ def test_a_dataset_of_one_task_is_learned_as_it_was_before(
     """Also where the instructions are none of LIBERO's: they may be said in other words."""
     folder = libero(tmp_path / "d", texts)
     recipe = stream([task], [folder])
-    assert robots.given(recipe, 0) == (folder, Selection())
+    assert robot_demos.given(recipe, 0) == (folder, Selection())
     before, now = demonstrations.load(folder, 0.05, 0), learned(recipe, 0)
     assert now.sha256 == before.sha256 and now.train.equal(before.train)
 
@@ -216,9 +216,9 @@ def test_words_are_read_before_frames_which_may_stay_in_their_videos(
 
     backbone = cast(Backbone, SimpleNamespace(image_size=None, check_prompt=knows_objects))
     with pytest.raises(AegisError, match="'open|'put|'push|'turn"):
-        robots._demos(recipe, 0, backbone, Path("unused"), ignore)
+        robot_demos.load(recipe, 0, backbone, Path("unused"), ignore)
     with pytest.raises(pytest.fail.Exception):
-        robots._demos(recipe, 1, backbone, Path("unused"), ignore)
+        robot_demos.load(recipe, 1, backbone, Path("unused"), ignore)
 
 
 # --- chosen episodes ------------------------------------------------------------------------------
@@ -334,7 +334,7 @@ def test_a_cell_is_told_by_the_files_that_its_tasks_read(tmp_path: Path) -> None
     folder = as_version_2(libero(tmp_path / "d", texts), "v2.1")
     runner = RobotStreamRunner(tmp_path / "study", ignore)
     tasks = ("libero/goal", "libero/object")
-    of_each = [runner._digest(*robots.given(stream(tasks, folder), i)) for i in (0, 1)]
+    of_each = [runner._digest(*robot_demos.given(stream(tasks, folder), i)) for i in (0, 1)]
     assert of_each == [learned(stream(tasks, folder), i).sha256 for i in (0, 1)]
     assert of_each[0] != of_each[1]
 

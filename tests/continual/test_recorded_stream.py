@@ -22,7 +22,7 @@ from samples.training_runs import contents
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import Warned
-from aegis_cli.continual import files, probe, robots, state, train
+from aegis_cli.continual import files, probe, robot_demos, robots, state, train
 from aegis_cli.continual.held_out import HeldOut
 from aegis_cli.data import demonstrations, spread
 from aegis_cli.data.lerobot.write import NewEpisode
@@ -43,7 +43,7 @@ def test_errors_are_those_of_an_evaluation_of_held_out_frames(
     report, out = done(method)
     run = robots.load_to_act(out)
     for number, task in enumerate(TASKS):
-        shown = robots._demos(real(method), number, run.model.backbone, out, lambda event: None)
+        shown = robot_demos.load(real(method), number, run.model.backbone, out, lambda event: None)
         # Those that no step has learned from, evenly spread.
         assert len(shown.validation) > FRAMES
         at = shown.validation[spread.rows(len(shown.validation), FRAMES)]
@@ -72,7 +72,7 @@ def test_a_joint_whose_scale_a_glitch_makes_is_warned_of(
     folder = save(tmp_path / "robot", made, state_names=names, action_names=names)
     recipe = real(demos=RobotDemos(paths=(str(folder), str(folder)), only=("0-2", "0-2")))
     told: list[Any] = []
-    robots._demos(recipe, 0, backbone, out, told.append)
+    robot_demos.load(recipe, 0, backbone, out, told.append)
     warned = [event.text for event in told if isinstance(event, Warned)]
     assert any("make most of the spread" in text and "in episode 1;" in text for text in warned)
 

@@ -26,7 +26,8 @@ from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.files import sha256_value
 from aegis_cli.continual import files, loop, probe, robots, state, train
 from aegis_cli.continual.report import RobotStreamReport
-from aegis_cli.continual.robots import ClosedLoopEvaluator, RobotStreamRun
+from aegis_cli.continual.robot_evaluators import ClosedLoopEvaluator
+from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.core.accuracy_matrix import seen_scores
 from aegis_cli.data import demonstrations
 from aegis_cli.data import record as demos

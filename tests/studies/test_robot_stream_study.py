@@ -291,7 +291,7 @@ def test_a_stream_asks_and_plays_by_the_seeds_of_its_recipe(
         played.append(seed)
         return type("Played", (), {"success": 0.0, "return_share": None})
 
-    monkeypatch.setattr("aegis_cli.continual.robots.play", play)
+    monkeypatch.setattr("aegis_cli.continual.robot_evaluators.play", play)
     plain = make("sequential")
     changed = dataclasses.replace(getattr(plain, section), seed=7)
     runs = [

@@ -15,7 +15,7 @@ from samples.training_runs import Start
 from aegis_cli import recipes
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
-from aegis_cli.continual import robots
+from aegis_cli.continual import robot_demos
 from aegis_cli.data import demonstrations
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import backbones
@@ -125,7 +125,7 @@ def test_a_stream_learns_suite_after_suite(tiny_folder: Path, tmp_path: Path) ->
 
     def loaded(number: int, **changes: Any) -> demonstrations.Demonstrations:
         changed = dataclasses.replace(recipe, **changes)
-        return robots._demos(changed, number, backbone, tmp_path / "run", ignore)
+        return robot_demos.load(changed, number, backbone, tmp_path / "run", ignore)
 
     for number, task in enumerate(recipe.tasks):
         found = loaded(number)

@@ -1,0 +1,220 @@
+"""The demonstrations of a stream of robot tasks: which each task learns, and where they lie.
+
+The recipe names them, or they are recorded beside the run.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aegis_cli import recipes, sim
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.files import make_folder
+from aegis_cli.common.palette import COLORS
+from aegis_cli.data import demonstrations, mixture, renaming, task_episodes
+from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.selection import Selection
+from aegis_cli.models.backbones.base import Backbone
+from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe
+from aegis_cli.training import loading
+from aegis_cli.training.up_to_date import Made, StageRecords
+
+
+def check_words(backbone: Backbone, task: str) -> None:
+    """Raise AegisError unless the backbone knows the words of a simulated task's instructions."""
+    size = backbone.image_size or 64
+    picture = torch.zeros(1, size, size, 3, dtype=torch.uint8)
+    for template in sim.make(task).spec.templates:
+        backbone.prepare(picture, [template.format(color=COLORS[0])])
+
+
+def check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
+    """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
+
+    To decode the first task's frames can take hours.
+    """
+    if recipe.demos.paths is None:
+        return
+    sets = [demonstrations.at(name) for name in recipe.demos.named]
+    mixture.check_rename(sets, renaming.of(recipe.demos.rename))
+    for number in range(len(recipe.tasks)):
+        path, selection = given(recipe, number)
+        if selection.only is not None:
+            count = demonstrations.count_episodes(path)
+            demonstrations.learned_from(path, count, selection.only)
+        if not recipe.simulated:
+            robot = mixture.robot_of(path, selection)  # with its cameras and features
+            _check_task(robot.task, recipe.tasks[number], path)
+    if not recipe.simulated:
+        _check_own_episodes(recipe, on_event)
+
+
+def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
+    """Refuse tasks that learn from the same episodes, and warn of those that share some.
+
+    Raises:
+        AegisError: two tasks have all of their episodes in common.
+    """
+    seen: list[tuple[str, Path, set[int]]] = []
+    for number, task in enumerate(recipe.tasks):
+        path, selection = given(recipe, number)
+        count = demonstrations.count_episodes(path)
+        own = set(demonstrations.learned_from(path, count, selection.only).tolist())
+        place = demonstrations.locate(path).resolve()  # a folder may be named in two ways
+        for other, elsewhere, theirs in seen:
+            if elsewhere != place or not own & theirs:
+                continue
+            if own == theirs:
+                raise AegisError(
+                    f"the same {len(own)} episodes of '{path}' for '{other}' and '{task}'",
+                    "episodes of its own for each task",
+                    "correct demos.only, or demos.paths",
+                )
+            shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
+            text = (
+                f"{shared}: what one holds out the other may learn from, so that their errors on "
+                "held-out episodes tell too little"
+            )
+            on_event(Warned("train", text))
+        seen.append((task, place, own))
+
+
+def load(
+    recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
+) -> Demonstrations:
+    """The demonstrations of one task, whose instructions the backbone can read.
+
+    Raises:
+        AegisError: they cannot be read, are those of another task, or hold an unknown word.
+    """
+    task = recipe.tasks[number]
+    path, selection = _source(recipe, number, out, on_event)
+    found = demonstrations.load(
+        path,
+        recipe.train.validation_share,
+        recipe.seed,
+        selection,
+        image_size=backbone.image_size,
+        on_event=on_event,
+        cache=recipe.demos.cache,
+        check_text=backbone.check_prompt,
+    )
+    if found.task is None:
+        found = loading.of_named_task(found, task, recipe.demos.rename or {})
+    _check_task(found.task, task, path)
+    if sim.of_datasets(task) is not None:
+        task_episodes.check_own(found.texts, task, f"'{path}'")
+    # An unknown word must end no training half-way.
+    backbone.check_prompts(found.images(found.read[:1]), found.texts)
+    if not recipe.simulated:
+        loading.warn_of_outliers(path, found, recipe.train, on_event)
+    return found
+
+
+def _check_task(recorded: str | None, task: str, path: Path) -> None:
+    """Raise AegisError unless what was recorded is a task of the stream, or no simulated one.
+
+    Args:
+        recorded: the simulated task that the demonstrations are of; None of any other.
+        task: the recipe's.
+    """
+    if recorded == (task if TASK.accepts(task) else None):
+        return
+    of = "no simulated task" if recorded is None else f"'{recorded}'"
+    fix = f"record with: aegis demos {task}"
+    if not TASK.accepts(task):
+        fix = f"call the task '{recorded}' in tasks, or correct demos.paths"
+    elif sim.of_datasets(task) is not None:
+        fix = "correct tasks, or demos.paths"
+    elif recorded is None:
+        fix += "; or give the task, if it is another robot's, a name of your own in tasks"
+    raise AegisError(
+        f"demonstrations of {of} in '{path}' for the task '{task}'", "one and the same task", fix
+    )
+
+
+def _source(
+    recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent
+) -> tuple[Path, Selection]:
+    """Where a task's demonstrations lie, and what it learns of them.
+
+    They are recorded if the recipe names none.
+    """
+    if recipe.demos.paths is not None:
+        return given(recipe, number)
+    records = _records(out, on_event)
+    make_folder(records.folder)
+    made = record(recipe, number, records)
+    return made.path, recipe.demos.selection(only=None)
+
+
+def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
+    """The demonstrations that a recipe names for a task, and what it learns of them.
+
+    Raises:
+        AegisError: nothing is there, or it cannot be told which episodes are the task's.
+    """
+    demos = recipe.demos
+    path = demonstrations.at(demos.of_task(number))
+    if demos.only is not None:
+        return path, demos.selection(demos.only[number])
+    if _is_shared(recipe, number) and not recipe.simulated:
+        raise AegisError(
+            f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
+            "would learn",
+            "demonstrations of its own for each task, or which of these episodes are whose",
+            "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
+        )
+    only = demonstrations.part_of(path, recipe.tasks[number], _is_shared(recipe, number))
+    return path, demos.selection(only)
+
+
+def _is_shared(recipe: RobotStreamRecipe, number: int) -> bool:
+    """Whether other tasks learn from the same demonstrations as the task of that number."""
+    of_each = [recipe.demos.of_task(i) for i in range(len(recipe.tasks))]
+    return of_each.count(of_each[number]) > 1
+
+
+def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, Any]:
+    """What the task of that number would have learned of demonstrations, as `recipes.selected`.
+
+    Args:
+        path: where they lie by now; also others than it learned from.
+    """
+    chosen, demos = recipes.selected(recipe), recipe.demos
+    only = None
+    if demos.only is not None:
+        only = demos.only[number]
+    elif demos.paths is not None:
+        try:
+            shared = _is_shared(recipe, number)
+            only = demonstrations.part_of(path, recipe.tasks[number], shared)
+        except AegisError:  # others, whose episodes cannot be told apart: then all are meant
+            only = None
+    return chosen if only is None else {**chosen, "only": only}
+
+
+def place_of(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
+    """Where the demonstrations that the task of that number learned from lie, or lay."""
+    if recipe.demos.paths is not None:
+        return Path(recipe.demos.of_task(number))
+    return _records(run, ignore).recorded(recipe.tasks[number], _to_record(recipe))
+
+
+def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
+    """The demonstrations of one task, recorded as the recipe says unless they are there."""
+    return records.demonstrations(recipe.tasks[number], _to_record(recipe))
+
+
+def _records(run: Path, on_event: OnEvent) -> StageRecords:
+    """What is recorded for a run, beside it."""
+    return StageRecords(run.parent / "demos", on_event)
+
+
+def _to_record(recipe: RobotStreamRecipe) -> Demos:
+    settings = recipe.demos
+    return Demos(episodes=settings.episodes, noise=settings.noise, seed=settings.seed)
