@@ -165,7 +165,7 @@ def test_what_cannot_be_told_apart_is_refused_before_anything_is_decoded(
 ) -> None:
     for name in ("check", "check_recordable"):
         monkeypatch.setattr(robots.sim, name, lambda task: None)  # which would want LIBERO
-    monkeypatch.setattr(robots, "_demos", lambda *_: pytest.fail("a set was read"))
+    monkeypatch.setattr(robot_demos, "load", lambda *_: pytest.fail("a set was read"))
     demos = RobotDemos(paths=str(libero(tmp_path / "d", texts)))
     recipe = dataclasses.replace(make(), tasks=tasks, demos=demos)
     with pytest.raises(AegisError, match=says) as caught:
@@ -297,7 +297,7 @@ def test_a_run_acts_by_a_camera_that_was_renamed_away(
         return dataclasses.replace(found, cameras=("observation.images.camera1",))
 
     monkeypatch.setattr(demonstrations, "load", seen_by)
-    monkeypatch.setattr(robots.mixture, "check_rename", lambda *_: None)
+    monkeypatch.setattr(robot_demos.mixture, "check_rename", lambda *_: None)
     recipe = make("sequential", steps=1)
     demos = dataclasses.replace(recipe.demos, rename={"side": "camera1"})
     train.run(dataclasses.replace(recipe, demos=demos), tmp_path / "run")

@@ -24,7 +24,16 @@ from aegis_cli import inspection, recipes, sim
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.files import sha256_value
-from aegis_cli.continual import files, loop, probe, robots, state, train
+from aegis_cli.continual import (
+    files,
+    loop,
+    probe,
+    robot_demos,
+    robot_evaluators,
+    robots,
+    state,
+    train,
+)
 from aegis_cli.continual.report import RobotStreamReport
 from aegis_cli.continual.robot_evaluators import ClosedLoopEvaluator
 from aegis_cli.continual.robots import RobotStreamRun
@@ -249,7 +258,9 @@ def test_to_freeze_what_would_not_learn_or_everything_is_refused_before_anything
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(robots, "_demos", lambda *_: pytest.fail("demonstrations were looked for"))
+    monkeypatch.setattr(
+        robot_demos, "load", lambda *_: pytest.fail("demonstrations were looked for")
+    )
     with pytest.raises(AegisError) as caught:
         train.build(make(method, freeze=freeze), tmp_path / "run")
     assert caught.value.found.startswith("train.freeze: ") and says in caught.value.found
@@ -397,7 +408,7 @@ def test_success_is_what_closed_loops_say(
             task=task, success=len(played) / 10, episodes=episodes, episodes_per_s=1.0
         )
 
-    monkeypatch.setattr(robots, "play", play)
+    monkeypatch.setattr(robot_evaluators, "play", play)
     settings = RobotRollout(episodes=3, colors="held-out", replan=2, split="validation")
     report = train.run(make("isolated-lora", steps=1, rollout=settings), tmp_path / "run")
     assert played == [

@@ -22,6 +22,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import ignore
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.attention import KeyValue
+from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.methods import METHODS
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Batch, Encoding
@@ -310,7 +311,9 @@ def test_a_validation_passes_no_more_frames_at_once_than_a_step(
     assert max(seen) <= -(-job.recipe.train.batch_size // 3)
 
 
-@pytest.mark.parametrize(("number", "wanted"), [(0, ["load", "wait"]), (1, ["wait", "load"])])
+@pytest.mark.parametrize(
+    ("number", "wanted"), [(0, ["decide and load", "wait"]), (1, ["wait", "load"])]
+)
 def test_one_process_of_a_machine_decodes_and_the_others_find_the_frames(
     number: int,
     wanted: list[str],
@@ -318,13 +321,17 @@ def test_one_process_of_a_machine_decodes_and_the_others_find_the_frames(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Which also decides whether the disk has room for them: two might find otherwise."""
     order: list[str] = []
     load = loading.load_demonstrations
+
+    def noted(*given: Any, decides: bool = True) -> Demonstrations:
+        order.append("decide and load" if decides else "load")
+        return load(*given, decides=decides)
+
     monkeypatch.setenv("LOCAL_RANK", str(number))
     monkeypatch.setattr(Ranks, "wait", lambda _: order.append("wait"))
-    monkeypatch.setattr(
-        loading, "load_demonstrations", lambda *given: order.append("load") or load(*given)
-    )
+    monkeypatch.setattr(loading, "load_demonstrations", noted)
     job = make("naive", tmp_path / "run")
     method = METHODS["naive"]
     assemble.build(job.recipe, method, job.demos, job.anchor, job.out, ignore)
