@@ -275,6 +275,7 @@ def test_a_compiled_policy_trains_alike(
     another size would be compiled anew.
     """
     monkeypatch.setattr(train, "VALIDATION_FRAMES", SETTINGS.batch_size)
+    torch._dynamo.reset()  # beside an earlier test's graphs these would be of any size, and slower
     called: list[str] = []
 
     def quickly(real: Callable[..., None], part: Any) -> None:
