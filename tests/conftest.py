@@ -39,6 +39,20 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 TESTS = Path(__file__).parent
+# They take the longest, half a minute and more each, and come first: of those that came last, a
+# process would still have one when the others have nothing left to do.
+LONG = (
+    "training/test_parallel.py",
+    "training/test_validation_rollout.py",
+    "training/test_train_resume.py",
+    "campaign/test_campaign.py",
+    "training/test_train.py",
+    "models/test_hf_training.py",
+    "training/test_validation_vqa.py",
+    "continual/test_robot_stream.py",
+    "studies/test_pipeline.py",
+    "sim/test_metaworld.py",
+)
 # How many modules were there when garbage was last collected, and how many more are worth another.
 MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 
@@ -75,11 +89,12 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the fast tests, by the rule of `samples.fast`."""
+    """Mark the fast tests, by the rule of `samples.fast`; put the long files first."""
     for item in items:
         path = item.path.relative_to(TESTS).as_posix()
         if fast.test_is_fast(path, getattr(item, "originalname", item.name)):
             item.add_marker("fast")
+    items.sort(key=lambda item: item.path.relative_to(TESTS).as_posix() not in LONG)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -462,7 +462,7 @@ def test_a_reader_that_has_gone_is_no_error(aegis, stage):
 @pytest.mark.parametrize("closed", ["1>&-", "2>&-", "1>&- 2>&-", "| true", "2>&1 | true"])
 def test_closed_streams_change_no_exit_code(closed: str, tmp_path: Path):
     """A refused command exits with 2, whoever reads it: 1 would be a failed gate."""
-    command = f"'{sys.executable}' -m aegis_cli inspect nothing.safetensors {closed}"
+    command = f"'{sys.executable}' -m aegis_cli recipes show nothing {closed}"
     shell = ["bash", "-o", "pipefail", "-c", command]
     done = subprocess.run(shell, cwd=tmp_path, env=finding(ROOT))
     assert done.returncode == 2

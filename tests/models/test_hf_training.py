@@ -220,6 +220,8 @@ def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded)
 def test_a_run_with_compiled_layers_trains_alike(
     hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Validation is of one batch, as large as the others: another size would be compiled anew."""
+    monkeypatch.setattr(train, "VALIDATION_FRAMES", 4)
     for owner, name in ((HFBackbone, "compile_passes"), (ActionExpert, "compile_layers")):
         quick = functools.partialmethod(getattr(owner, name), "aot_eager")
         monkeypatch.setattr(owner, name, quick)

@@ -70,23 +70,24 @@ def test_it_predicts_what_the_stream_does_at_the_task(
     assert list(map(layout.short, found.cameras)) == list(map(layout.short, own.cameras))
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("method", ["isolated-lora", "sequential"])
 def test_a_hugging_face_model_goes_out_in_the_type_in_which_it_came(
-    method: str, form: str, real: Make, hf_folder: Callable[[str], Path], tmp_path: Path
+    method: str, real: Make, hf_folder: Callable[[str], Path], tmp_path: Path
 ) -> None:
     narrow, vlm = tmp_path / "vlm", backbones.load(str(hf_folder("paligemma")))
     vlm.round_weights(torch.bfloat16)
     vlm.save(narrow)
-    run, out = tmp_path / "run", tmp_path / "policy"
+    run = tmp_path / "run"
     train.run(real(method, steps=2, backbone=str(narrow)), run)
-    assert export.run(run, out, form, task="pick").dtype == "bfloat16"
-    export.run(run, tmp_path / "wide", form, dtype="float32", task="pick")
     wanted = chunk(load_policy(run, "pick"), "pick")
-    np.testing.assert_allclose(
-        chunk(load_policy(tmp_path / "wide"), "pick"), wanted, rtol=1e-3, atol=1e-4
-    )
-    assert np.abs(chunk(load_policy(out), "pick") - wanted).max() < 0.1 * np.abs(wanted).max()
+    for form in FORMS:
+        out, wide = (tmp_path / form / name for name in ("policy", "wide"))
+        assert export.run(run, out, form, task="pick").dtype == "bfloat16"
+        export.run(run, wide, form, dtype="float32", task="pick")
+        found = chunk(load_policy(wide), "pick")
+        np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4, err_msg=form)
+        found = chunk(load_policy(out), "pick")
+        assert np.abs(found - wanted).max() < 0.1 * np.abs(wanted).max(), form
 
 
 def test_what_of_igsp_has_one_expert_a_map_is_written(real: Make, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,21 +66,28 @@ def start(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Start:
     return run
 
 
-@pytest.fixture(scope="session", params=sorted(METHODS))
-def finished(
-    request: pytest.FixtureRequest, start: Start, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[str, Path]:
+@pytest.fixture(scope="session")
+def whole_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A run of a method from first step to last, made once; read only."""
+
+    @cache
+    def run(method: str) -> Path:
+        out = tmp_path_factory.mktemp("run") / method
+        start(method, out)
+        return out
+
+    return run
+
+
+@pytest.fixture(params=sorted(METHODS))
+def finished(request: pytest.FixtureRequest, whole_run: Callable[[str], Path]) -> tuple[str, Path]:
     """A method and a run of it from first step to last."""
-    out = tmp_path_factory.mktemp("run") / request.param
-    start(request.param, out)
-    return request.param, out
+    return request.param, whole_run(request.param)
 
 
 @pytest.fixture(scope="session")
-def naive_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("run") / "naive"
-    start("naive", out)
-    return out
+def naive_run(whole_run: Callable[[str], Path]) -> Path:
+    return whole_run("naive")
 
 
 def contents(out: Path) -> dict[str, bytes | str]:

@@ -20,6 +20,7 @@ from aegis_cli.sim.contract import EVALUATION, episode_rng
 from aegis_cli.sim.simulators import Wanted, opened
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_an_environment_is_the_same_in_another_process() -> None:
     def shown(env: Any) -> list[Any]:
         seen = env.reset(episode_rng(3, EVALUATION, 1), SEEN)
@@ -75,6 +76,7 @@ def test_a_task_that_cannot_be_made_starts_no_process(monkeypatch: pytest.Monkey
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_an_error_there_is_an_error_here() -> None:
     with opened(2, 3) as simulators:
         env = simulators.make(Wanted("point", 0))
@@ -88,6 +90,7 @@ def test_an_error_there_is_an_error_here() -> None:
                 simulators.each(act, range(number + 1))
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_process_that_dies_is_named() -> None:
     with (
         pytest.raises(AegisError, match="a simulating process died"),

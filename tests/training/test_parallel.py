@@ -33,6 +33,7 @@ from aegis_cli.training.train import LEDGER
 
 Make = Callable[..., Job]
 BATCH, STEPS, SAVED = 8, 4, 2  # three processes have 2, 3 and 3 frames of a batch
+SHORT = {"steps": SAVED}  # where it is enough that steps follow one another to one checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +81,14 @@ def watched(job: Job) -> Job:
     """The same training, which is asked, acts and predicts with every validation loss.
 
     Three processes ask 2, 2 and 3 of the questions, where each has whole weights. The first one
-    alone acts and predicts.
+    alone acts and predicts. Whole chunks are executed, so that an episode takes few predictions.
     """
     recipe = job.recipe
     watching = replace(
         recipe,
         train=replace(recipe.train, validate_actions=6),
         probe=replace(recipe.probe, while_training=7),
-        rollout=replace(recipe.rollout, while_training=2),
+        rollout=replace(recipe.rollout, while_training=1, replan=recipe.train.chunk),
     )
     return replace(job, recipe=watching)
 
@@ -125,7 +126,7 @@ def shared_runs(
     average = make("nullspace", out / "average", parallel="fsdp", ema_decay=0.6)
     two["fsdp", "nullspace", "average"] = watched(average)
     for way, name in FROZEN:
-        held = {"parallel": way, "freeze": ("stem", "layers.0")}
+        held = {"parallel": way, "freeze": ("stem", "layers.0"), **SHORT}
         two[way, name, "frozen"] = make(name, out / way / f"{name}-frozen", **held)
     tower = replace(hugging_face.recipe.train, freeze="vision")
     two["fsdp", "hf", "frozen"] = replace(
@@ -133,14 +134,14 @@ def shared_runs(
     )
     for way, name in OF_TWO_IN_BF16:
         two[way, name, "bf16"] = make(
-            name, out / way / f"{name}-bf16", parallel=way, precision="bf16"
+            name, out / way / f"{name}-bf16", parallel=way, precision="bf16", **SHORT
         )
     changed = replace(hugging_face.recipe.train, precision="bf16")
     two["fsdp", "hf", "bf16"] = replace(
         hugging_face, recipe=replace(hugging_face.recipe, train=changed), out=out / "hf-bf16"
     )
     for way in ("ddp", "fsdp"):
-        job = make("naive", out / f"averaging-{way}", parallel=way)
+        job = make("naive", out / f"averaging-{way}", parallel=way, **SHORT)
         two[way, "averaging"] = Averaging(**vars(replace(job, anchor=None)))
     # The others notice it, and may be the first that are noticed.
     gone = (multiprocessing.ProcessExitedException, multiprocessing.ProcessRaisedException)

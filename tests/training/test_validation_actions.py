@@ -161,16 +161,20 @@ def test_nothing_is_compiled_for_predictions(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    graphs = compiled_graphs(monkeypatch)
-    settings = replace(PREDICTING, steps=2, validate_every=2, compile=True)
+    """Nor for a step or a validation after them: all that is compiled is there before the first."""
+    graphs, before = compiled_graphs(monkeypatch), []
+    figures = validation_actions.ValidationActions.figures
+
+    def noted(*given: Any) -> dict[str, float]:
+        before.append(len(graphs))
+        return figures(*given)
+
+    monkeypatch.setattr(validation_actions.ValidationActions, "figures", noted)
+    settings = replace(PREDICTING, steps=2, validate_every=1, compile=True)
     compiling = replace(predicting, train=settings)
     torch._dynamo.reset()  # an earlier test's graphs would serve as well
-    start("naive", tmp_path / "plain", recipe=without(compiling))
-    before = len(graphs)
-    graphs.clear()
-    torch._dynamo.reset()
     start("naive", tmp_path / "run", recipe=compiling)
-    assert len(graphs) == before > 0
+    assert before == [len(graphs)] * 2 and graphs
     found = open_loop.run(tmp_path / "run", demos_file, frames=COUNT)
     assert of_metrics(metrics(tmp_path / "run")[-1]) == pytest.approx(of_report(found), rel=1e-4)
 

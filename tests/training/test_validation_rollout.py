@@ -31,7 +31,7 @@ from aegis_cli.evaluation import kept_figures, rollout
 from aegis_cli.inspection import folders
 from aegis_cli.models import acting
 from aegis_cli.models.acting import RolloutReport
-from aegis_cli.recipes import Kfac, Nullspace, Recipe
+from aegis_cli.recipes import Kfac, Nullspace, Recipe, Rollout
 from aegis_cli.reporting import gather
 from aegis_cli.sim.contract import DEMOS, EVALUATION, VALIDATION
 from aegis_cli.training import checkpoint, dry_run, train, validation_rollout
@@ -43,10 +43,13 @@ Reports = list[RolloutReport]
 
 @pytest.fixture
 def playing(recipe: Recipe) -> Recipe:
-    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within."""
+    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within.
+
+    Whole chunks are executed, so that an episode takes few predictions.
+    """
     return replace(
         recipe,
-        rollout=replace(recipe.rollout, while_training=COUNT, seed=SEED),
+        rollout=Rollout(replan=SETTINGS.chunk, while_training=COUNT, seed=SEED),
         nullspace=Nullspace(every=4),
         kfac=Kfac(every=4),
     )
@@ -273,16 +276,20 @@ def test_nothing_is_compiled_for_episodes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    graphs = compiled_graphs(monkeypatch)
-    compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=2, compile=True))
+    """Nor for a step or a validation after them: all that is compiled is there before the first."""
+    graphs, before = compiled_graphs(monkeypatch), []
+    figures = validation_rollout.ValidationEpisodes.figures
+
+    def noted(*given: Any) -> dict[str, float]:
+        before.append(len(graphs))
+        return figures(*given)
+
+    monkeypatch.setattr(validation_rollout.ValidationEpisodes, "figures", noted)
+    compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=1, compile=True))
     torch._dynamo.reset()  # an earlier test's graphs would serve as well
-    start("naive", tmp_path / "plain", recipe=without(compiling))
-    before = len(graphs)
-    graphs.clear()
-    torch._dynamo.reset()
     start("naive", tmp_path / "run", recipe=compiling)
-    assert len(graphs) == before > 0
-    assert_same_episodes(played[0], again(tmp_path / "run"))
+    assert before == [len(graphs)] * 2 and graphs
+    assert_same_episodes(played[-1], again(tmp_path / "run"))
 
 
 def test_one_process_acts_and_the_others_are_told(
