@@ -72,9 +72,9 @@ pytest_plugins = [
     "samples.nullspace",
     "samples.processes",
     "samples.robots",
-    "samples.own_robots",  # after what it imports
     "samples.streams",
     "samples.training_runs",
+    "samples.own_robots",  # after what it imports
     "samples.user_folder",
     "samples.vqa_truth",
 ]

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from samples.interrupted import at_each
 from samples.lerobot import frame_cache  # noqa: F401
-from samples.own_robots import TASKS
+from samples.own_robots import TASKS, assert_resumes
 from samples.robots import STEPS, Make
-from samples.training_runs import contents
 
 from aegis_cli import recipes
 from aegis_cli.continual import robots, train
@@ -67,12 +64,7 @@ def test_steps_learn_from_changed_frames_alone(
 
 def test_interrupted_and_resumed_it_ends_in_the_same_bytes(real: Make, tmp_path: Path) -> None:
     recipe = real("isolated-lora", augment=NAMES, accumulate=2)
-    train.run(recipe, tmp_path / "whole")
-    begin = partial(train.run, recipe, tmp_path / "run")
-    for _ in at_each(((f"task 1 {TASKS[0]}", 3), (f"task 2 {TASKS[1]}", 3)), begin):
-        pass
-    begin(resume=True)
-    assert contents(tmp_path / "run") == contents(tmp_path / "whole")
+    assert_resumes(recipe, tmp_path)
 
 
 def test_runs_that_began_before_there_was_the_key_are_the_same_runs(real: Make) -> None:

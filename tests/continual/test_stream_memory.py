@@ -10,11 +10,9 @@ from typing import Any
 
 import pytest
 import torch
-from samples.interrupted import at_each
 from samples.lerobot import frame_cache  # noqa: F401
-from samples.own_robots import TASKS, Done
+from samples.own_robots import Done, assert_resumes
 from samples.robots import Make
-from samples.training_runs import contents
 from torch import Tensor
 
 from aegis_cli import recipes
@@ -162,12 +160,7 @@ def test_interrupted_and_resumed_it_ends_in_the_same_bytes(
 ) -> None:
     monkeypatch.setattr(robots, "CALIBRATION_FRAMES", 6)  # to measure routers takes the most time
     recipe = hugging_face(method, steps=4, gradient_checkpointing=True, accumulate=2)
-    train.run(recipe, tmp_path / "whole")
-    begin = partial(train.run, recipe, tmp_path / "run")
-    for _ in at_each(((f"task 1 {TASKS[0]}", 3), (f"task 2 {TASKS[1]}", 3)), begin):
-        pass
-    begin(resume=True)
-    assert contents(tmp_path / "run") == contents(tmp_path / "whole")
+    assert_resumes(recipe, tmp_path)
 
 
 def test_runs_that_began_before_there_were_the_keys_are_the_same_runs(real: Make) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from aegis_cli.continual import train
 from aegis_cli.continual.report import RecordedStreamReport
 from aegis_cli.data.lerobot.write import NewEpisode
 from aegis_cli.recipes import RobotDemos, RobotRollout, RobotStreamRecipe
+from samples.interrupted import at_each
 from samples.lerobot import save
 from samples.robots import Make
+from samples.training_runs import contents
 
 Done = Callable[[str], tuple[RecordedStreamReport, Path]]
 TASKS = ("pick", "open-drawer")
@@ -83,3 +86,13 @@ def done(real: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
         return made[method]
 
     return get
+
+
+def assert_resumes(recipe: RobotStreamRecipe, folder: Path) -> None:
+    """A run that was interrupted in each task and resumed ends in the bytes of a whole one."""
+    train.run(recipe, folder / "whole")
+    begin = partial(train.run, recipe, folder / "run")
+    for _ in at_each(((f"task 1 {TASKS[0]}", 3), (f"task 2 {TASKS[1]}", 3)), begin):
+        pass
+    begin(resume=True)
+    assert contents(folder / "run") == contents(folder / "whole")

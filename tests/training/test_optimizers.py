@@ -30,7 +30,7 @@ SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05, betas=(0.8, 0.95))
 # auxiliary loss, and updates that are projected or preconditioned over several steps. That each
 # method goes on from a checkpoint is tested with AdamW, in `test_train_resume`.
 @pytest.mark.parametrize("method", ["naive", "aegis", "lora", "ewc", "kfac", "nullspace"])
-def test_a_resumed_run_of_any_method_ends_in_the_same_bytes(
+def test_a_resumed_run_with_sgd_ends_in_the_same_bytes(
     start: Start, recipe: Recipe, tmp_path: Path, method: str
 ) -> None:
     assert_resumes(start, method, replace(recipe, train=SGD), tmp_path)
