@@ -264,16 +264,16 @@ def anchor(
     temperature: Annotated[
         float,
         Option(
-            help="What answers' scores are divided by for the curvature; 4 for a backbone that is "
-            "sure of its answers."
+            help="Divides the answers' scores for the curvature; 4 for a backbone that is sure of "
+            "its answers."
         ),
     ] = Anchor().temperature,
     memory: Annotated[
         int | None,
         Option(
             metavar="MB",
-            help="What the sums of inputs or curvature may take: maps are measured in groups, each "
-            "with passes of its own; all at once unless given.",
+            help="What the sums of inputs or curvature may take: maps are then measured in groups, "
+            "each in separate passes; default: all at once.",
         ),
     ] = None,
     batch_size: BatchSize = 64,
@@ -363,7 +363,7 @@ def train(
     out: Annotated[
         Path | None,
         Option(
-            metavar="FOLDER", help="Run folder to write; left out, to resume a run by its folder."
+            metavar="FOLDER", help="Run folder to write; not needed to resume a run by its folder."
         ),
     ] = None,
     demos: Annotated[
@@ -515,7 +515,7 @@ def merge(
         ),
     ],
     method: Annotated[
-        str, Option("--method", metavar="METHOD", help=f"What is kept: {', '.join(MERGES)}.")
+        str, Option("--method", metavar="METHOD", help=f"Rule of the merge: {', '.join(MERGES)}.")
     ] = "factors",
     strength: Annotated[
         float | None,
@@ -559,8 +559,8 @@ def merge(
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="Demonstrations of the run; default: those that it learned from. Repeatable, for "
-            "a run that learned from several sets, in their order.",
+            help="Demonstrations of the run; default: those that it was trained on. Repeatable, "
+            "for a run that learned from several sets, in their order.",
         ),
     ] = None,
     anchor: AnchorIn = None,
@@ -573,13 +573,13 @@ def merge(
     skip_bad: SkipBad = False,
     samples: Annotated[
         int,
-        Option(help="Questions to measure on where there is no --anchor.", callback=positive),
+        Option(help="Questions to measure on if there is no --anchor.", callback=positive),
     ] = 1000,
     temperature: Annotated[
         float,
         Option(
-            help="Where there is no --anchor: what the answers' scores are divided by before the "
-            "curvature's words are drawn; 4 where the model is sure of its answers.",
+            help="Without --anchor: divides the answers' scores before the words for the curvature "
+            "are drawn; 4 for a model that is sure of its answers.",
             callback=above_zero,
         ),
     ] = 1.0,
@@ -587,7 +587,8 @@ def merge(
         int, Option(help="Robot frames to measure on, at most.", callback=positive)
     ] = 1000,
     questions: Annotated[
-        int, Option(help="Validation questions of a sweep; of files, at most.", callback=positive)
+        int,
+        Option(help="Validation questions of a sweep; for files, the maximum.", callback=positive),
     ] = 2100,
     damping: Annotated[
         float,
@@ -721,7 +722,7 @@ def probe(
     questions: Annotated[
         int | None,
         Option(
-            help="Number of held-out questions; of files, at most; default: a run's own "
+            help="Number of held-out questions; for files, the maximum; default: a run's own "
             "probe.questions, else 5000.",
             callback=positive,
         ),
@@ -761,7 +762,7 @@ def probe(
 ) -> None:
     """Measure what the VLM still knows, and its drift; for a stream, the accuracy on every task.
 
-    What is measured of a run is also written into its folder, below results.
+    The figures of a run are also written into its folder, below results.
 
     About half of the images of question files are asked about; no anchor is ever measured on them.
 
@@ -1023,13 +1024,13 @@ def rollout(
         int | None,
         Option(
             metavar="STEPS",
-            help="Steps that a prediction takes, in which the robot goes on with the chunk before; "
-            "default: it waits.",
+            help="Steps that a prediction takes, during which the robot continues with the "
+            "previous chunk; default: it waits.",
         ),
     ] = None,
     guided: Annotated[
         bool,
-        Option("--guided", help="With --delay: chunks that continue the one before."),
+        Option("--guided", help="With --delay: each chunk continues the previous one."),
     ] = False,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
     device: Device = None,
@@ -1108,9 +1109,9 @@ def evaluate(
     """Compare predicted with recorded actions on held-out episodes, for robots without a simulator.
 
     The error is open loop: each chunk is predicted at a recorded frame and nothing is executed. It
-    is given by dimension of the actions, by steps ahead and by instruction, relative to that of the
-    training's mean action, and beside that of the current position where actions are positions. The
-    run of one policy keeps the figures.
+    is reported by dimension of the actions, by steps ahead and by instruction, relative to the
+    error of the training's mean action. Where actions are positions, the error of holding the
+    current position stands beside it. A run of one policy keeps the figures.
 
     \b
     Example: aegis evaluate runs/x --plot actions.png
@@ -1156,7 +1157,8 @@ def serve(
     ] = None,
     seed: Annotated[int, Option(help="Seed of the policy's noise.", callback=seed_number)] = 0,
     precision: Annotated[
-        Precision, Option(help="Of matrix products; auto is bf16 on a GPU that has it.")
+        Precision,
+        Option(help="Number format of matrix products; auto is bf16 on a GPU that has it."),
     ] = Precision.auto,
     ensemble: Ensemble = None,
     device: Device = None,
@@ -1254,7 +1256,7 @@ def push(
         bool, Option("--private", help="Make a private repository; refuse a public one.")
     ] = False,
     dry_run: Annotated[
-        bool, Option("--dry-run", help="Check all, list the files, send nothing.")
+        bool, Option("--dry-run", help="Check everything, list the files, and send nothing.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -1271,7 +1273,7 @@ def push(
     stages.PUSH.run(run, repo, form and form.value, private, dry_run, dtype.value, as_json=as_json)
 
 
-@app.command(short_help="Train the embedded models from nothing.")
+@app.command(short_help="Train the embedded models from scratch.")
 def pretrain(
     recipe: RecipeArg,
     out: Annotated[
@@ -1283,7 +1285,7 @@ def pretrain(
     device: Device = None,
     as_json: Json = False,
 ) -> None:
-    """Train the embedded VLM, or the embedded dual encoder, from nothing.
+    """Train the embedded VLM, or the embedded dual encoder, from scratch.
 
     \b
     Example: aegis pretrain recipes/pretrain-embedded.yaml
@@ -1314,9 +1316,9 @@ def run(
         bool,
         Option(
             "--dry-run",
-            help="List the stages, or a study's cells, that would run, and why; of trainings whose "
-            "demonstrations and anchor are there also memory, disk and hours; write nothing; exit "
-            "1 if memory or disk does not suffice.",
+            help="List the stages, or a study's cells, that would run, and why; for trainings "
+            "whose demonstrations and anchor exist, also memory, disk and hours; write nothing; "
+            "exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     device: Device = None,
@@ -1411,7 +1413,7 @@ def bench(
     ] = None,
     chosen: Annotated[
         str | None,
-        Option("--methods", metavar="NAMES", help="Which methods beside naive; default: all."),
+        Option("--methods", metavar="NAMES", help="Methods to compare with naive; default: all."),
     ] = None,
     device: Device = None,
     overrides: Set = None,
@@ -1419,12 +1421,12 @@ def bench(
 ) -> None:
     """Time the anchor pass, each method's step and the guard, and measure their peak memory.
 
-    Compared are the anchor pass with a bare forward, each step with naive's, and the guard with
-    training. With --methods some methods alone are compared, and with --set the recipe's keys are
-    others, as in --set aegis.refresh=4; both leave the guard out.
+    The anchor pass is compared with a bare forward pass, each method's step with naive's, and the
+    guard with training. --methods compares only some methods, and --set changes keys of the recipe,
+    as in --set aegis.refresh=4; both leave the guard out.
 
-    Times are taken in turn, so that a busy machine slows all alike; memory is that of a process for
-    each method.
+    Times are taken in turn, so that a busy machine slows all alike. Memory is measured in a process
+    of its own for each method.
 
     --latency times a trained policy alone, from pictures to actions, one observation at a time.
 
@@ -1489,7 +1491,7 @@ def recipes(
     name: Annotated[str | None, Argument(metavar="NAME", help="Recipe to show or copy.")] = None,
     out: Annotated[
         Path | None,
-        Argument(metavar="FILE", help="New file for the copy; NAME.yaml here unless given."),
+        Argument(metavar="FILE", help="New file for the copy; default: NAME.yaml in this folder."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -1529,7 +1531,7 @@ def recipes(
 @app.command(short_help="Check the installation and the machine.")
 def doctor(
     quick: Annotated[
-        bool, Option("--quick", help="Leave the job out, which takes half a minute or more.")
+        bool, Option("--quick", help="Skip the job, which takes half a minute or more.")
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -241,7 +241,7 @@ RecipeOrRunArg = Annotated[
     Argument(
         metavar="RECIPE_OR_RUN",
         help="Recipe file, or the name of one that ships, e.g. quickstart; or the folder of a run, "
-        "which goes on by its own recipe, demonstrations and anchor.",
+        "to resume it with its own recipe, demonstrations and anchor.",
         callback=recipe_file,
     ),
 ]
@@ -266,17 +266,16 @@ Wide = Annotated[
     bool,
     Option(
         "--wide",
-        help="One line a row, however narrow the terminal: for | less -S. Else a table that is too "
-        "wide goes on below with its next columns.",
+        help="Print each row on one line, however narrow the terminal, for | less -S. Otherwise a "
+        "table that is too wide continues below with its next columns.",
     ),
 ]
-_RESUMED = "Continue from the last checkpoint in --out; without a run there, start anew."
+_RESUMED = "Continue from the last checkpoint in --out; without a run there, start one."
 Resume = Annotated[
     bool,
     Option(
         "--resume",
-        help=f"{_RESUMED} A policy's run that has ended goes on where train.steps is more than it "
-        "was.",
+        help=" A finished run of a policy continues if train.steps is larger than before.",
     ),
 ]
 ResumePretraining = Annotated[bool, Option("--resume", help=_RESUMED)]
@@ -284,7 +283,7 @@ Overwrite = Annotated[
     bool,
     Option(
         "--overwrite",
-        help="Begin anew where Aegis has written before, and replace what it wrote there.",
+        help="Start over where Aegis has written before, and replace what it wrote there.",
     ),
 ]
 Episodes = Annotated[int, Option(help="Number of episodes.", callback=positive)]
@@ -326,7 +325,7 @@ OwnAsk = Annotated[
     ),
 ]
 SkipBad = Annotated[
-    bool, Option("--skip-bad", help="Leave bad questions of files out and count them.")
+    bool, Option("--skip-bad", help="Leave out bad questions in files and count them.")
 ]
 Device = Annotated[
     str | None,
@@ -350,8 +349,8 @@ Ensemble = Annotated[
     Option(
         "--ensemble",
         metavar="DECAY",
-        help="Temporal ensembling with this decay, as a recipe's rollout.ensemble; default: as the "
-        "policy was trained.",
+        help="Temporal ensembling with this decay, as in a recipe's rollout.ensemble; default: as "
+        "the policy was trained.",
     ),
 ]
 Rename = Annotated[
@@ -359,8 +358,8 @@ Rename = Annotated[
     Option(
         "--rename",
         metavar="NAME=NAME",
-        help="A camera, feature or joint of --demos, and the policy's name of it, as demos.rename "
-        "has them; repeatable.",
+        help="Name of a camera, feature or joint in --demos, and the policy's name for it, as in "
+        "demos.rename; repeatable.",
         callback=renamed,
     ),
 ]

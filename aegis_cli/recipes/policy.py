@@ -99,7 +99,8 @@ PART = Check(EXPECTED, is_pattern)
 _AS_IT_IS = "{}"  # what `ask` makes of a question where it changes nothing
 _ASK = (
     "What a question becomes before the model reads it, with {} for it. Chat models that answer in "
-    "sentences need e.g. '{} Answer with a single word or phrase.', for answers are compared whole."
+    "sentences need e.g. '{} Answer with a single word or phrase.', because answers are compared "
+    "as a whole."
 )
 
 
@@ -118,7 +119,7 @@ class Demos:
         NOT_EMPTY,
         default=None,
         doc="Demonstrations to use instead of recording: a file, the folder of a LeRobot dataset, "
-        "or its id on the hub; a list has several sets of one robot learned from together.",
+        "or its id on the hub; a list trains on several sets of one robot together.",
     )
     weights: tuple[float, ...] | None = key(
         POSITIVE_EACH,
@@ -159,17 +160,17 @@ class Demos:
         later=True,
         doc="Episodes of a single set in `path` to learn from and validate on; null: all. Numbers "
         "from 0 and ranges such as '0-39,45', the name of a split in a LeRobot dataset's "
-        "info.json, or a task of LIBERO's, such as libero/spatial, for those with its "
-        "instructions.",
+        "info.json, or a LIBERO suite or task, such as libero/spatial, for the episodes with "
+        "its instructions.",
     )
     cache: bool | None = key(
         default=None,
         later=True,
         shapes=False,
-        doc="Whether all frames of a LeRobot dataset's videos are decoded before training, into a "
-        "cache on the disk, or each whenever a batch has it; the weights are the same. Null "
-        "decodes them before where they take at most a quarter of the free disk. Pictures in data "
-        "files always are.",
+        doc="Whether to decode all frames of a LeRobot dataset's videos into a cache on disk "
+        "before training (true), or each frame when a batch needs it (false); the trained "
+        "weights are the same. Null decodes them beforehand if they take at most a quarter of "
+        "the free disk. Pictures in data files are always decoded beforehand.",
     )
     drop_below: float | None = key(
         BELOW_ONE,
@@ -193,17 +194,19 @@ class Anchor:
         choice(*ANCHOR_SOURCES),
         default="questions",
         later=True,
-        doc="What the backbone reads while it is measured: questions, or the frames of the "
-        "demonstrations with their instructions, of which only moments are measured.",
+        doc="What the backbone reads while it is measured: questions, or the demonstrations' "
+        "frames with their instructions, for which only moments are measured.",
     )
     vqa: str = key(
         NOT_EMPTY,
         default="scenes",
         doc="Questions: 'scenes', which are drawn, 'easy-vqa', or a file, folder or hub id of "
-        "questions, of whose images anchors get a share.",
+        "questions. Anchors use a share of the images of such a set, and never those that "
+        "probes use.",
     )
     skip_bad: bool = key(
-        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+        default=False,
+        doc="Leave out bad questions in files and count them, instead of refusing the file.",
     )
     ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
     samples: int = key(
@@ -244,16 +247,17 @@ class Anchor:
         POSITIVE,
         default=1.0,
         later=True,
-        doc="What the scores of answers are divided by before the curvature's words are drawn from "
-        "them. A backbone that is sure of its answers gives gradients to few questions alone; 4 "
-        "spreads them over all.",
+        doc="Divides the scores of answers before the words for the curvature are drawn from them. "
+        "If the backbone is sure of its answers, only few questions give gradients; 4 spreads "
+        "them over all questions.",
     )
     memory: int | None = key(
         POSITIVE,
         default=None,
         later=True,
-        doc="MB that the sums of inputs or curvature may take beside the model: maps are measured "
-        "in groups, each with passes of its own. Null measures all at once.",
+        doc="MB that the sums of inputs or curvature may take in addition to the model. Maps are "
+        "then measured in groups, with separate passes for each group. Null measures all at "
+        "once.",
     )
 
 
@@ -264,16 +268,16 @@ class Train:
     method: str = key(
         choice(*METHODS),
         default="naive",
-        doc="How the backbone is fine-tuned by `aegis train`; `aegis run` goes through `methods`.",
+        doc="Method that `aegis train` uses; `aegis run` trains with each of `methods`.",
     )
     steps: int = key(POSITIVE, default=1500, doc="Optimizer steps.")
     extended_from: tuple[int, ...] | None = key(
         POSITIVE,
         default=None,
         later=True,
-        doc="Numbers of steps that were planned before, where `aegis train --resume --set "
-        "train.steps=N` has made a run longer: it writes them here. The learning rate follows each "
-        "plan up to its end, and the next from there.",
+        doc="Earlier values of `steps` of a run that `aegis train --resume --set train.steps=N` "
+        "has made longer; the command writes them here. The learning rate follows each plan to "
+        "its end, and then the next.",
     )
     batch_size: int = key(POSITIVE, default=32, doc="Frames per step.")
     chunk: int = key(POSITIVE, default=8, doc="Actions that are predicted at once.")
@@ -291,15 +295,15 @@ class Train:
         choice(*SCHEDULES),
         default=COSINE,
         later=True,
-        doc="How the learning rates go on from their peaks: down to `final_lr_share` along a "
-        "cosine or a straight line, or constant, which stays at the peaks.",
+        doc="How the learning rates continue after their peaks: down to `final_lr_share` along a "
+        "cosine or a straight line, or constant at the peaks.",
     )
     optimizer: str = key(
         choice(*OPTIMIZERS),
         default="adamw",
         later=True,
-        doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are "
-        "some thirty times larger. The expert, which begins from nothing, always has AdamW.",
+        doc="Optimizer of the backbone: AdamW, or SGD with momentum, whose learning rates are some "
+        "thirty times larger. The expert, which is trained from scratch, always uses AdamW.",
     )
     momentum: float = key(
         BELOW_ONE,
@@ -318,7 +322,7 @@ class Train:
         DIVIDES,
         default=1e-8,
         later=True,
-        doc="What AdamW adds to the root of the second moment, by which it divides.",
+        doc="Term that AdamW adds to its denominator, the root of the second moment.",
     )
     states: str = key(
         choice(*STATES),
@@ -343,8 +347,8 @@ class Train:
         default=False,
         later=True,
         doc="Predict actions relative to the robot's position when their chunk begins, each to the "
-        "position of its own name, as LeRobot's use_relative_actions does. The policy adds the "
-        "position again, so that what it answers is absolute.",
+        "position of its own name, as LeRobot's use_relative_actions does. The policy adds "
+        "the position again, so that its predictions are absolute.",
     )
     relative_exclude: tuple[str, ...] | None = key(
         NOT_EMPTY,
@@ -370,16 +374,15 @@ class Train:
         SHARE_OR_ONE,
         default=1.0,
         later=True,
-        doc="Share of the steps after which the backbone stands still and the expert alone goes "
-        "on.",
+        doc="Share of the steps after which the backbone is frozen and only the expert trains on.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,
         default=None,
         later=True,
         doc="Parts of the backbone that do not learn, whatever the method: names or patterns of "
-        "them, such as vision, or [vision, embeddings, layers.0-11], each with all that is below "
-        "it. Null: all learns that the method trains.",
+        "them, such as vision, or [vision, embeddings, layers.0-11], each with all that is "
+        "below it. Null freezes nothing beyond what the method itself does.",
     )
     validation_share: float = key(
         SHARE, default=0.05, doc="Share of the episodes that is kept for the validation loss."
@@ -390,20 +393,21 @@ class Train:
         default=None,
         later=True,
         shapes=False,
-        doc="Held-out frames at which `aegis train` predicts actions with every validation loss. "
-        "Their error, as `aegis evaluate` has it, is in its log and in trackers: 1 is that of "
-        "always predicting the mean. Of a robot that is not simulated no other figure tells of "
-        "whole actions while it trains. Null: none.",
+        doc="Number of held-out frames at which `aegis train` predicts actions with every "
+        "validation loss. Their error, computed as by `aegis evaluate`, goes to the log and to "
+        "trackers; always predicting the mean gives 1. For a robot that is not simulated, no "
+        "other figure measures whole actions during training. Null: none.",
     )
     checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
     keep_checkpoints: int | None = key(
         POSITIVE,
         default=None,
         shapes=False,
-        doc="How many of the last checkpoints stay, beside the one with the least validation loss; "
-        "others are removed. Null keeps all. A validation loss counts for a checkpoint of the same "
-        "step. With `probe.while_training` and `probe.max_drop` it is the best of those that lose "
-        "no more, if one does.",
+        doc="How many of the latest checkpoints to keep, in addition to the one with the lowest "
+        "validation loss; the others are removed. Null keeps all. A validation loss counts for "
+        "the checkpoint of the same step. With `probe.while_training` and `probe.max_drop`, "
+        "the extra one is the best of those that lost no more than `max_drop`, if there is "
+        "one.",
     )
     log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
     # They belonged to a figure that is no longer measured.
@@ -420,7 +424,7 @@ class Train:
         POSITIVE,
         default=3,
         later=True,
-        doc="How many of `augment` change one image, drawn anew each time.",
+        doc="How many of `augment` are applied to one image, drawn anew each time.",
     )
     precision: str = key(
         choice(*PRECISIONS),
@@ -432,38 +436,40 @@ class Train:
         choice(*WEIGHTS),
         default="float32",
         doc="Number format of a Hugging Face backbone's weights; bf16 takes half the memory, and "
-        "small steps are lost. bf16-master rounds them for the forward and backward pass alone: "
+        "small steps are lost. bf16-master rounds them only for the forward and backward pass: "
         "the optimizer and the method work on float32 weights.",
     )
     gradient_checkpointing: bool = key(
         default=False,
-        doc="Hugging Face backbones only: less memory, at the price of a second forward pass, of "
-        "the action expert too.",
+        doc="Recompute activations in the backward pass, also the action expert's: less memory at "
+        "the price of a second forward pass. Hugging Face backbones only.",
     )
     compile: bool = key(
         default=False,
-        doc="Compile backbone and expert with torch.compile: of a Hugging Face backbone its "
-        "layers, with prompts padded to multiples of 32 tokens (the embedded backbone's: of 4).",
+        doc="Compile the backbone and the expert with torch.compile. Of a Hugging Face backbone "
+        "the layers are compiled, and prompts are padded to multiples of 32 tokens (the "
+        "embedded backbone's: of 4).",
     )
     accumulate: int = key(
         POSITIVE,
         default=1,
         later=True,
-        doc="Passes in which a step's frames are taken, for less memory.",
+        doc="Number of passes that a step's frames are split into, to save memory (gradient "
+        "accumulation).",
     )
     parallel: str = key(
         choice(*PARALLEL),
         default="ddp",
         later=True,
-        doc="How processes that torchrun has started share a training: each with all weights "
-        "(ddp), or with some rows of each (fsdp).",
+        doc="How processes started by torchrun share a training: each holds all weights (ddp), or "
+        "some rows of each weight (fsdp).",
     )
     track: tuple[str, ...] | None = key(
         choice(*TRACKERS),
         default=None,
         shapes=False,
-        doc="Trackers that get each line of metrics.jsonl too; offline unless their own "
-        "environment variables say otherwise.",
+        doc="Trackers that also receive each line of metrics.jsonl; they stay offline unless their "
+        "own environment variables say otherwise.",
     )
 
     @property
@@ -482,9 +488,9 @@ class Expert:
         NOT_EMPTY,
         default=None,
         later=True,
-        doc="Folder of a run, checkpoint or exported policy of the same robot, with whose expert "
-        "this training begins; null begins with a new one. The backbone is still `backbone`, which "
-        "may be that folder too.",
+        doc="Folder of a run, checkpoint or exported policy of the same robot, whose expert this "
+        "training starts from; null starts with a new one. The backbone is still set by "
+        "`backbone`, which may name the same folder.",
     )
 
 
@@ -524,9 +530,9 @@ class Aegis:
     restoration: float = key(
         NOT_NEGATIVE,
         default=0.0,
-        doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is "
-        "far the longer one: on the embedded VLM its norm began at 8,405, the task's at 4.7, so "
-        "1e-5 to 1e-2 is the range to try.",
+        doc="Weight of the anchor gradient that is added to the task's. The anchor gradient is far "
+        "larger: on the embedded VLM its norm began at 8,405, the task's at 4.7, so 1e-5 to "
+        "1e-2 is the range to try.",
     )
     groups: str = key(
         choice(*GROUPS),
@@ -537,21 +543,23 @@ class Aegis:
         choice(*IDLE),
         default="moved",
         later=True,
-        doc="What becomes of parameters that the task's gradient does not reach: the projection "
-        "moves them along the anchor gradient, or they are kept as naive has them.",
+        doc="What happens to parameters that the task's gradient does not reach: the projection "
+        "moves them along the anchor gradient (moved), or they are trained as under naive "
+        "(kept).",
     )
     refresh: int = key(
         POSITIVE,
         default=1,
         later=True,
-        doc="Steps that share one anchor gradient; each first one pays for a second backward pass.",
+        doc="Number of steps that share one anchor gradient; the first of them pays for a second "
+        "backward pass.",
     )
     fraction: float = key(
         SHARE_OR_ONE,
         default=1.0,
         later=True,
-        doc="Share of the batch that the anchor gradient is taken on. Below 1, these frames pass "
-        "the backbone once more, in a small graph of their own.",
+        doc="Share of the batch on which the anchor gradient is computed. Below 1, these frames go "
+        "through the backbone a second time, in a small graph of their own.",
     )
 
 
@@ -569,7 +577,7 @@ class Nullspace:
         UP_TO_ONE,
         default=None,
         doc="Instead of `soft`: the leading directions that hold this share of the energy are "
-        "protected wholly.",
+        "fully protected.",
     )
     protect: tuple[str, ...] = key(
         choice(*SITE_KINDS), default=SITE_KINDS, doc="Kinds of modules that are protected."
@@ -577,14 +585,15 @@ class Nullspace:
     every: int = key(
         POSITIVE,
         default=4,
-        doc="Steps between two projections, each of all the steps since the last.",
+        doc="Steps between two projections; each projects all the steps since the last one.",
     )
     keeps: str = key(
         choice(*KEPT),
         default="weights",
         later=True,
-        doc="What a projection knows of the weights before its steps: the weights themselves, or "
-        "their coordinates along the protected directions, which take less memory and more time.",
+        doc="What is kept of the weights from before the steps that a projection covers: the "
+        "weights themselves, or their coordinates along the protected directions, which take "
+        "less memory and more time.",
     )
 
 
@@ -607,12 +616,12 @@ class Kfac:
     balance: float = key(
         NOT_NEGATIVE,
         default=1.0,
-        doc="How much less maps of small gradients move; 0 takes Adam's steps as they are.",
+        doc="How much less maps with small gradients move; 0 takes Adam's steps as they are.",
     )
     every: int = key(
         POSITIVE,
         default=4,
-        doc="Steps between two proximal steps, each of all the steps since the last.",
+        doc="Steps between two proximal steps; each covers all the steps since the last one.",
     )
     step: str = key(
         choice(*PENALTY_STEPS),
@@ -691,8 +700,8 @@ class Insulate:
     weight: float = key(
         NOT_NEGATIVE,
         default=1.0,
-        doc="Weight of the cross-entropy of actions as text. The backbone has no other loss of "
-        "robot frames, so its learning rate decides more.",
+        doc="Weight of the cross-entropy of actions as text. The backbone has no other loss on "
+        "robot frames, so its learning rate matters more.",
     )
     bins: int | None = key(
         TWO_OR_MORE,
@@ -708,14 +717,14 @@ class Insulate:
     horizon: int = key(
         POSITIVE,
         default=2,
-        doc="Number of the chunk's actions that are written, the first and others evenly after it; "
-        "all of a shorter chunk.",
+        doc="Number of the chunk's actions that are written as text: the first, and others evenly "
+        "spaced after it; all of a shorter chunk.",
     )
     prompt: str = key(
         WITH_PLACE,
         default="{}",
-        doc="What the backbone is asked for the actions, with {} for the instruction; words that "
-        "no question has tell the two apart.",
+        doc="Prompt that asks the backbone for the actions, with {} for the instruction. Words "
+        "that no question contains tell the two apart.",
     )
     vqa_weight: float = key(
         NOT_NEGATIVE,
@@ -730,7 +739,8 @@ class Insulate:
         "share of the images.",
     )
     skip_bad: bool = key(
-        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+        default=False,
+        doc="Leave out bad questions in files and count them, instead of refusing the file.",
     )
     ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
     questions: int = key(POSITIVE, default=14_000, doc="Number of questions that are drawn from.")
@@ -748,7 +758,8 @@ class Cotrain:
         doc="Questions that are trained on; of files, those of the anchor's share of the images.",
     )
     skip_bad: bool = key(
-        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+        default=False,
+        doc="Leave out bad questions in files and count them, instead of refusing the file.",
     )
     ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
     questions: int = key(POSITIVE, default=14_000, doc="Number of questions that are drawn from.")
@@ -757,7 +768,7 @@ class Cotrain:
 
 @section
 class Probe:
-    """How it is measured what the VLM still knows."""
+    """How Aegis measures what the VLM still knows."""
 
     vqa: str | tuple[str, ...] = key(
         NOT_EMPTY,
@@ -767,32 +778,33 @@ class Probe:
         "chosen by the first.",
     )
     skip_bad: bool = key(
-        default=False, doc="Leave bad questions of files out and count them, instead of refusing."
+        default=False,
+        doc="Leave out bad questions in files and count them, instead of refusing the file.",
     )
     ask: str = key(WITH_PLACE, default="{}", later=True, doc=_ASK)
-    questions: int = key(POSITIVE, default=5000, doc="Number of questions; of files, at most.")
+    questions: int = key(POSITIVE, default=5000, doc="Number of questions; for files, the maximum.")
     seed: int = key(SEED, default=0, doc="Seed of the choice of questions.")
     batch_size: int = key(POSITIVE, default=64, doc="Questions per forward pass.")
     max_drop: float | None = key(
         NOT_NEGATIVE,
         default=None,
-        doc="Drop of the accuracy, in percentage points, past which `aegis run` exits with 1, and "
-        "`aegis probe` of the run.",
+        doc="Largest drop of the accuracy, in percentage points: beyond it `aegis run`, and `aegis "
+        "probe` of the run, exit with 1.",
     )
     gate: str = key(
         choice(MEAN, UPPER),
         default=MEAN,
         later=True,
-        doc="What of the drop `max_drop` limits: mean, the drop as measured, or upper, the upper "
-        "end of its 95 % interval, so that too few questions cannot pass.",
+        doc="Which figure `max_drop` limits: mean, the drop as measured, or upper, the upper end "
+        "of its 95 % interval, so that too few questions cannot pass.",
     )
     while_training: int | None = key(
         POSITIVE,
         default=None,
         later=True,
-        doc="Validation questions of each set that `aegis train` asks before the first step and "
-        "with every validation loss, so that what is lost shows while it is lost: in its log and "
-        "in trackers. They are of images that neither anchors nor probes are of. Null: none.",
+        doc="Number of validation questions of each set that `aegis train` asks before the first "
+        "step and with every validation loss, so that its log and trackers show a loss of VQA "
+        "as it happens. Neither anchors nor probes use their images. Null: none.",
     )
 
     @property
@@ -850,15 +862,15 @@ class Rollout:
         MADE,
         default=None,
         later=True,
-        doc="Validation episodes that `aegis train` plays with every validation loss, on seen "
-        "colours, so that success shows while it grows: in its log and in trackers. Neither "
-        "demonstrations nor evaluations are of these episodes. Null: none.",
+        doc="Number of validation episodes, on seen colours, that `aegis train` plays with every "
+        "validation loss, so that its log and trackers show the success as it grows. Neither "
+        "demonstrations nor evaluations use these episodes. Null: none.",
     )
 
 
 @section
 class Merge:
-    """A move back towards the pre-trained backbone, after the training and before all measuring.
+    """Moves the backbone back towards the pre-trained one, after training and before measuring.
 
     `aegis run` does what `aegis merge` does; `aegis train` alone does not.
     """
@@ -866,7 +878,8 @@ class Merge:
     method: str | None = key(
         choice(*MERGES),
         default=None,
-        doc="What is kept of how far the backbone has moved; null keeps all and merges nothing.",
+        doc="Rule that decides how much of the backbone's change is kept; null keeps all of it and "
+        "merges nothing.",
     )
     strength: float = key(
         NOT_NEGATIVE,

@@ -51,8 +51,8 @@ class PretrainRecipe:
     start: str | None = key(
         NOT_EMPTY,
         default=None,
-        doc="Embedded VLM whose weights it begins with, such as 'embedded'; words that it does not "
-        "know begin with drawn ones. Null begins from nothing.",
+        doc="Embedded VLM whose weights it starts from, such as 'embedded'; words that it does not "
+        "know start from random ones. Null trains from scratch.",
     )
     steps: int = key(POSITIVE, default=4000, doc="Optimizer steps.")
     batch_size: int = key(POSITIVE, default=48, doc="Scenes per step, each with all its questions.")

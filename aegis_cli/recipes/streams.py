@@ -144,8 +144,9 @@ class RobotTrain:
         PART,
         default=None,
         later=True,
-        doc="Parts of the backbone that do not learn, as in a recipe of a policy; a learner with "
-        "experts puts none beside their maps. Null: all learns that the learner trains.",
+        doc="Parts of the backbone that do not learn, as in a policy's recipe; a learner with "
+        "experts adds none to their maps. Null freezes nothing beyond what the learner itself "
+        "does.",
     )
     validation_share: float = key(
         SHARE,
@@ -167,25 +168,26 @@ class RobotTrain:
         default=None,
         later=True,
         doc="Transformations, with LeRobot's ranges, that change training frames; null changes "
-        "none. What is measured, routers too, sees frames as they are.",
+        "none. Measurements, also those of routers, see frames as they are.",
     )
     augment_count: int = key(
         POSITIVE,
         default=3,
         later=True,
-        doc="How many of `augment` change one image, drawn anew each time.",
+        doc="How many of `augment` are applied to one image, drawn anew each time.",
     )
     gradient_checkpointing: bool = key(
         default=False,
         later=True,
-        doc="Hugging Face backbones only: less memory, at the price of a second forward pass, of "
-        "the action expert too.",
+        doc="Recompute activations in the backward pass, also the action expert's: less memory at "
+        "the price of a second forward pass. Hugging Face backbones only.",
     )
     accumulate: int = key(
         POSITIVE,
         default=1,
         later=True,
-        doc="Passes in which a step's frames are taken, for less memory.",
+        doc="Number of passes that a step's frames are split into, to save memory (gradient "
+        "accumulation).",
     )
 
 
@@ -245,8 +247,8 @@ class RobotDemos:
         default=None,
         later=True,
         shapes=False,
-        doc="Whether all frames of a LeRobot dataset's videos are decoded before training, into a "
-        "cache on the disk, or each whenever a batch has it, as in a policy's recipe.",
+        doc="Whether to decode all frames of a LeRobot dataset's videos into a cache on disk "
+        "before training, or each frame when a batch needs it, as in a policy's recipe.",
     )
 
     @property
@@ -268,9 +270,9 @@ class RobotDemos:
 
 @section
 class RobotRollout:
-    """How each task of a stream so far is measured after each of them.
+    """How all tasks learned so far are measured after each task of a stream.
 
-    Simulated ones are played; of others, actions are predicted at held-out frames.
+    Simulated tasks are played; for others, actions are predicted at held-out frames.
     """
 
     episodes: int = key(MADE, default=50, doc="Number of episodes per task.")
@@ -286,23 +288,23 @@ class RobotRollout:
     split: str = key(
         choice(*SPLITS),
         default="evaluation",
-        doc="Episodes and questions that figures are of; validation takes others, to choose "
-        "settings on.",
+        doc="Episodes and questions that are measured; validation uses others, for choosing "
+        "settings.",
     )
     frames: int = key(
         POSITIVE,
         default=1000,
         later=True,
-        doc="Held-out frames per task, at most, at which actions are predicted where no simulator "
-        "has the tasks.",
+        doc="Largest number of held-out frames per task at which actions are predicted, for tasks "
+        "that no simulator has.",
     )
 
 
 @section
 class Inference:
-    """How it is inferred which task an image belongs to.
+    """How the task of an image is inferred.
 
-    There is a Gaussian per task over the bare encoder's early features.
+    There is one Gaussian per task over the bare encoder's early features.
     """
 
     rank: int = key(
@@ -410,24 +412,24 @@ class Igsp:
     tolerance: float = key(
         NOT_NEGATIVE,
         default=0.03,
-        doc="Total variation of the routing between two checks under which routers stand still.",
+        doc="Total variation of the routing between two checks below which routers count as still.",
     )
     checks: int = key(
         POSITIVE,
         default=3,
-        doc="Successive checks at which routers have to stand still to end phase 1.",
+        doc="Successive checks at which routers have to be still to end phase 1.",
     )
     check_every: int = key(POSITIVE, default=10, doc="Steps between two checks.")
     prune: bool = key(default=True, doc="Whether experts are pruned; false is an ablation.")
     orthogonal: bool = key(
         default=False,
-        doc="Whether phase 2 keeps off the columns of the experts of earlier tasks.",
+        doc="Whether phase 2 keeps updates orthogonal to the columns of earlier tasks' experts.",
     )
 
 
 @section
 class StreamRecipe:
-    """Lets a dual encoder learn a stream of classification tasks one after the other."""
+    """Trains a dual encoder on a stream of classification tasks, one after the other."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run.")
     stream: str = key(
@@ -453,8 +455,8 @@ class StreamRecipe:
     split: str = key(
         choice(*PARTS),
         default=TEST,
-        doc="Part of each task's images that accuracies are of; validation is there to choose "
-        "settings on.",
+        doc="Part of each task's images that accuracies are measured on; validation is for "
+        "choosing settings.",
     )
     train: StreamTrain = StreamTrain()
     inference: Inference = Inference()
@@ -468,7 +470,7 @@ class StreamRecipe:
 
 @section
 class RobotStreamRecipe:
-    """Lets a policy learn several robot tasks one after the other."""
+    """Trains a policy on several robot tasks, one after the other."""
 
     name: str = key(FOLDER_NAME, doc="Name of the run.")
     tasks: tuple[str, ...] = key(

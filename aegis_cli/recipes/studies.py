@@ -140,8 +140,8 @@ class StudyRecipe:
     per_seed: tuple[str, ...] | None = key(
         choice(*PER_SEED),
         default=None,
-        doc="What is drawn anew with every seed. What is not named is one and the same for all "
-        "seeds: an interval says nothing of others then.",
+        doc="What is drawn anew for every seed. What is not listed is the same for all seeds, so "
+        "intervals say nothing about other draws of it.",
     )
     keep_runs: bool = key(
         default=False, doc="Keep the checkpoints of trainings that have been measured."
@@ -152,8 +152,8 @@ class StudyRecipe:
         later=True,
         shapes=False,
         doc="Where nothing can be rolled out: how far above naive's a variant's open-loop error "
-        "may be to pass the bar, as a share of the actions' variance. One policy's error moved by "
-        "as much on 16 episodes where its flow began with other noise.",
+        "may be to pass the bar, as a share of the actions' variance. One policy's error "
+        "changed by as much on 16 episodes when its flow started from other noise.",
     )
 
 
@@ -166,12 +166,12 @@ class StreamVariant(Variant):
 
 @section
 class Pairs:
-    """Two streams of two tasks: in one the second should share the first's experts, in one not."""
+    """Two streams of two tasks: the second should share experts in one, and not in the other."""
 
     a: str = key(
         NOT_EMPTY,
         doc="Stream whose second task should share: the same question about pictures that look "
-        "otherwise.",
+        "different.",
     )
     b: str = key(
         NOT_EMPTY,
@@ -263,8 +263,8 @@ class RobotStreamStudyRecipe:
     per_seed: tuple[str, ...] | None = key(
         choice(*_NO_ANCHOR),
         default=None,
-        doc="What is drawn anew with every seed. What is not named is one and the same for all "
-        "seeds: an interval says nothing of others then.",
+        doc="What is drawn anew for every seed. What is not listed is the same for all seeds, so "
+        "intervals say nothing about other draws of it.",
     )
     keep_runs: bool = key(
         default=False, doc="Keep the run folders of streams that have been measured."
