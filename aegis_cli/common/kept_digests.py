@@ -76,7 +76,8 @@ def _know(large: Mapping[Path, tuple[Path, Stamp]], home: Path, on_event: OnEven
     store = cache.folder("digests") / f"{files.sha256_value(str(home.resolve()))[:32]}.json"
     cache.sweep(store.parent)
     try:
-        with _locked(store):  # others who begin with the same data set wait for what this one reads
+        # Others who begin with the same data set wait for what this one reads.
+        with _locked(store, on_event):
             kept = _kept(store)
             cache.touch(store)
             _known.update({key: kept[key] for key in large.values() if key in kept})
@@ -95,7 +96,7 @@ class _Unkept(Exception):
 
 
 @contextlib.contextmanager
-def _locked(store: Path) -> Generator[None]:
+def _locked(store: Path, on_event: OnEvent) -> Generator[None]:
     """Wait until no other process reads the files of this data set for their digests."""
     try:
         files.make_folder(store.parent)
@@ -107,10 +108,25 @@ def _locked(store: Path) -> Generator[None]:
     try:
         with contextlib.suppress(OSError):  # a file system without locks: each reads for itself
             os.utime(lock)
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            _lock(lock, on_event)
         yield
     finally:
         os.close(lock)
+
+
+def _lock(lock: int, on_event: OnEvent) -> None:
+    """Take a lock, and tell of it where another process has it, which may take minutes.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        waits = "checksums (waits for another process that reads the data set)"
+        on_event(Progress(waits, 0, 1, "data set"))
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        on_event(Progress(waits, 1, 1, "data set"))
 
 
 def _read(unread: Mapping[Path, tuple[Path, Stamp]], on_event: OnEvent) -> dict[Any, str]:

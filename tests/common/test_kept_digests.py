@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -210,6 +211,28 @@ def test_of_two_that_begin_at_once_one_reads(
         for each in both:
             each.join()
     assert found == [expected, expected] and len(reads) == len(paths)
+
+
+def test_who_waits_for_another_process_is_told(
+    forget: Forget, reads: list[str], tmp_path: Path
+) -> None:
+    paths = written(tmp_path / "set")
+    kept_digests.of_files(paths, tmp_path / "set")
+    forget()
+    (lock,) = (tmp_path / "cache").rglob("*.lock")
+    other = os.open(lock, os.O_RDWR)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    told: list[tuple[str, int]] = []
+
+    def heard(event: Event) -> None:
+        assert isinstance(event, Progress)
+        told.append((event.stage, event.done))
+        if event.done == 0:
+            os.close(other)  # the other process has read all
+
+    kept_digests.of_files(paths, tmp_path / "set", heard)
+    waits = "checksums (waits for another process that reads the data set)"
+    assert told == [(waits, 0), (waits, 1)] and len(reads) == len(paths)
 
 
 class _Forgetful(dict):
