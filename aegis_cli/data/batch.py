@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,16 +49,15 @@ class Normalizer(nn.Module):
     @classmethod
     def fit(cls, rows: Tensor) -> Normalizer:
         """Mean and standard deviation of rows [N, D]."""
-        x = rows.double()
-        return cls.scaled(x.mean(0), deviations(x), _never_varies(x))
+        middle = _by_dimension(rows, torch.mean)
+        return cls.scaled(middle, deviations(rows), _by_dimension(rows, _never_varies))
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
         """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
-        x = rows.double()
-        # NumPy's, since `torch.quantile` refuses more than 2**24 numbers.
-        low, high = torch.from_numpy(np.quantile(x.numpy(), (0.01, 0.99), axis=0))
-        return cls.scaled((low + high) / 2, (high - low) / 2, _never_varies(x))
+        low, high = _by_dimension(rows, _outer_quantiles).unbind(1)
+        still = _by_dimension(rows, _never_varies)
+        return cls.scaled((low + high) / 2, (high - low) / 2, still)
 
     @classmethod
     def scaled(cls, middle: Tensor, scale: Tensor, still: Tensor | None = None) -> Normalizer:
@@ -84,22 +83,40 @@ class Normalizer(nn.Module):
 
 
 def deviations(rows: Tensor) -> Tensor:
-    """Standard deviations [D] float64 of rows [N, D]; 0 of a dimension that never varies.
+    """Standard deviations [D] float64 of rows [N, D]; 0 of a dimension that never varies."""
+    return _by_dimension(rows, _deviation)
+
+
+def _by_dimension(rows: Tensor, measure: Callable[[Tensor], Tensor]) -> Tensor:
+    """What a function of a column [N] float64 gives of each column of rows [N, D], stacked.
+
+    One column at a time: float64 copies of millions of rows would take gigabytes.
+    """
+    return torch.stack([measure(column.double()) for column in rows.unbind(1)])
+
+
+def _deviation(column: Tensor) -> Tensor:
+    """The standard deviation [] of a column [N]; 0 if it never varies.
 
     Two passes in float64: E[x^2] - E[x]^2 would cancel where the mean is large.
     """
-    x = rows.double()
-    spread = (x - x.mean(0)).square().mean(0).sqrt()
-    return torch.where(_never_varies(x), 0.0, spread)
+    spread = (column - column.mean()).square_().mean().sqrt()
+    return torch.where(_never_varies(column), 0.0, spread)
 
 
-def _never_varies(rows: Tensor) -> Tensor:
-    """Which dimensions [D] of rows [N, D] have one value, but for sensor noise.
+def _outer_quantiles(column: Tensor) -> Tensor:
+    """The 1 % and the 99 % quantile [2] of a column [N], interpolated linearly."""
+    # NumPy's, since `torch.quantile` refuses more than 2**24 numbers.
+    return torch.from_numpy(np.quantile(column.numpy(), (0.01, 0.99)))
 
-    Their quantiles do not tell: a gripper that closes in one frame of two hundred has equal ones.
+
+def _never_varies(column: Tensor) -> Tensor:
+    """Whether a column [N] has one value, but for sensor noise.
+
+    Its quantiles do not tell: a gripper that closes in one frame of two hundred has equal ones.
     """
-    low, high = rows.aminmax(dim=0)
-    return high - low <= least_spread(rows.mean(0))
+    low, high = column.aminmax()
+    return high - low <= least_spread(column.mean())
 
 
 @dataclass(frozen=True)
