@@ -56,8 +56,8 @@ def run(
 ) -> InspectReport | StreamInspection | QuestionsReport:
     """Recognise `path`: an embedded model's name, an artifact file, a run, a dataset or questions.
 
-    A dataset on the hub goes by its id, and only its meta folder is downloaded. A split of
-    questions follows a #.
+    What is on the hub goes by its id. Of a LeRobot dataset only the meta folder is downloaded, of
+    questions the split that is read, which may follow a #.
 
     Only an artifact's header is read, unless figures need the tensors. It is done at once, so
     `on_event` is called for images alone.
@@ -88,11 +88,20 @@ def run(
 
 
 def is_questions(path: Path) -> bool:
-    """Whether a path is a file or folder of questions, or easy-VQA's name; of a hub's set not."""
+    """Whether a path is a file or folder of questions, easy-VQA's name, or a set on the hub.
+
+    Raises:
+        AegisError: what has the form of an id on the hub, and is not there.
+    """
     if path.is_dir():
         from aegis_cli.inspection import folders
 
         return folders.is_questions(path)
+    if not path.exists() and not hub.is_local(str(path)):
+        from aegis_cli.data.lerobot import download
+
+        # Whatever is no LeRobot dataset is read as questions, or refused as such.
+        return not download.is_dataset(str(path))
     if path.exists() and path.suffix not in file.OF_QUESTIONS:  # told without torch
         return False
     from aegis_cli.data.vqa import summary

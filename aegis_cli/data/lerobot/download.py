@@ -17,6 +17,26 @@ _META, _ROWS = "meta/*", "data/*"
 _MOST_NAMED = 1000  # files that are asked for one by one; the hub's client compares each with all
 
 
+def is_dataset(name: str) -> bool:
+    """Whether a repository on the hub is a LeRobot dataset, whose meta folder is then here.
+
+    Raises:
+        AegisError: it is neither in the cache nor to be had.
+    """
+    _require_hub(name)
+    return layout.is_dataset(_snapshot(name, (_META,)))
+
+
+def _require_hub(name: str) -> None:
+    """Raise AegisError if there is no package that asks the hub."""
+    if not hub.is_installed():
+        raise AegisError(
+            f"no file or folder '{name}', and no package 'huggingface_hub' to ask the hub for it",
+            "a local dataset, or the package that downloads one",
+            "check the path, or pip install 'aegis-vla[hub,lerobot]'",
+        )
+
+
 def meta(name: str) -> Path:
     """The local folder of a dataset on the hub, of which the meta folder is there.
 
@@ -25,12 +45,7 @@ def meta(name: str) -> Path:
     Raises:
         AegisError: neither in the cache nor to be had, or no LeRobot dataset that Aegis reads.
     """
-    if not hub.is_installed():
-        raise AegisError(
-            f"no file or folder '{name}', and no package 'huggingface_hub' to ask the hub for it",
-            "a local dataset, or the package that downloads one",
-            "check the path, or pip install 'aegis-vla[hub,lerobot]'",
-        )
+    _require_hub(name)
     layout.require_pyarrow()
     folder = _snapshot(name, (_META,))
     if not layout.is_dataset(folder):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aegis_cli.common import files, media
+from aegis_cli.common import files, hub, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.data.vqa import easy, sets
@@ -89,13 +89,17 @@ class QuestionsReport:
 def is_set(name: str) -> bool:
     """Whether a name is that of easy-VQA, or of a file or folder of questions.
 
-    A split may follow it after a #. Sets on the hub are not looked for.
+    A split may follow it after a #, and so it may a name that has the form of one on the hub.
+    Others on the hub are not looked for.
     """
     if name == easy.NAME:
         return True
     path = Path(name)
     if not path.exists() and "#" in name:
-        path = Path(name.rpartition("#")[0])
+        own = name.rpartition("#")[0]
+        path = Path(own)
+        if not path.exists() and not hub.is_local(own):
+            return True
     return sets.is_file(path) or (path.is_dir() and sets.is_folder(path))
 
 
@@ -197,6 +201,8 @@ def _read(name: str) -> sets.Listed:
         found = sets.read(name, skip_bad=True)
     except AegisError as error:
         known = "aegis inspect takes .jsonl and .parquet files, and lists in .json, for questions"
+        if not Path(name).exists() and hub.is_id(name):
+            known += ", and a repository with meta/info.json at its top for a LeRobot dataset"
         raise AegisError(error.found, error.expected, f"{error.fix}; {known}") from error
     if not isinstance(found, sets.Listed):
         raise AegisError(f"'{name}', which is rendered", "questions of files", "aegis probe MODEL")

@@ -16,6 +16,7 @@ from samples.vqa_files import hub_rows
 
 from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
+from aegis_cli.data.lerobot import download as lerobot
 from aegis_cli.data.vqa import download, sets
 
 Bad = Callable[..., str]
@@ -35,6 +36,7 @@ def hosted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DatasetHub:
     monkeypatch.setattr("huggingface_hub.snapshot_download", found.snapshot)
     monkeypatch.setattr("huggingface_hub.list_repo_files", found.files)
     download.fetch.cache_clear()
+    lerobot._snapshot.cache_clear()
     return found
 
 
@@ -72,6 +74,26 @@ def test_a_probe_takes_its_id(aegis: Any, hosted: DatasetHub, place: Path) -> No
     code, out, err = aegis("probe", "embedded", "--vqa", name, "--questions", 4, "--json")
     assert code == 0, err
     assert json.loads(out)["questions"] == 4
+
+
+def test_it_is_inspected_by_its_id(aegis: Any, hosted: DatasetHub, tmp_path: Path) -> None:
+    """By a split, or the only one there is; one of LeRobot's is told by its meta folder."""
+    code, out, err = aegis("inspect", f"{NAME}#validation", "--plot", tmp_path / "sheet.png")
+    assert code == 0 and (tmp_path / "sheet.png").is_file(), err
+    code, _, err = aegis("inspect", NAME)
+    assert code == 2 and f"2 splits in '{NAME}'" in err
+    next(hosted.repository.rglob("train-*")).unlink()
+    download.fetch.cache_clear()
+    code, out, err = aegis("inspect", NAME, "--verify", "--json")
+    assert code == 0, err
+    told = json.loads(out)
+    assert (told["kind"], told["path"], told["questions"]) == ("questions", NAME, 6)
+
+
+def test_what_is_neither_is_refused_by_inspect(hosted: DatasetHub, bad: Bad) -> None:
+    shutil.rmtree(hosted.repository / "data")
+    says = ("no parquet file at the top", "a repository with meta/info.json at its top")
+    bad("inspect", NAME, says=says)
 
 
 def test_several_splits_are_refused_before_any_is_downloaded(hosted: DatasetHub, bad: Bad) -> None:
