@@ -854,8 +854,8 @@ def inspect(
         Path,
         Argument(
             metavar="PATH",
-            help="A recipe, an artifact, a model (also 'embedded'), the folder of a run, checkpoint "
-            "or study, a LeRobot dataset or a set of questions, also by its id on the hub.",
+            help="A recipe, artifact, model (also 'embedded'), the folder of a run, checkpoint or "
+            "study, a LeRobot dataset or a set of questions, also by its id on the hub.",
         ),
     ],
     plot: Annotated[
