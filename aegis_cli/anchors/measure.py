@@ -29,7 +29,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
 
 # The least with which docs/results/ablations.md found `aegis`, which reads moments alone, and
-# `nullspace`, which reads directions, to keep about as much as with 3,000 samples. `kfac` lost more.
+# `nullspace`, which reads directions, to keep about as much as with 3,000 samples; `kfac` lost more.
 FEWEST_FOR_MOMENTS, FEWEST = 30, 300
 
 
