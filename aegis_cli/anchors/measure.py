@@ -28,8 +28,8 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
 
-# The least with which docs/results/ablations.md found `aegis`, which reads moments alone, and
-# `nullspace`, which reads directions, to keep about as much as with 3,000 samples; `kfac` lost more.
+# The fewest with which `aegis`, which reads moments alone, and `nullspace`, which reads directions,
+# kept about as much as with 3,000 samples (docs/results/ablations.md). `kfac` lost more with 300.
 FEWEST_FOR_MOMENTS, FEWEST = 30, 300
 
 
