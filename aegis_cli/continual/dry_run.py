@@ -1,6 +1,6 @@
-"""`aegis train --dry-run` of robot tasks: what a stream needs, by steps of its first and last task.
+"""`aegis train --dry-run` of robot tasks: measures a stream by steps of its first and last task.
 
-The last task is as large as it can be: of every task before it all experts are there.
+The last task is as large as it can get: it assumes that every earlier task kept all its experts.
 """
 
 from __future__ import annotations
@@ -44,28 +44,29 @@ _STAGE = "dry run"
 
 @dataclass(frozen=True)
 class StreamDryRunReport:
-    """What a stream of robot tasks would do.
+    """What training a stream of robot tasks would need.
 
-    Megabytes are estimates, but for those measured. Both are of the task that needs most.
+    Megabytes are estimates unless they are called measured. Both refer to the task that needs most.
 
     Attributes:
-        parameters: of backbone and action expert, before the first task.
-        steps: of each task.
-        tasks: by name: `training_frames`, `epochs`, `trainable` (parameters that learn at its
-            beginning), and `step_s`, seconds of a step, which of the tasks between the first and
-            the last is what lies between theirs; None where memory does not suffice.
-        tokens_per_frame: of one frame (of all cameras) with its instruction, of the task that has
-            most.
-        memory_mb: by what takes it.
-        memory_measured_mb: the most that building, these steps and the measuring took, and what
-            writing the state takes more; None where no step was taken.
-        memory_free_mb: where training would run, None if that is not known.
-        memory_fits: by what was measured, else by the estimate.
-        measuring_s: seconds of all that is measured after the last task, by what takes them:
-            `questions`, each `task TASK`, the validation `loss`, and of a learner with experts
-            `routing`, each time that it is looked at; None where memory does not suffice.
-        hours: of what is left of the stream.
-        disk_mb: of the state and of what a finished run keeps; disk_free_mb: where they would be.
+        parameters: parameters of backbone and action expert before the first task.
+        steps: steps of each task.
+        tasks: by name: `training_frames`, `epochs`, `trainable` (parameters that learn when the
+            task begins) and `step_s` (seconds of a step, interpolated for the tasks between the
+            first and the last; None if memory does not suffice).
+        tokens_per_frame: tokens of one frame (all cameras) and its instruction, in the task with
+            the most.
+        memory_mb: estimated memory by component.
+        memory_measured_mb: peak memory of building, these steps and the evaluation, plus the
+            estimate for writing the state; None if no step was taken.
+        memory_free_mb: free memory where training would run; None if that is not known.
+        memory_fits: by the measurement if there is one, else by the estimate.
+        measuring_s: seconds of the evaluation after the last task, by component: `questions`, each
+            `task TASK`, the validation `loss`, and for a learner with experts `routing` (each time
+            the routers are measured); None if memory does not suffice.
+        hours: hours of the rest of the stream.
+        disk_mb: disk space of the state and of the files of a finished run; disk_free_mb: free
+            space where they would be.
     """
 
     method: str
@@ -91,7 +92,7 @@ class StreamDryRunReport:
 
     @property
     def memory_needed_mb(self) -> float:
-        """What was measured, else the estimate."""
+        """The measured memory if there is one, else the estimate."""
         measured = self.memory_measured_mb
         return self.memory_total_mb if measured is None else measured
 
@@ -116,7 +117,7 @@ def run(
     out, device = Path(out), devices.pick()
     folder.check(out, recipe, resume, overwrite, train.read_by(recipe))
     recipe = _recorded(recipe, out)
-    # Before this process itself takes some.
+    # Measured before this process allocates any.
     free, base = memory.free(device), memory.restart_peak(device)
     with loading_told(_STAGE, on_event):
         stream = robots.build(recipe, out, on_event)
@@ -131,10 +132,10 @@ def run(
     if fits is not False:
         taking = partial(_measured, begun, frames, found, free, on_event)
         measured = where_it_fits(taking, ALONE)
-        fits = False  # unless what was taken shows that it does
+        fits = False  # unless the measurement shows that it does
     most = max(found, key=lambda one: one.needed)
     if measured is not None:
-        # Nothing was written: that share is still the estimate's.
+        # The dry run writes no state, so that part stays an estimate.
         needed = memory.peak(device) - base + most.parts["state"]
         fits = fits_in(needed, free, device, ALONE)
         measured = measured._replace(needed=needed)
@@ -142,10 +143,10 @@ def run(
 
 
 def shortage(report: StreamDryRunReport) -> str | None:
-    """What does not fit, on one line, and what to do about it; None where everything does."""
+    """What does not fit and what to do about it, on one line; None if everything fits."""
     missing = []
     if report.memory_fits is False:
-        assert report.memory_free_mb is not None  # else nobody knows whether it fits
+        assert report.memory_free_mb is not None  # otherwise memory_fits would be None
         smaller = "use a smaller backbone"
         if report.memory_needed_mb - report.memory_mb["activations"] < report.memory_free_mb:
             smaller = "take a step in more passes: set train.accumulate"
@@ -159,7 +160,7 @@ def shortage(report: StreamDryRunReport) -> str | None:
 
 
 def _recorded(recipe: RobotStreamRecipe, out: Path) -> RobotStreamRecipe:
-    """The recipe with the demonstrations that are recorded already as its own.
+    """The recipe with the demonstrations that are already recorded filled in.
 
     Raises:
         AegisError: there are none yet.
@@ -194,7 +195,7 @@ def _left(stream: RobotStreamRun, overwrite: bool) -> list[int]:
 
 
 def _frames_of_a_pass(stream: RobotStreamRun) -> int:
-    """The most frames that pass at once: of a step, or where routers are looked at, of that."""
+    """The most frames in one forward pass, of a training step or of measuring the routers."""
     settings = stream.recipe.train
     frames = -(-settings.batch_size // settings.accumulate)  # rounded up
     looked_at = robots.CALIBRATION_FRAMES
@@ -206,7 +207,7 @@ def _frames_of_a_pass(stream: RobotStreamRun) -> int:
 
 
 class _Begun(NamedTuple):
-    """A task that has begun, and what learns then."""
+    """A task that has begun, and how many parameters learn in it."""
 
     stream: RobotStreamRun
     number: int
@@ -215,20 +216,20 @@ class _Begun(NamedTuple):
 
     @classmethod
     def at(cls, stream: RobotStreamRun, number: int) -> _Begun:
-        """The stream at the beginning of the task of that number, after those before it."""
+        """The stream at the beginning of task `number`, after all earlier tasks."""
         stream.current = TaskInProgress(task=number)
         training = loop.prepare(stream, (), None)
         trainable = sum(p.numel() for p in stream.learning().values())
         return cls(stream, number, training, trainable)
 
     def ended(self) -> None:
-        """End the task, with every expert that it has begun with."""
+        """End the task and keep every expert that it began with."""
         self.stream.learner.finish(self.training.context, {})
         self.stream.model.requires_grad_(False).zero_grad()
 
 
 class _Estimated(NamedTuple):
-    """What a task needs at its beginning: bytes by what takes them, and of the files."""
+    """What a task needs when it begins: bytes of memory by component, and bytes of its state."""
 
     trainable: int
     tokens: int
@@ -256,7 +257,7 @@ def _estimated(begun: _Begun, frames: int, on_event: OnEvent) -> _Estimated:
         "activations": activations,
         "state": 0,
     }
-    # It is written between two steps, when what a step takes is free again.
+    # The state is written between two steps, when a step's activations are free again.
     parts["state"] = max(0, WRITTEN_COPIES * largest - activations)
     state_bytes = _bytes(stream.parameters().values()) + moments
     return _Estimated(begun.trainable, tokens, parts, state_bytes)
@@ -266,16 +267,16 @@ def _bytes(tensors: Iterable[torch.Tensor]) -> int:
     return sum(t.nbytes for t in tensors)
 
 
-# --- what is taken --------------------------------------------------------------------------------
+# --- measurements ---------------------------------------------------------------------------------
 
 
 class _Measured(NamedTuple):
-    """What was taken, and how long it took.
+    """Measured times and memory.
 
     Attributes:
-        step_s: of the first task and of the last.
-        looks_s: of one look at the routers; None of a learner without any.
-        needed: bytes at the peak.
+        step_s: seconds of a step in the first and in the last task.
+        looks_s: seconds of measuring the routers once; None for a learner without routers.
+        needed: peak memory in bytes.
     """
 
     step_s: tuple[float, float]
@@ -293,15 +294,15 @@ def _measured(
     free: int | None,
     on_event: OnEvent,
 ) -> _Measured | None:
-    """Take steps of the first task and the last, and what is measured after that.
+    """Time steps of the first and the last task, and the evaluation that follows.
 
     Args:
         begun: the first task.
-        found: gets what each later task needs.
-        free: bytes before anything was built.
+        found: the estimates, to which those of the later tasks are appended.
+        free: free bytes before anything was built.
 
     Returns:
-        None where a later task does not fit by the estimate.
+        The measurements, or None if a later task does not fit by its estimate.
     """
     stream, count = begun.stream, len(begun.stream.names)
     steps = 2 * (1 + min(TIMED_STEPS, stream.recipe.train.steps))
@@ -327,7 +328,7 @@ def _measured(
 
 
 def _steps_s(begun: _Begun, on_event: OnEvent, done: int, total: int) -> float:
-    """Seconds of a step: the mean of some, after one that pays for what is done once."""
+    """Seconds of a step: the mean of a few, after a warm-up step."""
     stream, training = begun.stream, begun.training
     steps = range(min(1 + TIMED_STEPS, stream.recipe.train.steps))
     started = time.perf_counter()
@@ -341,7 +342,7 @@ def _steps_s(begun: _Begun, on_event: OnEvent, done: int, total: int) -> float:
     return (time.perf_counter() - started) / max(1, len(steps) - 1)
 
 
-# --- what is said ---------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def _report(
@@ -391,7 +392,7 @@ def _report(
 
 
 def _between(ends: tuple[float, float], count: int) -> list[float]:
-    """The first, the last, and evenly spaced what lies between them."""
+    """`count` evenly spaced values from the first to the last of `ends`."""
     first, last = ends
     return [first + (last - first) * i / max(1, count - 1) for i in range(count)]
 
@@ -403,7 +404,7 @@ def _measuring_s(names: tuple[str, ...], measured: _Measured) -> dict[str, float
 
 
 def _hours(stream: RobotStreamRun, measured: _Measured, left: list[int]) -> float:
-    """Hours of the steps that are left, and of what is measured after their tasks."""
+    """Hours of the remaining steps and of the evaluation after their tasks."""
     seconds = measured.vqa_s if left[0] == stream.recipe.train.steps else 0.0  # before the first
     looks_s = (measured.looks_s or 0.0) * _looks(stream)
     for number, step_s in enumerate(_between(measured.step_s, len(left))):
@@ -414,7 +415,7 @@ def _hours(stream: RobotStreamRun, measured: _Measured, left: list[int]) -> floa
 
 
 def _looks(stream: RobotStreamRun) -> int:
-    """How often a task's routers are looked at, at most: in its first phase, and at its end."""
+    """How often a task's routers are measured at most, in its first phase and at its end."""
     if stream.learner.identification is None:
         return 1
     options = stream.options
@@ -423,10 +424,10 @@ def _looks(stream: RobotStreamRun) -> int:
 
 
 def _disk(stream: RobotStreamRun, kept: int) -> int:
-    """Bytes at the most: two states while one replaces the other, or one beside a finished run.
+    """Most bytes on disk: two states while one replaces the other, or one and a finished run.
 
     Args:
-        kept: of a state.
+        kept: bytes of a state.
     """
     finished = _bytes(stream.parameters().values())
     if stream.learner.trains == "model":

@@ -21,10 +21,10 @@ from aegis_cli.recipes import RobotStreamRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOpenLoopReport(OpenLoopReport):
-    """How far the predictions of one of a stream's policies are from what was recorded.
+    """How far the predictions of a stream's policy for one task are from the recorded actions.
 
     Attributes:
-        task: whose policy it is.
+        task: the task of the policy.
     """
 
     task: str
@@ -45,13 +45,14 @@ def run(
     """Compare the predictions of one of a stream's policies with demonstrations, frame by frame.
 
     Args:
-        task: which one; None where the stream has a single task.
-        data: demonstrations; None: those that the task was learned from.
-        episodes: numbers from 0; None: the held-out ones of the task, or all of other data.
-        frames, seed, batch_size, traced, rename: as of `open_loop.run`.
+        task: the task of the policy; may be None if the stream has a single task.
+        data: demonstrations; None means those that the task was learned from.
+        episodes: numbers from 0; None means the task's held-out episodes, or all episodes of other
+            data.
+        frames, seed, batch_size, traced, rename: as in `open_loop.run`.
 
     Raises:
-        AegisError: a task that the run has not learned, or what `open_loop.run` finds wrong.
+        AegisError: the run has not learned the task, or `open_loop.run` raises.
     """
     number = robots.number_of(run_path, task)
     recipe = recipes.load(run_path / "recipe.yaml", kind=RobotStreamRecipe)
@@ -87,7 +88,7 @@ def _own(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
 
 
 def _source(stream: RobotStreamRun, number: int, data: Path) -> Source:
-    """What is known of how the task of that number was learned."""
+    """How task `number` was learned."""
     recipe, task, run = stream.recipe, stream.names[number], stream.out
     share, backbone = recipe.train.validation_share, backbones.divided(recipe.backbone)[0]
     read = robot_demos.learned_of(recipe, number, data)
@@ -98,8 +99,8 @@ def _source(stream: RobotStreamRun, number: int, data: Path) -> Source:
 
 
 def _of_other_tasks(stream: RobotStreamRun, number: int, data: Path) -> list[Earlier]:
-    """The other tasks of the stream that have shaped what serves the one of that number."""
-    # What is frozen once a task is learned owes nothing to those after it.
+    """The other tasks of the stream that have shaped the weights that serve task `number`."""
+    # Weights that are frozen after a task do not depend on later tasks.
     frozen = learners.get(stream.recipe.train.method).frozen
     found = []
     for other in range(number if frozen else len(stream.names)):

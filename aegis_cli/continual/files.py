@@ -1,4 +1,4 @@
-"""The files of a finished stream: written, read back, and put to work again."""
+"""The files of a finished stream: writing them, reading them and loading them into a model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from aegis_cli.models.structure import digest
 
 EXPERTS, ROUTING = "experts.safetensors", "routing.safetensors"
 PARAMETERS, REPORT = "parameters.json", "stream.json"
-_NOT_KEPT = ("out", "minutes")  # of a report: they differ from repetition to repetition
+_NOT_KEPT = ("out", "minutes")  # fields of a report that differ between equal runs
 
 
 def is_done(path: Path) -> bool:
@@ -35,7 +35,7 @@ def is_done(path: Path) -> bool:
 
 
 def write(run: AnyStreamRun, report: StreamReport) -> None:
-    """Every file of a finished run; stream.json comes last and says that it is finished."""
+    """Write all files of a finished run; stream.json comes last and marks it as finished."""
     if run.learner.trains == "experts":
         write_tensors(run, report)
     run.save_model()  # after the experts, whose digest a robot's action expert notes
@@ -46,7 +46,7 @@ def write(run: AnyStreamRun, report: StreamReport) -> None:
 
 
 def write_matrix(path: Path, report: StreamReport) -> None:
-    """The matrix of the tasks learned so far, and its figures."""
+    """Write the matrix of the tasks learned so far, and its figures."""
     files.save_json(path / report.file, report.matrix_json())
 
 
@@ -80,7 +80,7 @@ def attach(run: AnyStreamRun) -> None:
     """Put a finished run's experts, routers and Gaussians back beside the bare model.
 
     Raises:
-        AegisError: files that are missing, damaged, or of another encoder.
+        AegisError: files are missing, damaged, or belong to another encoder.
     """
     experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
     routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
@@ -93,7 +93,7 @@ def attach(run: AnyStreamRun) -> None:
     with reading_meta(run.out / EXPERTS):
         state.rebuild(run.sites, experts.header.meta["structure"], experts.tensors)
     parameters = routing.named_parameters(run.sites)
-    # The other tensors of the routers are figures, which the file's kind has checked.
+    # The other tensors in this file are figures. The artifact's kind has checked them.
     learned = {n: t for n, t in routers.tensors.items() if n in parameters}
     tensors = experts.tensors | learned
     check_state(f"'{run.out / EXPERTS}' and '{ROUTING}'", tensors, parameters)
@@ -104,7 +104,7 @@ def attach(run: AnyStreamRun) -> None:
 
 
 def write_tensors(run: AnyStreamRun, report: StreamReport) -> None:
-    """Experts, and routers with what they were measured to do."""
+    """Write the experts, and the routers with the figures measured at them."""
     parameters = {}
     for name, parameter in routing.named_parameters(run.sites).items():
         parameters[name] = parameter.detach().cpu()
@@ -131,9 +131,9 @@ def write_tensors(run: AnyStreamRun, report: StreamReport) -> None:
 
 
 def _figures(run: AnyStreamRun, report: StreamReport) -> dict[str, Tensor]:
-    """The experts' numbers, mean weights and loads, per router.
+    """The experts' numbers, mean weights and loads per router.
 
-    They are as measured when the router's task was last learned.
+    They were measured when the router's task was last learned.
     """
     tensors = {}
     for task, record in enumerate(report.records):
@@ -148,7 +148,7 @@ def _figures(run: AnyStreamRun, report: StreamReport) -> dict[str, Tensor]:
 
 
 def _parameters(report: StreamReport) -> dict[str, Any]:
-    """What learned in each phase and what was added, per task, and the sums."""
+    """Parameters trained in each phase and added, per task and in total."""
     names = ("task", "phase1_steps", "trained_phase1", "trained", "trained_mean", "added")
     sums = ("parameters", "inference_parameters", "trained_phase1", "trained", "trained_mean")
     plain = report.to_json()

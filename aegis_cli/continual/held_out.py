@@ -1,7 +1,7 @@
-"""How well a task is learned that no simulator has: its actions at frames of held-out episodes.
+"""Evaluation of tasks without a simulator: the error of actions at frames of held-out episodes.
 
 The error is that of `aegis evaluate` and `train.validate_actions`, on the same frames after every
-task, and stands in the place of a success.
+task. It takes the place of the success rate.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ class HeldOut:
     """Held-out frames of one task, at which a policy predicts.
 
     Attributes:
-        hold_error: the error of repeating the current position; None where actions are no
-            positions.
+        hold_error: the error of repeating the current position; None if actions are not positions.
     """
 
     def __init__(
@@ -32,11 +31,11 @@ class HeldOut:
         """Choose the frames.
 
         Args:
-            most: how many there are at most, evenly spread.
-            chunk: how many actions are predicted at each.
+            most: the maximum number of frames, evenly spread.
+            chunk: the number of actions predicted at each frame.
 
         Raises:
-            AegisError: actions that never vary, so that no error is relative to anything.
+            AegisError: the actions never vary, so there is no variance to divide errors by.
         """
         std = np.array(demos.action_std)
         if not std.any():
@@ -46,15 +45,16 @@ class HeldOut:
                 "choose the actions by demos.action, or give other demonstrations",
             )
         self._frames = validation_actions.held_out(demos, most, std, batch_size)
-        # Whatever is predicted, the error of the position is the same.
+        # The error of holding the position does not depend on the prediction.
         anything = torch.zeros(len(self._frames.at), chunk, len(std))
         errors = ActionErrors.of(demos, self._frames.at, anything, std)
         self.hold_error = mean(errors.held, errors.valid)
 
     def error(self, policy: Policy, on_event: OnEvent) -> tuple[float, list[float] | None]:
-        """The policy's mean squared error over the variance of the training's actions.
+        """The policy's mean squared error, divided by the variance of the training actions.
 
-        Beside it stands its 95 % interval by Student's t over episodes; None of a single one.
+        Returns:
+            The error, and its 95 % interval by Student's t over episodes (None for one episode).
         """
         found = validation_actions.of_line(self._frames.figures(policy, Ranks(), on_event))
         return found["relative_error"], found["relative_interval"]

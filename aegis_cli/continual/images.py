@@ -1,7 +1,8 @@
 """Streams of classification tasks: a dual encoder learns pictures by the names of their classes.
 
-The tasks are a shipped stream's or image folders. A task is learned by the cross-entropy over its
-own classes, and what is measured is the accuracy on every task, with the task told and inferred.
+The tasks come from a shipped stream or from image folders. A task is learned by the cross-entropy
+over its own classes. The evaluation measures the accuracy on every task, with the task told and
+with the task inferred.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.dual import DualEncoder, class_weights
 from aegis_cli.recipes import VALIDATION, StreamRecipe
 
-# Training images, evenly spaced, on which routers are measured: always the same, so nothing is
-# drawn, and no more than a step has, since they need a gradient too.
+# Number of evenly spaced training images on which routers are measured. They are always the same,
+# so nothing is drawn at random. They need a gradient, so there are no more than in a step.
 CALIBRATION_IMAGES = 64
-EVALUATION_BATCH = 256  # images at a time, where no gradient is needed
-ENCODER = "encoder"  # folder, in the run's, of an encoder that the run has trained
-OWN_ENCODER = "trained encoder"  # that encoder among a report's inputs
+EVALUATION_BATCH = 256  # images at a time when no gradient is needed
+ENCODER = "encoder"  # subfolder of the run folder for an encoder that the run has trained
+OWN_ENCODER = "trained encoder"  # name of that encoder among a report's inputs
 
 
 # --- the run --------------------------------------------------------------------------------------
@@ -54,9 +55,9 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
     Attributes:
         encoder: the dual encoder that learns.
         tasks: the stream's tasks in order.
-        image_set: digest that tells the tasks' images from others.
-        prototypes: mean feature [D] of each task's training images in the bare encoder, of the
-            tasks so far; none for a learner that does not compare them.
+        image_set: digest that identifies the tasks' images.
+        prototypes: mean feature [D] of the training images in the bare encoder, for each task so
+            far; empty for a learner that does not compare them.
     """
 
     encoder: DualEncoder
@@ -85,23 +86,23 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
 
     @cached_property
     def evaluator(self) -> ImageEvaluator:
-        """What measures the run; it keeps what never changes from row to row."""
+        """The evaluator of the run; it caches what never changes from row to row."""
         return ImageEvaluator(self.encoder, self.sites, self.tasks, self.learner)
 
     def before_task(self) -> list[Tensor]:
-        """Prototypes for a learner that compares them, and a Gaussian of the task's early looks.
+        """Prototypes for a learner that compares them, and a Gaussian of the task's early features.
 
-        A learner with one state for all tasks need not tell the task from others.
+        A learner with one state for all tasks does not have to infer the task.
         """
         task = self.current.task
         if self.learner.compares:
-            # A resumed run begins with the first: prototypes are not in its state, but the bare
+            # A resumed run starts from the first task. Its state holds no prototypes, but the bare
             # encoder gives the same ones again.
             for i in range(len(self.prototypes), task + 1):
                 features = self.evaluator.bare(self.tasks[i].train)  # [N, D]
                 mean = features.double().mean(0)
                 self.prototypes.append(mean.float().cpu())
-        # A task that goes on has its Gaussian in the state.
+        # For a resumed task, the Gaussian is in the state.
         if not self.learner.shared and len(self.gaussians) == task:
             settings = self.recipe.inference
             looks = self.evaluator.looks(self.tasks[task].train)
@@ -121,7 +122,7 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
         assert isinstance(before, ImageStreamReport)
         count = len(self.tasks)
         oracle, inferred = list(before.oracle), list(before.inferred)
-        # Unless what serves a learned task is frozen, the weights after earlier tasks are gone.
+        # If a learner does not freeze a learned task's weights, those of earlier rows are gone.
         rows = range(count) if self.learner.frozen else [count - 1]
         for done, t in enumerate(rows, 1):
             told, guessed = self.evaluator.row(t, self.gaussians[: t + 1])
@@ -152,7 +153,7 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
         )
 
     def measured_with(self) -> dict[str, str]:
-        """Digests of the inputs, and of an encoder that the run has trained, as it ends."""
+        """Digests of the inputs, and of the final encoder if the run has trained it."""
         trained = self.learner.trains == "model"
         own = {OWN_ENCODER: self.encoder.fingerprint()} if trained else {}
         return {**self.inputs, **own}
@@ -163,7 +164,7 @@ class ImageStreamRun(StreamRun[StreamRecipe]):
 
 
 def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageStreamRun:
-    """Encoder, tasks and learner; experts can be put beside the encoder's maps, and none are yet.
+    """Build encoder, tasks and learner; the encoder's maps can have experts, but have none yet.
 
     Raises:
         AegisError: no such encoder, stream or task, or names that the text tower cannot read.
@@ -171,7 +172,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
     learner = learners.get(recipe.train.method)
     model = encoder(recipe.encoder).to(devices.pick()).eval()
     found = tasks(recipe, model.image_size, on_event)
-    if recipe.split == VALIDATION:  # for choices, which must not see the test parts
+    if recipe.split == VALIDATION:  # settings must be chosen without the test parts
         found = on_validation(found)
     fingerprint = model.fingerprint()  # of the bare encoder, before anything stands beside its maps
     model.requires_grad_(False)
@@ -191,7 +192,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
 
 
 def _check_words(model: DualEncoder, task: StreamTask, path: str | None) -> None:
-    """Raise AegisError for a task that the text tower cannot read, and say where its words lie."""
+    """Raise AegisError if the text tower cannot read a task's words, and say where they are."""
     try:
         class_weights(model, task.classes, task.templates)
     except AegisError as error:
@@ -207,20 +208,20 @@ def _check_words(model: DualEncoder, task: StreamTask, path: str | None) -> None
 def load(
     recipe: StreamRecipe, path: Path, before: StreamReport, on_event: OnEvent = ignore
 ) -> ImageStreamRun:
-    """A finished run as it is at its end, to be measured again.
+    """Load a finished run in its final state, to measure it again.
 
     Args:
         before: the run's report.
 
     Raises:
-        AegisError: files that are missing or damaged, or other images, words or encoder than the
-            run was measured with.
+        AegisError: files are missing or damaged, or the images, words or encoder are not those
+            that the run was measured with.
     """
     if (path / ENCODER).is_dir():
         recipe = dataclasses.replace(recipe, encoder=str(path / ENCODER))
     run = build(recipe, path, on_event)
     now = run.measured_with()
-    # a run that trained its encoder no longer needs the one that it began with
+    # A run that trained its encoder no longer needs the one that it started from.
     needed = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
     if changed := [name for name in needed if before.inputs.get(name) != now[name]]:
         raise AegisError(
@@ -233,14 +234,14 @@ def load(
     return run
 
 
-# --- what a stream is made of ---------------------------------------------------------------------
+# --- encoder and tasks ----------------------------------------------------------------------------
 
 
 def encoder(name: str) -> DualEncoder:
     """A dual encoder by name or folder.
 
     Raises:
-        AegisError: there is none.
+        AegisError: there is no such encoder.
     """
     return backbones.load_dual(name)
 
@@ -250,7 +251,7 @@ def tasks(
 ) -> tuple[StreamTask, ...]:
     """The recipe's tasks in its order.
 
-    Images that are made are kept with the other caches; those of folders stay there.
+    Generated images are kept with the other caches; those of folders stay where they are.
 
     Raises:
         AegisError: no such stream or task, or images that cannot be read or made.
@@ -262,7 +263,7 @@ def tasks(
 
 
 def image_set(recipe: StreamRecipe) -> str:
-    """Digest that tells whether images and words are those of before, wherever they lie.
+    """Digest of images and words, which does not depend on where they are stored.
 
     Raises:
         AegisError: no such stream or task, or files that cannot be read.
@@ -278,7 +279,7 @@ def _contents(recipe: StreamRecipe, root: Path) -> dict[str, dict[str, Any]]:
 
 
 def _checked_image_set(recipe: StreamRecipe, on_event: OnEvent) -> str:
-    """The same digest, with a warning of images of folders that are not held out in truth."""
+    """The same digest; warns of images in folders that are not really held out."""
     if recipe.path is None:
         return image_set(recipe)
     used = _contents(recipe, Path(recipe.path))
@@ -287,7 +288,7 @@ def _checked_image_set(recipe: StreamRecipe, on_event: OnEvent) -> str:
 
 
 def _warn_of_shared(root: Path, used: Mapping[str, Mapping[str, Any]], on_event: OnEvent) -> None:
-    """Warn of held-out images that are, byte for byte, also in a part that comes before."""
+    """Warn of held-out images that are byte for byte also in an earlier part."""
     pairs: list[tuple[Path, Path]] = []
     total = 0
     for name, contents in used.items():
@@ -305,7 +306,7 @@ def _warn_of_shared(root: Path, used: Mapping[str, Mapping[str, Any]], on_event:
 
 
 def _folder_tasks(root: Path, recipe: StreamRecipe, image_size: int) -> Iterator[StreamTask]:
-    # Only a published stream's tasks have templates of their own; others could bear their names.
+    # Only tasks of a published stream have their own templates; other tasks may share a name.
     known = mtil.STREAMS.get(recipe.stream, ())
     for name in _folder_names(recipe):
         template = mtil.TEMPLATES.get(name, folders.TEMPLATE) if known else folders.TEMPLATE
@@ -329,7 +330,7 @@ def on_validation(found: Sequence[StreamTask]) -> tuple[StreamTask, ...]:
 
 
 def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[StreamTask, ...]:
-    """The tasks that `order` names, as it has them; None: all, as they are."""
+    """The tasks that `order` names, in that order; None means all tasks, unchanged."""
     if order is None:
         return tuple(found)
     named = {task.name: task for task in found}
@@ -339,11 +340,11 @@ def ordered(found: Sequence[StreamTask], order: Sequence[str] | None) -> tuple[S
     return tuple(named[name] for name in order)
 
 
-# --- what a task is learned by --------------------------------------------------------------------
+# --- the training objective -----------------------------------------------------------------------
 
 
 class ClassificationLoss:
-    """Cross-entropy over a task's own classes, whose names stand in the first template."""
+    """Cross-entropy over a task's own classes, whose names are put into the first template."""
 
     passes = calibration_passes = 1
 
@@ -351,7 +352,7 @@ class ClassificationLoss:
         self.name, self.size = task.name, len(task.train)
         self._task, self._encoder, self._smoothing = task, encoder, label_smoothing
         self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_IMAGES))
-        # the classes' features [C, D], as long as nothing that learns acts on them
+        # The classes' features [C, D], cached while no trainable parameter affects them.
         self._texts: Tensor | None = None
 
     def fetch(self, rows: Tensor, step: int | None = None) -> tuple[Tensor, Tensor]:
@@ -362,7 +363,7 @@ class ClassificationLoss:
         return self._loss(batch, self._class_features)
 
     def calibration_loss(self, share: Share = WHOLE) -> Tensor:
-        # Without the kept features: the text tower's routers are measured on this pass too.
+        # No cached features here: this pass also measures the text tower's routers.
         return self._loss(self._calibration, self._class_weights)
 
     def trainable_changed(self) -> None:
@@ -380,7 +381,7 @@ class ClassificationLoss:
         if self._texts is not None:
             return self._texts
         found = self._class_weights()
-        # Where gradients are off, nothing would ask for one, whatever learns.
+        # With gradients disabled, `requires_grad` is False even if the text tower learns.
         if not found.requires_grad and torch.is_grad_enabled():
             self._texts = found
         return found
@@ -389,16 +390,16 @@ class ClassificationLoss:
         return class_weights(self._encoder, self._task.classes, self._task.templates[:1])
 
 
-# --- what is measured -----------------------------------------------------------------------------
+# --- evaluation -----------------------------------------------------------------------------------
 
 
 class ImageEvaluator:
     """Predictions of one encoder.
 
-    What the bare encoder says of an image never changes, and is computed once. So are the answers
-    of a learned task whose learner freezes what serves it, until the last row, which is computed
-    anew. A learner that trains the model itself leaves no bare encoder: a router of None stands for
-    the current weights then, and nothing is kept.
+    The bare encoder's predictions never change and are computed once. If the learner freezes the
+    weights of learned tasks, their answers are also cached until the last row, which is computed
+    anew. A learner that trains the model itself leaves no bare encoder. The router None then
+    stands for the current weights, and nothing is cached.
     """
 
     def __init__(
@@ -411,13 +412,13 @@ class ImageEvaluator:
 
     @torch.inference_mode()
     def row(self, done: int, gaussians: Sequence[Gaussian]) -> tuple[list[float], list[float]]:
-        """R[t, :] after tasks 0 to t = `done`: the task told, and inferred.
+        """R[t, :] after tasks 0 to t = `done`, with the task told and with the task inferred.
 
-        A task that has not come yet is served, told or not told, by what there is: the bare
-        encoder, or where one state serves all, that. Inferring chooses among the tasks so far and
-        the bare encoder, image by image; the classes to choose among are the task's own in both.
+        A task that has not come yet is served by the bare encoder, or by the single state of a
+        learner that has one for all tasks. Inference chooses among the tasks so far and the bare
+        encoder for each image. In both cases an image is classified among its own task's classes.
         """
-        if done == len(self.tasks) - 1:  # so that forgetting at the end is measured, not assumed
+        if done == len(self.tasks) - 1:  # measure the final forgetting instead of assuming it
             self._known = {key: answers for key, answers in self._known.items() if key[1] is None}
         told, inferred = [], []
         for i, task in enumerate(self.tasks):
@@ -436,9 +437,9 @@ class ImageEvaluator:
         return self._features(part, None, torch.arange(len(part)))
 
     def looks(self, part: Part) -> Tensor:
-        """What the bare encoder's image tower makes of a part's images early on [N, W], on the CPU.
+        """Early features [N, W] of a part's images in the bare encoder's image tower, on the CPU.
 
-        Tasks are told from each other by it.
+        The task is inferred from them.
         """
         return self._read(self.encoder.looks, part, None, torch.arange(len(part))).cpu()
 
@@ -456,12 +457,12 @@ class ImageEvaluator:
         return self._bare[i]
 
     def _state(self, i: int, done: int) -> int | None:
-        """The router that serves task i after task `done`, if one does."""
+        """The router that serves task i after task `done`, or None."""
         known = self.learner.shared or i <= done
         return self.learner.router(i) if known and self.learner.trains == "experts" else None
 
     def _answers(self, i: int, router: int | None) -> Tensor:
-        """Classes [N] that all test images of a task are given."""
+        """Predicted classes [N] of all test images of a task."""
         if (i, router) in self._known:
             return self._known[i, router]
         if router is None:
@@ -469,18 +470,18 @@ class ImageEvaluator:
         else:
             features = self._features(self.tasks[i].test, router, None)
         answers = self._classify(i, router, features)
-        # Kept only where nothing that is learned later can change them.
+        # Cached only if nothing that is learned later can change them.
         if self.learner.frozen or (router is None and self.learner.trains != "model"):
             self._known[i, router] = answers
         return answers
 
     def _inferred(self, i: int, own: int | None, answers: Tensor, chosen: Tensor) -> Tensor:
-        """Classes [N] where each image goes through the router that was `chosen` [N] for it."""
+        """Predicted classes [N] if each image uses the router of its `chosen` [N] task."""
         mixed = torch.empty_like(answers)
         for task in chosen.unique().tolist():
             rows = (chosen == task).nonzero().flatten()
             router = None if task == NONE else self.learner.router(task)
-            if router == own:  # what the answers came from already
+            if router == own:  # the answers come from this router already
                 mixed[rows] = answers[rows]
             elif router is None:
                 mixed[rows] = self._answers(i, None)[rows]
@@ -490,7 +491,7 @@ class ImageEvaluator:
         return mixed
 
     def _features(self, part: Part, router: int | None, rows: Tensor | None) -> Tensor:
-        """Features [N, D] of a part's images, or of those with the numbers `rows` [N]."""
+        """Features [N, D] of a part's images, or only of those in `rows` [N]."""
         chosen = torch.arange(len(part)) if rows is None else rows
         return self._read(self.encoder.image_features, part, router, chosen)
 

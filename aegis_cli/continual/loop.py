@@ -1,4 +1,4 @@
-"""One task of a stream: the loop over its steps, the end of its first phase, and its own end."""
+"""One task of a stream: the loop over its steps, the end of its first phase and of the task."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from aegis_cli.data.batch import Share
 from aegis_cli.training import folder
 from aegis_cli.training.schedule import BatchOrder, warmup_then_decay
 
-# what flows where the task has no router, since no loss reads the map
+# the flow of a map at which the task has no router, since no loss reads the map
 NOTHING = Flow(torch.empty(0), torch.empty(0))
 
 
@@ -33,12 +33,12 @@ class TaskTraining:
     """A task while it is being learned.
 
     Attributes:
-        context: what the learner is told of it.
+        context: the task as the learner sees it.
         objective: its examples and its loss.
-        order: which examples a step sees.
-        optimizer: over what learns; None where nothing does.
-        slower: what to do if it diverges.
-        constraint: what holds the last phase in a subspace.
+        order: which examples each step trains on.
+        optimizer: optimizer of the trainable parameters; None if there are none.
+        slower: advice for the user if training diverges.
+        constraint: keeps the last phase in a subspace, if set.
     """
 
     context: TaskContext
@@ -59,16 +59,15 @@ def learn(
     optimizer: torch.optim.Optimizer | None,
     on_event: OnEvent,
 ) -> TaskRecord:
-    """Train the task at `run.current` from its step on; everything is frozen afterwards.
+    """Train the task `run.current` from its current step on, then freeze everything.
 
     Args:
-        prototypes: mean feature of each task so far in the bare encoder, this one's last.
-        optimizer: of a task that has begun before.
+        prototypes: mean feature of each task so far in the bare encoder, this task's last.
+        optimizer: the optimizer if the task has already begun.
 
     Raises:
-        Diverged: a loss or gradient that is not finite; the state on disk is of the last good
-            checkpoint.
-        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
+        Diverged: a loss or gradient is not finite; the state on disk is the last good checkpoint.
+        KeyboardInterrupt: a signal arrived, and the steps up to it are saved.
     """
     current, settings = run.current, run.recipe.train
     training = prepare(run, prototypes, optimizer)
@@ -90,8 +89,8 @@ def learn(
             if current.step % settings.log_every == 0 or current.step == steps:
                 _log(run, time.perf_counter() - started)
                 started = time.perf_counter()
-            # after the last step the state waits for the evaluation, so that a run goes on either
-            # before a task's end or after it, and nowhere in between
+            # After the last step the state is saved only once the task has been evaluated, so a
+            # run resumes either before a task's end or after it, never in between.
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
                 state.save(run, training.optimizer)
             on_event(Progress(stage, current.step, steps, "steps", {"loss": loss}))
@@ -107,16 +106,16 @@ def learn(
 def prepare(
     run: AnyStreamRun, prototypes: Sequence[Tensor], optimizer: torch.optim.Optimizer | None
 ) -> TaskTraining:
-    """Let the learner begin the task, unless it has done so before the run was interrupted."""
+    """Let the learner begin the task, unless it did so before the run was interrupted."""
     current, objective = run.current, run.objective(run.current.task)
-    # What is drawn follows from seed and task alone, so that a resumed run draws it again.
+    # Random draws depend only on seed and task, so a resumed run repeats them.
     generator = torch.Generator().manual_seed(run.recipe.seed * 1_000_003 + current.task)
     means = torch.stack(list(prototypes)) if prototypes else torch.empty(0)
     sites = run.growing(current.task)
     context = TaskContext(
         current.task, len(run.names), run.model, sites, run.options, means, generator
     )
-    # In a task that goes on, the state has brought back what its beginning made.
+    # In a resumed task, the state has restored what `begin` created.
     if current.step == 0:
         run.learner.begin(context)
         run.task_begun()
@@ -150,7 +149,7 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     """Take one step, and return the task's own loss before it.
 
     Raises:
-        Diverged: the loss or the gradient is not finite; nothing has moved then.
+        Diverged: the loss or the gradient is not finite; no parameter has changed then.
     """
     settings, current, optimizer = run.recipe.train, run.current, training.optimizer
     assert optimizer is not None
@@ -169,12 +168,11 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
             else:
                 with traced(run.sites) as traces:
                     loss = training.objective.loss(batch, step, share)
-                # A pass charges its own positions, by its frames' share of the price.
+                # Each pass pays the penalty of its own positions, weighted by its share of frames.
                 rows = share.rows(settings.batch_size)
                 paid = (rows.stop - rows.start) / settings.batch_size
                 total = loss + identification.penalty(training.context, traces, paid)
-        # Outside autocast, as PyTorch advises: the way back is in the types of the way there
-        # anyway.
+        # Outside autocast, as PyTorch advises: backward uses the dtypes of forward anyway.
         total.backward()
         losses.append(loss.detach())
     loss = torch.stack(losses).sum()
@@ -185,7 +183,7 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     figures = {"loss": loss.item(), "gradient norm": norm.item()}
     where = f"at step {step + 1} of task '{training.objective.name}'"
     check_finite(figures, where, training.slower, step)
-    # After the clipping: to project a gradient never makes it longer.
+    # After clipping, because a projection never makes a gradient longer.
     if training.constraint is not None:
         training.constraint.gradient()
     optimizer.step()
@@ -195,7 +193,7 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
 
 
 def _log(run: AnyStreamRun, seconds: float) -> None:
-    """Write a line of metrics, of the steps since the last one."""
+    """Write a line of metrics for the steps since the last line."""
     current = run.current
     line = {
         "task": current.task,
@@ -212,25 +210,25 @@ def _log(run: AnyStreamRun, seconds: float) -> None:
 
 
 def _watch(run: AnyStreamRun, training: TaskTraining) -> None:
-    """End phase 1 when the routers stand still at a check, or its share of the steps is over."""
+    """End phase 1 once the routers have converged, or its share of the steps is used up."""
     current, options = run.current, run.options
     limit = max(1, round(options["identify"] * run.recipe.train.steps))
     check = current.step % options["check_every"] == 0
-    # To measure takes a pass over the calibration examples, so it is done only where it counts.
+    # Measuring takes a pass over the calibration examples, so it is done only when needed.
     if not check and current.step < limit:
         return
     flows = measure(run, training)
     masses = {name: found.mass.tolist() for name, found in flows.items()}
     if check:
         still = _moved(current.masses, masses) < options["tolerance"]
-        current.quiet = current.quiet + 1 if still else 0  # checks on end, so it begins anew
+        current.quiet = current.quiet + 1 if still else 0  # counts consecutive checks
         current.masses = masses
     if current.quiet >= options["checks"] or current.step >= limit:
         _settle(run, training, flows)
 
 
 def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> float:
-    """Mean over maps of the total variation since the last check; infinite at the first."""
+    """Mean over maps of the total variation since the last check; infinite at the first check."""
     if not before:
         return math.inf
     distances = []
@@ -240,9 +238,10 @@ def _moved(before: dict[str, list[float]], after: dict[str, list[float]]) -> flo
 
 
 def _settle(run: AnyStreamRun, training: TaskTraining, flows: Flows) -> None:
-    """Fix the structure and note which experts left.
+    """Fix the structure and record which experts were removed.
 
-    What still learns keeps its moments in the optimizer, as in a learner with one phase.
+    Parameters that go on learning keep their moments in the optimizer, as in a learner with one
+    phase.
     """
     current = run.current
     before = {name: _used(run, name) for name in run.sites}
@@ -251,13 +250,13 @@ def _settle(run: AnyStreamRun, training: TaskTraining, flows: Flows) -> None:
     identification.settle(training.context, flows)
     for name, site in run.sites.items():
         gone = [n for n in before[name] if n not in _used(run, name)]
-        # What an earlier task's router uses is still there; the rest is deleted for good.
+        # Experts that an earlier task's router uses still exist; the others are deleted for good.
         current.dropped[name] = [n for n in gone if n in site.numbers]
         current.pruned[name] = [n for n in gone if n not in site.numbers]
     current.phase, current.phase1_steps = 2, current.step
     current.quiet, current.masses = 0, {}
     training.objective.trainable_changed()
-    # Over what still learns: experts are gone, and routers may be fixed.
+    # A new optimizer, because experts are gone and routers may be frozen.
     training.optimizer = state.optimizer(run, before=training.optimizer)
     training.constraint = run.learner.constrain(training.context)
 
@@ -269,7 +268,7 @@ def _used(run: AnyStreamRun, site: str) -> tuple[int, ...]:
 
 
 def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
-    """What flows where in each map that the task has a router in, on its calibration examples."""
+    """The flow in each map that has a router of the task, on its calibration examples."""
     task = run.learner.router(run.current.task)
     activate(run.sites, task)
     run.model.eval()
@@ -281,7 +280,7 @@ def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
     passes: dict[str, list[Traced]] = {name: [] for name in used}
     count = training.objective.calibration_passes
     for share in (Share(number, count) for number in range(count)):
-        # With its graph: `where_read` goes back from the loss to find the positions that it reads.
+        # Keeps the graph: `where_read` backpropagates from the loss to find the positions it reads.
         with devices.autocast(run.device, run.recipe.train.precision), traced(run.sites) as traces:
             loss = training.objective.calibration_loss(share)
         for name, found in where_read({name: traces[name] for name in used}, loss).items():
@@ -291,7 +290,7 @@ def measure(run: AnyStreamRun, training: TaskTraining) -> Flows:
 
 
 def _without_graph(passed: Traced) -> Traced:
-    """What `flow` reads of a pass, which keeps neither the graph nor the outputs in memory."""
+    """The parts of a pass that `flow` reads, without the graph and the outputs, to save memory."""
     return Traced(passed.weights.detach(), passed.codes.detach(), passed.outputs.detach()[:0])
 
 
@@ -299,7 +298,7 @@ def _without_graph(passed: Traced) -> Traced:
 
 
 def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> TaskRecord:
-    """Let the learner end the task, freeze everything, and say what was learned."""
+    """Let the learner end the task, freeze everything, and return the task's record."""
     current, steps = run.current, run.recipe.train.steps
     flows = measure(run, training) if run.sites else {}
     # Counted before the learner freezes anything.
@@ -319,7 +318,7 @@ def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> Ta
         trained_phase1=trained_first,
         trained=trained,
         trained_mean=trained_steps / steps,
-        # All that is stored now, less what the tasks before have added.
+        # All numbers stored now, minus those that earlier tasks have added.
         added=run.stored() - sum(r["added"] for r in current.records),
         history_mass=sum(masses) / len(masses) if masses else None,
         untouched=untouched(sites, current.task),
@@ -329,9 +328,9 @@ def _finish(run: AnyStreamRun, training: TaskTraining, loss: float | None) -> Ta
 
 
 def _routing(run: AnyStreamRun, name: str, found: Flow, trained: int) -> SiteRouting:
-    """What one map's router does at the task's end, where `trained` parameters have learned."""
+    """The routing of one map at the task's end; `trained` of its parameters have learned."""
     site, used, current = run.sites[name], _used(run, name), run.current
-    before = 0  # what earlier tasks have added here
+    before = 0  # numbers that earlier tasks have added here
     for record in current.records:
         before += sum(s["added"] for s in record["sites"] if s["site"] == name)
     return SiteRouting(

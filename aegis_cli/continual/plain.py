@@ -1,4 +1,4 @@
-"""A stream's policy of one task by itself: plain weights, with what serves the task merged in."""
+"""A stream's policy for a single task in plain weights, with the task's experts merged in."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from aegis_cli.recipes import RobotStreamRecipe
 
 
 def check(path: Path, task: str | None) -> int:
-    """The number of a task whose policy can be had in plain weights.
+    """The number of a task, if its policy can be written as plain weights.
 
     Only headers are read.
 
     Raises:
-        AegisError: the run is not done, it has not learned the task, or a map of it weighs several
-            experts.
+        AegisError: the run is not done, it has not learned the task, or one of the task's routers
+            mixes several experts.
     """
     number = robots.number_of(path, task)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
@@ -47,13 +47,13 @@ def check(path: Path, task: str | None) -> int:
 
 
 def policy(run: RobotStreamRun, number: int) -> Policy:
-    """The policy of a task that `check` has found to be one of plain weights.
+    """The policy of a task for which `check` has passed.
 
-    It takes the weights of the run, which is of no use afterwards. It has the positions and actions
-    of its own robot, whatever robots the stream's other tasks have.
+    It is built from the run's own weights, so the run cannot be used afterwards. Its positions and
+    actions are those of its own robot, even if other tasks of the stream have other robots.
     """
     found = run.policies[number]
-    # The policies share backbone and expert, so that the first one's are this one's.
+    # The policies share backbone and expert, so merging into the first policy changes this one too.
     routing.merge(run.model, run.sites, run.learner.router(number))
     sizes = len(found.proprio_scale.mean), len(found.action_scale.mean)
     expert = found.expert.of_robot(*sizes).to(found.backbone.device)

@@ -1,4 +1,4 @@
-"""`aegis probe` on the run of a stream: its matrix, measured again from the run's files."""
+"""`aegis probe` on a run of a stream: measures its matrix again from the run's files."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def run(path: Path, on_event: OnEvent = ignore) -> StreamProbe:
     """Load a finished run, measure every row that it can still give, and write the matrix.
 
     Raises:
-        AegisError: the run is not done, its files are damaged, or what it was measured with (model,
-            images, words, questions) is no longer the same.
+        AegisError: the run is not done, its files are damaged, or the model, images, words or
+            questions that it was measured with have changed.
     """
     path = Path(path)
     before = files.read(path)

@@ -1,7 +1,7 @@
-"""What is said of a stream: a task's routing and parameters, the matrix of all tasks, its figures.
+"""The report of a stream: each task's routing and parameters, the matrix of all tasks, its figures.
 
-A matrix is what a probe measures again and what lies in a file of its own; a report is a matrix
-and what the training recorded beside it.
+A matrix has a file of its own, and a probe measures it again. A report is a matrix together with
+the figures that the training recorded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from aegis_cli.recipes import TEST
 from aegis_cli.training import folder
 
 Rows = tuple[tuple[float, ...], ...]
-Ends = Sequence[Sequence[float] | None]  # of the intervals of a row
+Ends = Sequence[Sequence[float] | None]  # the intervals of a row
 
 
 # --- a task ---------------------------------------------------------------------------------------
@@ -35,19 +35,19 @@ Ends = Sequence[Sequence[float] | None]  # of the intervals of a row
 
 @dataclass(frozen=True)
 class SiteRouting:
-    """What one map's router does for one task, at the task's end.
+    """The routing of one map for one task, at the task's end.
 
     Attributes:
         site: the map's name.
-        experts: numbers of the experts it uses, none where no loss reads the map.
-        owners: the tasks that brought these experts.
-        mass: mean weight of each over the positions that the loss reads.
-        load: share of each in the summed p ||B A x||.
-        pruned: new experts that went after phase 1.
-        dropped: old experts that the router forgot then.
+        experts: numbers of the experts that the router uses; empty if no loss reads the map.
+        owners: the tasks that added these experts.
+        mass: mean weight of each expert over the positions that the loss reads.
+        load: share of each expert in the summed p ||B A x||.
+        pruned: new experts that were deleted after phase 1.
+        dropped: old experts that the router stopped using after phase 1.
         trained_phase1, trained: parameters here that learned in phase 1 (None without one) and in
             the last phase.
-        added: numbers stored here since the task before.
+        added: numbers stored here since the previous task.
     """
 
     site: str
@@ -72,11 +72,11 @@ class TaskRecord:
         trained_phase1, trained: parameters that learned in phase 1, and in the last (or only)
             phase.
         trained_mean: parameters that learned, mean over all steps of the task.
-        added: numbers stored since the task before, those that tell the task included.
-        history_mass: routing mass on experts of earlier tasks, mean over maps that have some; None
-            where none has.
-        untouched: share of maps that the task added no expert to; None without experts.
-        loss: loss of the last step; None where nothing learns.
+        added: numbers stored since the previous task, including those used to infer the task.
+        history_mass: routing mass on experts of earlier tasks, mean over the maps that have such
+            experts; None if no map has any.
+        untouched: share of maps to which the task added no expert; None without experts.
+        loss: loss of the last step; None if nothing learns.
         sites: the routing per map.
     """
 
@@ -98,9 +98,9 @@ def record_from(raw: Mapping[str, Any]) -> TaskRecord:
 
 
 def history_mass(sites: Sequence[SiteRouting], before: Sequence[TaskRecord]) -> list[float]:
-    """The mass on earlier tasks' experts, per map.
+    """The routing mass on earlier tasks' experts, per map.
 
-    Only maps count that got experts with an earlier task and have some now.
+    Only maps count that got experts in an earlier task and have experts now.
     """
     grown = {s.site for record in before for s in record.sites if s.experts}
     task = len(before)
@@ -123,13 +123,13 @@ def untouched(sites: Sequence[SiteRouting], task: int) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matrix(ABC):
-    """What a run of a learner reached on each task, after each task.
+    """The scores that a learner reached on each task, after each task.
 
     Attributes:
         kind: what `aegis inspect` calls a run of such a stream.
         model_name: what the tables call the model that learns.
-        file: name of the file that holds the matrix, whose keys are `keys`.
-        score: what the matrix holds.
+        file: name of the file that holds the matrix, with the keys `keys`.
+        score: name of the quantity in the matrix.
     """
 
     kind: ClassVar[str]
@@ -143,13 +143,13 @@ class Matrix(ABC):
 
     @abstractmethod
     def figures(self) -> list[float]:
-        """All measured shares and errors, in an order of their own."""
+        """All measured shares and errors, in a fixed order."""
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
     def matrix_json(self) -> dict[str, Any]:
-        """What the matrix's file holds."""
+        """The content of the matrix's file."""
         plain = self.to_json()
         return {key: plain[key] for key in self.keys}
 
@@ -159,13 +159,13 @@ class AccuracyMatrix(Matrix):
     """Accuracies R [T, T] of an encoder: row t after learning task t, column i on task i.
 
     Attributes:
-        split: the tasks' parts that accuracies are of: `test`, or `validation` where settings are
-            chosen.
-        oracle, inferred: R with the task told, and with the task inferred from the image; for a
-            learner with one state for all tasks they are the same. In the columns i > t of tasks
-            that have not come, `oracle` is what the bare encoder reaches, or the current weights of
-            a learner with one state.
-        scores, inferred_scores: Transfer, Average, Last and forgetting of the two.
+        split: the part of each task on which accuracies are measured: `test`, or `validation` when
+            settings are chosen.
+        oracle, inferred: R with the task told, and with the task inferred from the image; both are
+            the same for a learner with one state for all tasks. In the columns i > t of tasks
+            that have not come yet, `oracle` is the accuracy of the bare encoder, or of the current
+            weights of a learner with one state.
+        scores, inferred_scores: Transfer, Average, Last and forgetting of each.
     """
 
     kind = "stream-run"
@@ -186,11 +186,11 @@ class AccuracyMatrix(Matrix):
 
 @dataclass(frozen=True)
 class VqaScore:
-    """What the backbone knows with no task active.
+    """The backbone's answers to questions with no task active.
 
     Attributes:
         accuracy: share of correct answers in [0, 1].
-        cross_entropy: of the answers, in nats.
+        cross_entropy: cross-entropy of the answers, in nats.
         drop_points: percentage points of accuracy lost since before the first task.
     """
 
@@ -201,7 +201,7 @@ class VqaScore:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotMatrix(Matrix):
-    """What policies reached on robot tasks, and what their backbone knows."""
+    """The scores of policies on robot tasks, and of their backbone on questions."""
 
     kind = "robot-stream-run"
     model_name = "backbone"
@@ -209,11 +209,11 @@ class RobotMatrix(Matrix):
     @property
     @abstractmethod
     def measured_rows(self) -> Rows:
-        """The triangle as it was measured."""
+        """The triangular matrix as measured."""
 
     @property
     def measured_intervals(self) -> Sequence[Ends]:
-        """The 95 % interval of each entry, where it has one."""
+        """The 95 % interval of each entry, if it has one."""
         return ()
 
     @staticmethod
@@ -221,26 +221,25 @@ class RobotMatrix(Matrix):
     def of_measured(
         rows: Sequence[Sequence[float]], intervals: Sequence[Ends], held: Sequence[float | None]
     ) -> dict[str, Any]:
-        """The triangle with its figures, by the names of a matrix.
+        """The triangular matrix with its figures, by the attribute names of a matrix.
 
         Args:
-            intervals: of each error, where errors are measured.
-            held: of each task the error of holding the position, where errors are measured.
+            intervals: the interval of each error, if errors are measured.
+            held: each task's error of holding the position, if errors are measured.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessMatrix(RobotMatrix):
-    """Success of a policy in closed loop, and what its backbone knows.
+    """Success of a policy in closed loop, and its backbone's answers to questions.
 
     Attributes:
-        success: S, row t with t + 1 entries: success on task i after learning tasks 0 to t, the
-            task told; of a suite task its return's share of the highest. A task that has not come
-            has no scales to act with, and so no entry.
+        success: S, row t with t + 1 entries: success on task i after learning tasks 0 to t, with
+            the task told; for a suite task, its return as a share of the highest return. A task
+            that has not come yet has no scales to act with, and therefore no entry.
         scores: Average, Last and forgetting over these entries.
-        vqa: before the first task, and after each. With experts nothing of a task is active then,
-            so that nothing can change; `sequential` has no other weights than those that it goes on
-            training.
+        vqa: before the first task, and after each. With experts, no expert is active here, so
+            nothing can change; `sequential` has only the weights that it goes on training.
     """
 
     file = "success_matrix.json"
@@ -268,16 +267,17 @@ class SuccessMatrix(RobotMatrix):
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorMatrix(RobotMatrix):
-    """Open-loop errors of a policy in tasks that no simulator has, and what its backbone knows.
+    """Open-loop errors of a policy in tasks without a simulator, and its backbone's answers.
 
     Attributes:
         errors: row t with t + 1 entries: the error at held-out frames of task i after learning
-            tasks 0 to t, the task told. It is the mean squared error over the variance of the
-            training's actions, as `aegis evaluate` has it.
-        error_intervals: the 95 % interval of each, by Student's t over episodes; None of one.
-        hold_errors: of each task the error of repeating the current position there; None where
-            actions are no positions.
-        scores: Average, Last and forgetting of the errors, of which less is better.
+            tasks 0 to t, with the task told. It is the mean squared error divided by the variance
+            of the training actions, as in `aegis evaluate`.
+        error_intervals: the 95 % interval of each error, by Student's t over episodes; None for a
+            single episode.
+        hold_errors: each task's error of repeating the current position; None if actions are not
+            positions.
+        scores: Average, Last and forgetting of the errors (lower is better).
         vqa: before the first task, and after each.
     """
 
@@ -319,13 +319,13 @@ class ErrorMatrix(RobotMatrix):
 
 
 def vqa_scores(rows: Sequence[Sequence[float]]) -> tuple[VqaScore, ...]:
-    """Scores from rows of (accuracy, cross-entropy), the first of them before any task."""
+    """Scores from rows of (accuracy, cross-entropy); the first row is before any task."""
     first = rows[0][0]
     return tuple(VqaScore(accuracy, loss, 100 * (first - accuracy)) for accuracy, loss in rows)
 
 
 def as_rows(rows: Sequence[Sequence[float]]) -> Rows:
-    """A matrix that cannot be changed any more."""
+    """The rows as an immutable matrix."""
     return tuple(tuple(row) for row in rows)
 
 
@@ -334,20 +334,20 @@ def as_rows(rows: Sequence[Sequence[float]]) -> Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamReport(Matrix):
-    """A stream, learned.
+    """The report of a learned stream.
 
     Attributes:
         name: the recipe's name.
-        stream: the stream's name; of robot tasks, the tasks joined.
+        stream: the stream's name; for robot tasks, the task names joined.
         parameters: numbers stored beside the bare model at the end.
         trained_phase1, trained, trained_mean: means over tasks of the records' figures.
-        reuse: mean over tasks after the first, and maps that earlier tasks gave experts, of the
-            routing mass on these.
-        records: what was learned, per task.
+        reuse: routing mass on experts of earlier tasks, mean over all tasks after the first and
+            over the maps that earlier tasks gave experts.
+        records: one record per task.
         inputs: digests of what the run was made from and measured with.
         out: the run folder.
         minutes: time of training and evaluation. `out` and `minutes` are not part of the run's
-            files, which are the same in every repetition.
+            files, which are the same in every equal run.
     """
 
     name: str
@@ -370,11 +370,11 @@ class StreamReport(Matrix):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageStreamReport(StreamReport, AccuracyMatrix):
-    """A stream of classification tasks, learned.
+    """The report of a learned stream of classification tasks.
 
     Attributes:
-        inference_parameters: how many of `parameters` tell the task.
-        path: the folder of the images, where they are the user's own; JSON has it only there.
+        inference_parameters: how many of `parameters` are used to infer the task.
+        path: the folder of the user's own images; in the JSON only if there is one.
     """
 
     inference_parameters: int
@@ -391,9 +391,9 @@ class ImageStreamReport(StreamReport, AccuracyMatrix):
 
     @property
     def published(self) -> Mapping[str, tuple[float, float, float]]:
-        """What papers print for this stream: Transfer, Average and Last in percent, by method.
+        """Published Transfer, Average and Last for this stream in percent, by method.
 
-        There is nothing unless the stream was learned whole and in its order.
+        It is empty unless all tasks were learned in the stream's order and the test parts measured.
         """
         whole = self.split == TEST and self.tasks == mtil.STREAMS.get(self.stream)
         return mtil.PUBLISHED.get(self.stream, {}) if whole else {}
@@ -401,7 +401,7 @@ class ImageStreamReport(StreamReport, AccuracyMatrix):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStreamReport(StreamReport, SuccessMatrix):
-    """A stream of simulated robot tasks, learned.
+    """The report of a learned stream of simulated robot tasks.
 
     `parameters` counts the action expert, scales, experts and routers.
     """
@@ -409,14 +409,17 @@ class RobotStreamReport(StreamReport, SuccessMatrix):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedStreamReport(StreamReport, ErrorMatrix):
-    """A stream of robot tasks that no simulator has, learned; `parameters` counts as there."""
+    """The report of a learned stream of robot tasks without a simulator.
+
+    `parameters` counts as in `RobotStreamReport`.
+    """
 
 
 def report_from(kind: type[StreamReport], raw: Mapping[str, Any], out: Path) -> StreamReport:
-    """A report from its JSON, which lies in the run folder `out`.
+    """A report from its JSON in the run folder `out`.
 
     Raises:
-        ValueError: the JSON is not that of such a report.
+        ValueError: the JSON does not describe such a report.
         AegisError: the run's log is missing or damaged.
     """
     whole = {**raw, "out": str(out), "minutes": minutes(out)}
@@ -424,7 +427,7 @@ def report_from(kind: type[StreamReport], raw: Mapping[str, Any], out: Path) -> 
 
 
 def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
-    """What all records together say of parameters and reuse, by a report's names."""
+    """The parameters and reuse over all records, by a report's attribute names."""
     first = [r.trained_phase1 for r in records if r.trained_phase1 is not None]
     masses = []
     for task, record in enumerate(records):
@@ -439,7 +442,7 @@ def sums(records: Sequence[TaskRecord]) -> dict[str, Any]:
 
 
 def minutes(path: Path) -> float:
-    """Time of training and evaluation, as the run's log has it."""
+    """Time of training and evaluation in minutes, from the run's log."""
     return sum(line["seconds"] for line in folder.read_metrics(path, "seconds")) / 60
 
 
@@ -451,10 +454,10 @@ class StreamProbe(Matrix):
     """A matrix, measured again from the run's files.
 
     Attributes:
-        measured: how many rows were measured, which are the last ones: all rows where what serves a
-            learned task never changes, else the one of the end, since the weights of the other rows
-            are gone. Those are as the training measured them.
-        largest_difference: largest difference between the measured figures and the training's.
+        measured: how many of the last rows were measured again: all rows if the weights of a
+            learned task never change, otherwise only the last row, since the weights of the others
+            are gone. The remaining rows are as the training measured them.
+        largest_difference: largest difference between these figures and those of the training.
         out: the run folder.
     """
 
@@ -470,16 +473,16 @@ class ImageStreamProbe(StreamProbe, AccuracyMatrix):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStreamProbe(StreamProbe, SuccessMatrix):
-    """The success on a stream of robot tasks and the backbone's knowledge, measured again."""
+    """The success on a stream of robot tasks and the backbone's answers, measured again."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedStreamProbe(StreamProbe, ErrorMatrix):
-    """The errors in a stream of robot tasks and the backbone's knowledge, measured again."""
+    """The errors in a stream of robot tasks and the backbone's answers, measured again."""
 
 
 def probe_from(before: StreamReport, found: StreamReport, measured: int) -> StreamProbe:
-    """The figures that were measured again, beside those of the training."""
+    """A probe from the figures measured again and the report of the training."""
     kinds: dict[str, type[StreamProbe]] = {
         SuccessMatrix.score: RobotStreamProbe,
         ErrorMatrix.score: RecordedStreamProbe,

@@ -1,4 +1,4 @@
-"""The demonstrations of a stream of robot tasks: which each task learns, and where they lie.
+"""The demonstrations of a stream of robot tasks: which ones each task learns, and where they are.
 
 The recipe names them, or they are recorded beside the run.
 """
@@ -33,9 +33,9 @@ def check_words(backbone: Backbone, task: str) -> None:
 
 
 def check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what the meta folders of given demonstrations tell to be wrong.
+    """Raise AegisError for mistakes that the meta folders of given demonstrations already show.
 
-    To decode the first task's frames can take hours.
+    Without this check they could appear only after hours of decoding the first task's frames.
     """
     if recipe.demos.paths is None:
         return
@@ -64,7 +64,7 @@ def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
         path, selection = given(recipe, number)
         count = demonstrations.count_episodes(path)
         own = set(demonstrations.learned_from(path, count, selection.only).tolist())
-        place = demonstrations.locate(path).resolve()  # a folder may be named in two ways
+        place = demonstrations.locate(path).resolve()  # two paths may name the same folder
         for other, elsewhere, theirs in seen:
             if elsewhere != place or not own & theirs:
                 continue
@@ -86,10 +86,10 @@ def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
 def load(
     recipe: RobotStreamRecipe, number: int, backbone: Backbone, out: Path, on_event: OnEvent
 ) -> Demonstrations:
-    """The demonstrations of one task, whose instructions the backbone can read.
+    """Load the demonstrations of one task and check that the backbone can read their instructions.
 
     Raises:
-        AegisError: they cannot be read, are those of another task, or hold an unknown word.
+        AegisError: they cannot be read, belong to another task, or contain an unknown word.
     """
     task = recipe.tasks[number]
     path, selection = _source(recipe, number, out, on_event)
@@ -108,7 +108,7 @@ def load(
     _check_task(found.task, task, path)
     if sim.of_datasets(task) is not None:
         task_episodes.check_own(found.texts, task, f"'{path}'")
-    # An unknown word must end no training half-way.
+    # Check all texts now, so that an unknown word cannot stop the training halfway.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     if not recipe.simulated:
         loading.warn_of_outliers(path, found, recipe.train, on_event)
@@ -116,11 +116,11 @@ def load(
 
 
 def _check_task(recorded: str | None, task: str, path: Path) -> None:
-    """Raise AegisError unless what was recorded is a task of the stream, or no simulated one.
+    """Raise AegisError if the demonstrations are of another task.
 
     Args:
-        recorded: the simulated task that the demonstrations are of; None of any other.
-        task: the recipe's.
+        recorded: the simulated task of the demonstrations; None if the task is not simulated.
+        task: the recipe's task.
     """
     if recorded == (task if TASK.accepts(task) else None):
         return
@@ -140,7 +140,7 @@ def _check_task(recorded: str | None, task: str, path: Path) -> None:
 def _source(
     recipe: RobotStreamRecipe, number: int, out: Path, on_event: OnEvent
 ) -> tuple[Path, Selection]:
-    """Where a task's demonstrations lie, and what it learns of them.
+    """Where a task's demonstrations are, and which part of them it learns.
 
     They are recorded if the recipe names none.
     """
@@ -153,10 +153,10 @@ def _source(
 
 
 def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
-    """The demonstrations that a recipe names for a task, and what it learns of them.
+    """The demonstrations that a recipe names for a task, and which part of them it learns.
 
     Raises:
-        AegisError: nothing is there, or it cannot be told which episodes are the task's.
+        AegisError: they do not exist, or it is not known which episodes belong to the task.
     """
     demos = recipe.demos
     path = demonstrations.at(demos.of_task(number))
@@ -174,16 +174,16 @@ def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
 
 
 def _is_shared(recipe: RobotStreamRecipe, number: int) -> bool:
-    """Whether other tasks learn from the same demonstrations as the task of that number."""
+    """Whether other tasks learn from the same demonstrations as task `number`."""
     of_each = [recipe.demos.of_task(i) for i in range(len(recipe.tasks))]
     return of_each.count(of_each[number]) > 1
 
 
 def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, Any]:
-    """What the task of that number would have learned of demonstrations, as `recipes.selected`.
+    """The part of some demonstrations that task `number` would learn, as in `recipes.selected`.
 
     Args:
-        path: where they lie by now; also others than it learned from.
+        path: the current path of its demonstrations, or the path of others.
     """
     chosen, demos = recipes.selected(recipe), recipe.demos
     only = None
@@ -193,25 +193,25 @@ def learned_of(recipe: RobotStreamRecipe, number: int, path: Path) -> dict[str, 
         try:
             shared = _is_shared(recipe, number)
             only = demonstrations.part_of(path, recipe.tasks[number], shared)
-        except AegisError:  # others, whose episodes cannot be told apart: then all are meant
+        except AegisError:  # other demonstrations that do not tell episodes apart: take them all
             only = None
     return chosen if only is None else {**chosen, "only": only}
 
 
 def place_of(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
-    """Where the demonstrations that the task of that number learned from lie, or lay."""
+    """Where the demonstrations that task `number` learned from are, or were."""
     if recipe.demos.paths is not None:
         return Path(recipe.demos.of_task(number))
     return _records(run, ignore).recorded(recipe.tasks[number], _to_record(recipe))
 
 
 def record(recipe: RobotStreamRecipe, number: int, records: StageRecords) -> Made:
-    """The demonstrations of one task, recorded as the recipe says unless they are there."""
+    """The demonstrations of one task, recorded with the recipe's settings unless they exist."""
     return records.demonstrations(recipe.tasks[number], _to_record(recipe))
 
 
 def _records(run: Path, on_event: OnEvent) -> StageRecords:
-    """What is recorded for a run, beside it."""
+    """The recordings for a run, in a folder beside it."""
     return StageRecords(run.parent / "demos", on_event)
 
 

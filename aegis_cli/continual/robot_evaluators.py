@@ -1,4 +1,4 @@
-"""What is measured of a stream of robot tasks: how each is done, and what the backbone knows."""
+"""The evaluation of a stream of robot tasks: each task's score, and questions to the backbone."""
 
 from __future__ import annotations
 
@@ -24,52 +24,52 @@ Questions = sets.Scenes | sets.Listed
 
 
 class RobotEvaluator(ABC):
-    """How tasks are done with the task told, and questions with no task active.
+    """Scores of tasks with the task told, and of questions with no task active.
 
-    The questions are the same every time, and so is what a task is tried on.
+    The questions are the same every time, and so are the episodes or frames of each task.
 
     Attributes:
-        on_event: hears of its progress.
+        on_event: receives the progress events.
     """
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
         self._run, self.on_event = run, on_event
         count, check = run.recipe.probe.questions, run.model.backbone.check_text
-        # settings are chosen by other questions than those that figures are of
+        # Settings are chosen on different questions from those that are reported.
         part = "validation" if run.recipe.rollout.split == "validation" else "probe"
         seed = run.recipe.probe.seed
         self._asked = source.choose(part, count, seed, [check], on_event)
 
     @property
     def hold_errors(self) -> Sequence[float | None]:
-        """Of each task the error of holding the position; none where a success is measured."""
+        """Each task's error of holding the position; empty if success is measured."""
         return ()
 
     def intervals(self, done: int) -> list[list[float] | None]:
-        """Of each error of the tasks 0 to `done` its interval, as it was measured last.
+        """The interval of each error of tasks 0 to `done`, from the last measurement.
 
-        A success has none.
+        It is empty if success is measured.
         """
         return []
 
     def row(self, done: int) -> list[float]:
-        """What was measured after tasks 0 to t = `done`, of these alone."""
+        """The scores of tasks 0 to t = `done`, measured after learning them."""
         return [self.tried(i) for i in range(done + 1)]
 
     @abstractmethod
     def tried(self, task: int) -> float:
-        """How the task of that number is done now."""
+        """The present score of task `task`."""
 
     def tried_s(self, task: int) -> float:
-        """About how many seconds `tried` takes, by its first parts."""
+        """Estimated seconds of `tried`, from its first parts."""
         return expected_s(self._heard_by(partial(self.tried, task)))
 
     def vqa_s(self) -> float:
-        """About how many seconds `vqa` takes."""
+        """Estimated seconds of `vqa`."""
         return expected_s(self._heard_by(self.vqa))
 
     def _heard_by(self, work: Callable[[], object]) -> Callable[[OnEvent], None]:
-        """Some of its work, of whose progress somebody else hears."""
+        """`work` as a function that sends its progress events to another receiver."""
 
         def heard(on_event: OnEvent) -> None:
             before, self.on_event = self.on_event, on_event
@@ -88,7 +88,7 @@ class RobotEvaluator(ABC):
         return [found.accuracy, found.cross_entropy]
 
     def _named(self, task: str) -> OnEvent:
-        """Events of a rollout, with the task's name."""
+        """A receiver that adds the task's name to events and passes them on."""
 
         def passed_on(event: Event) -> None:
             self.on_event(dataclasses.replace(event, stage=f"{event.stage} {task}"))
@@ -100,7 +100,7 @@ class ClosedLoopEvaluator(RobotEvaluator):
     """Lets policies act in simulated tasks."""
 
     def tried_s(self, task: int) -> float:
-        """About how many seconds `tried` takes if no episode ends early."""
+        """Estimated seconds of `tried` if no episode ends early."""
         acting, settings = self._run.acting(task), self._run.recipe.rollout
         return longest_s(acting, settings.episodes, settings.colors, self._split, settings.seed)
 
@@ -110,7 +110,7 @@ class ClosedLoopEvaluator(RobotEvaluator):
         return named[self._run.recipe.rollout.split]
 
     def tried(self, task: int) -> float:
-        """Share of successes of the task of that number, or of the highest return."""
+        """Success rate of task `task`, or its return as a share of the highest return."""
         acting, settings = self._run.acting(task), self._run.recipe.rollout
         found = play(
             acting,
@@ -120,14 +120,14 @@ class ClosedLoopEvaluator(RobotEvaluator):
             on_event=self._named(acting.task),
             seed=settings.seed,
         )
-        # A task of dm_control's suite has no success, but a return.
+        # A task of dm_control's suite has a return instead of a success.
         share = found.return_share if found.success is None else found.success
         assert share is not None
         return share
 
 
 class HeldOutEvaluator(RobotEvaluator):
-    """Lets policies predict at held-out frames of tasks that no simulator has."""
+    """Lets policies predict at held-out frames of tasks without a simulator."""
 
     def __init__(self, run: RobotStreamRun, source: Questions, on_event: OnEvent = ignore) -> None:
         super().__init__(run, source, on_event)
@@ -143,7 +143,7 @@ class HeldOutEvaluator(RobotEvaluator):
         return [frames.hold_error for frames in self._frames]
 
     def tried(self, task: int) -> float:
-        """The error of the actions that are predicted in the task of that number."""
+        """The error of the actions predicted in task `task`."""
         self._run.activate(task)
         policy, on_event = self._run.policies[task].eval(), self._named(self._run.names[task])
         error, self._intervals[task] = self._frames[task].error(policy, on_event)

@@ -1,10 +1,10 @@
 """Streams of robot tasks: policies that share a backbone and an action expert learn one by one.
 
-The backbone's maps get experts with every task. The action expert learns whole with the first task
-and is frozen then; from the second task on low-rank experts adapt it too. With the task told, what
-served a learned task never changes. What is measured is the success in closed loop on the tasks so
-far, or of tasks that no simulator has the error of the predicted actions on held-out episodes; and
-what the backbone knows with no task active.
+The backbone's maps get experts with every task. All weights of the action expert are trained on the
+first task and then frozen; from the second task on, low-rank experts adapt it too. With the task
+told, the weights that serve a learned task never change. The evaluation measures the closed-loop
+success on the tasks so far (or, for tasks without a simulator, the error of the predicted actions
+on held-out episodes) and the backbone's answers to questions with no task active.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from aegis_cli.recipes import RobotStreamRecipe, RobotTrain
 from aegis_cli.training import assemble, checkpoint, freezing, loading, train
 from aegis_cli.training.freezing import Still
 
-# Training frames, evenly spaced, on which routers are measured, always with the same noise.
+# Number of evenly spaced training frames on which routers are measured, with constant noise.
 CALIBRATION_FRAMES = 32
 # maps of a backbone that get no experts
 ATTENTION_INPUTS = {"qkv", "qkv_proj", "q_proj", "k_proj", "v_proj"}
 # purposes of a step's noise, each with a generator of its own
 TRAINING_NOISE, VALIDATION_NOISE, CALIBRATION_NOISE = 1, 2, 3
 ACTION_EXPERT, BACKBONE = "expert.safetensors", "backbone"
-QUESTION_FILE = "vqa/"  # the name of a question file among a run's inputs begins so
+QUESTION_FILE = "vqa/"  # prefix of the names of question files among a run's inputs
 
 Scales = tuple[Normalizer, Normalizer]  # of positions and of actions
 
@@ -77,12 +77,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
     """A run through a stream of robot tasks.
 
     Attributes:
-        policies: one per task; they share backbone and action expert and have scales of their own.
-        views: how each task's policy looks: of a policy's meta, `cameras`, `pictures` and `rename`.
-        still: what the recipe freezes of the backbone.
-        demos: one per task; none in a run that only acts.
-        question_files: digests of the files that the questions come from; none of scenes.
-        evaluator: what measures the run; None in a run that only acts.
+        policies: one per task; they share backbone and action expert, and each has its own scales.
+        views: the entries of each task's policy meta that describe its input: `cameras`,
+            `pictures` and `rename`.
+        still: the parts of the backbone that the recipe freezes.
+        demos: one per task; empty in a run that only acts.
+        question_files: digests of the files that the questions come from; empty for scenes.
+        evaluator: measures the run; None in a run that only acts.
     """
 
     partial_matrix = True
@@ -110,13 +111,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return FlowMatchingLoss(task, self.recipe, self.policies[task], self.demos[task])
 
     def growing(self, task: int) -> Routed:
-        """With the first task only the backbone's maps: the action expert learns whole then."""
+        """All maps; with the first task only the backbone's, as the whole action expert learns."""
         if task > 0:
             return self.sites
         return {n: site for n, site in self.sites.items() if not n.startswith("expert.")}
 
     def task_begun(self) -> None:
-        """With the first task the action expert learns whole; what is frozen never does."""
+        """Freeze what the recipe freezes; with the first task, train the whole action expert."""
         self.still.hold()
         if self.learner.trains == "experts" and self.current.task == 0:
             self.model.expert.requires_grad_(True)
@@ -133,7 +134,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return "train.expert_lr" if own else super().rate_key(name)
 
     def stored(self) -> int:
-        """How many numbers are kept beside the bare backbone, scales so far included."""
+        """How many numbers are stored beside the bare backbone, including the scales so far."""
         count = super().stored()
         for policy in self.policies[: self.current.task + 1]:
             for scale in (policy.proprio_scale, policy.action_scale):
@@ -151,15 +152,15 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return {**super().inputs, "backbone": self.fingerprint, **digests, **self.question_files}
 
     def acting(self, task: int) -> Acting:
-        """The policy of the task of that number, which alone is active from here on.
+        """The policy of task `task`; only this task is active from here on.
 
         Raises:
-            AegisError: no simulator has the task.
+            AegisError: the task has no simulator.
         """
         if not self.recipe.simulated:
             raise no_simulator(self.out, self.names[task])
         self.activate(task)
-        # The policies share backbone and action expert, and differ in their task's scales.
+        # The policies share backbone and action expert and differ in their scales.
         policy, name, view = self.policies[task].eval(), self.names[task], self.views[task]
         cameras = checkpoint.cameras_of(view, name)
         sizes = checkpoint.sizes_of(view)
@@ -167,7 +168,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     @property
     def origin(self) -> dict[str, str]:
-        """Of a policy's meta what the backbone was before the stream: `stored`, `base_model`."""
+        """The policy meta that describes the original backbone: `stored`, `base_model`."""
         backbone, found = self.model.backbone, dict[str, str]()
         if backbone.hub_id is not None:
             found["base_model"] = backbone.hub_id
@@ -176,7 +177,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return found
 
     def meta(self, task: int) -> PolicyMeta:
-        """What a user of the policy of the task of that number has to know."""
+        """The meta of the policy of task `task`, which its users need."""
         recipe = self.recipe
         found: dict[str, Any] = {
             "method": recipe.train.method,
@@ -190,11 +191,11 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return cast(PolicyMeta, {**found, **chosen, **self.views[task], **self.origin})
 
     def activate(self, task: int | None) -> None:
-        """Let every map compute for the task of that number; None: the bare backbone."""
+        """Let every map compute for task `task`; None means the bare backbone."""
         routing.activate(self.sites, None if task is None else self.learner.router(task))
 
     def measure_with(self, source: Questions, on_event: OnEvent) -> None:
-        """Let these questions be what the run is measured with.
+        """Measure the run with these questions.
 
         Raises:
             AegisError: there are too few of them, or the backbone cannot read one.
@@ -214,8 +215,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     def after_task(self) -> dict[str, float]:
         current = self.current
-        self.demos[current.task].check_files()  # that nobody has written to them meanwhile
-        # Each measurement activates what it measures; none relies on what the last one left.
+        self.demos[current.task].check_files()  # they must not have changed during the training
+        # Each measurement activates its own task and does not rely on the one before.
         current.oracle.append(self.measuring.row(current.task))
         if not self.recipe.simulated:
             current.intervals.append(self.measuring.intervals(current.task))
@@ -238,7 +239,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return train.validation_loss(policy, demos, settings, noise, on_event=on_event)
 
     def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
-        """Every task is tried once: with frozen experts a column has one policy in all rows."""
+        """Measure every task once; with frozen experts all rows of a column share one policy."""
         assert isinstance(before, SuccessMatrix | ErrorMatrix)
         count = len(self.names)
         now = []
@@ -253,13 +254,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         measured = self.matrix(
             [*before.measured_rows[:first], *rows], [*before.measured_intervals[:first], *ends]
         )
-        # VQA has a score more than there are rows: the one before the first task.
+        # VQA has one more score than there are rows: the one before the first task.
         told = [(then.accuracy, then.cross_entropy) for then in before.vqa]
         vqa = vqa_scores([*told[: first + 1], *[known] * (count - first)])
         return dataclasses.replace(before, **measured, vqa=vqa), count - first
 
     def matrix(self, rows: Sequence[Sequence[float]], intervals: Sequence[Ends]) -> dict[str, Any]:
-        """What was measured of the tasks so far, with its figures, by a report's names."""
+        """The scores of the tasks so far with their figures, by a report's attribute names."""
         kind = SuccessMatrix if self.recipe.simulated else ErrorMatrix
         return kind.of_measured(rows, intervals, self.measuring.hold_errors)
 
@@ -275,7 +276,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         )
 
     def save_model(self) -> None:
-        """The action expert's own weights, each task's scales, and a backbone that has changed."""
+        """Save the action expert's own weights, each task's scales, and the backbone if trained."""
         fingerprint = self.fingerprint
         if self.learner.trains == "model":
             self.model.backbone.save(self.out / BACKBONE)
@@ -307,14 +308,14 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
 
 def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> RobotStreamRun:
-    """Backbone, demonstrations, questions and learner of a run that is to be trained.
+    """Build backbone, demonstrations, questions and learner of a run that is to be trained.
 
-    Demonstrations that are not given are recorded, unless they are there.
+    Demonstrations that are not given are recorded unless they exist already.
 
     Raises:
         AegisError: inputs that do not fit together; nothing has been recorded then.
     """
-    source = questions(recipe, on_event)  # a bad set shows before anything is recorded
+    source = questions(recipe, on_event)  # reject a bad set before anything is recorded
     if recipe.simulated:
         gl.check()
     for task in recipe.tasks if recipe.simulated else ():
@@ -330,11 +331,11 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     robot_demos.check_given(recipe, on_event)
     for task in recipe.tasks if recipe.simulated else ():
         robot_demos.check_words(backbone, task)
-    # Only now, when all else has been found to fit: recording takes long.
+    # Last, after all other checks, because recording takes long.
     numbers = range(len(recipe.tasks))
     demos = tuple(robot_demos.load(recipe, i, backbone, out, on_event) for i in numbers)
     scales = [d.scales(recipe.train.normalization) for d in demos]
-    # One action expert serves all robots: it reads and moves as many joints as any has.
+    # One action expert serves all robots, so it has the sizes of the robot with the most joints.
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
@@ -348,14 +349,14 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
 def load(
     recipe: RobotStreamRecipe, path: Path, before: StreamReport, on_event: OnEvent = ignore
 ) -> RobotStreamRun:
-    """A finished run as it is at its end, to be measured again.
+    """Load a finished run in its final state, to measure it again.
 
     Args:
         before: the run's report.
 
     Raises:
-        AegisError: files that are missing, damaged or of another backbone, or other questions or
-            held-out episodes than the run was measured with.
+        AegisError: files are missing, damaged or of another backbone, or the questions or held-out
+            episodes are not those that the run was measured with.
     """
     run = load_to_act(path)
     source = questions(recipe, on_event)
@@ -378,7 +379,7 @@ def _as_learned(
     """The demonstrations that a finished run has learned from, for its held-out episodes.
 
     Raises:
-        AegisError: they are gone, or others than the run learned from.
+        AegisError: they are gone, or not those that the run learned from.
     """
     count, backbone = len(recipe.tasks), run.model.backbone
     demos = tuple(robot_demos.load(recipe, i, backbone, run.out, on_event) for i in range(count))
@@ -394,7 +395,7 @@ def _as_learned(
 
 
 def load_to_act(path: Path) -> RobotStreamRun:
-    """A finished run that can act, but not learn.
+    """Load a finished run that can act, but not learn.
 
     Raises:
         AegisError: the run is not done, or files are missing, damaged or of another backbone.
@@ -425,7 +426,7 @@ def _saved_expert(path: Path, recipe: RobotStreamRecipe, fingerprint: str) -> ar
     """The action expert of a run, with each task's scales.
 
     Raises:
-        AegisError: the file is missing, damaged, or of other tasks or another backbone.
+        AegisError: the file is missing, damaged, or belongs to other tasks or another backbone.
     """
     saved = artifacts.load(path, "expert", fingerprint=fingerprint)
     if saved.header.meta.get("tasks") != list(recipe.tasks):
@@ -457,9 +458,9 @@ def _assemble(
     out: Path,
     demos: tuple[Demonstrations, ...] = (),
 ) -> RobotStreamRun:
-    """A run at its beginning: one policy per task, and sites for experts if its learner has any."""
+    """A run at its start: one policy per task, and sites for experts if its learner has any."""
     learner = learners.get(recipe.train.method)
-    # Taken from the bare backbone, before anything stands beside it.
+    # Computed from the bare backbone, before experts are added.
     fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
     policies = share(backbone, shape, scales, recipe.seed)
     return RobotStreamRun(
@@ -479,8 +480,8 @@ def load_policy(path: Path, task: str | None) -> Acting:
     """The policy of one of a run's tasks, ready to act in simulation.
 
     Raises:
-        AegisError: a task that the run has not learned, or none named, or that no simulator has, or
-            what `load_to_act` finds wrong.
+        AegisError: the run has not learned the task, no task is named, the task has no simulator,
+            or `load_to_act` raises.
     """
     number = number_of(path, task)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
@@ -490,7 +491,7 @@ def load_policy(path: Path, task: str | None) -> Acting:
 
 
 def no_simulator(run: Path, task: str) -> AegisError:
-    """What is wrong with playing a task that is not simulated."""
+    """The error for playing a task that is not simulated."""
     return AegisError(
         f"'{task}' of the stream in '{run}', a task that no simulator has",
         "a simulated task, to be played",
@@ -503,7 +504,7 @@ def number_of(path: Path, task: str | None) -> int:
     """The number of one of a run's tasks.
 
     Raises:
-        AegisError: a task that the run has not learned, or none named where it has several.
+        AegisError: the run has not learned the task, or it has several and none is named.
     """
     known = files.read(path).tasks
     if task is None and len(known) == 1:
@@ -521,10 +522,10 @@ def number_of(path: Path, task: str | None) -> int:
 def _checked_shape(
     path: Path, saved: artifacts.Artifact, backbone: Backbone, tasks: int
 ) -> ExpertShape:
-    """The shape of a stream's action expert, whose file has exactly its tensors, and the scales.
+    """The shape of a stream's action expert; checks that the file has its tensors and the scales.
 
     Raises:
-        AegisError: a file that is damaged, or of another backbone.
+        AegisError: the file is damaged or belongs to another backbone.
     """
     with reading_meta(path):
         shape = shape_from(ExpertShape, saved.header.meta["shape"], path, len(saved.tensors))
@@ -535,7 +536,7 @@ def _checked_shape(
     most = {"proprio": shape.proprio, "action": shape.actions}
     for task in range(tasks):
         for kind, size in most.items():
-            # A robot with fewer joints than the widest has shorter scales.
+            # Robots with fewer joints than the largest one have shorter scales.
             mean = saved.tensors.get(f"tasks.{task}.{kind}.mean")
             length = size if mean is None else min(mean.numel(), size)
             for part in ("mean", "std"):
@@ -546,10 +547,10 @@ def _checked_shape(
 
 
 def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta]:
-    """How each task's policy looks; files that were written before this was kept do not say it.
+    """The inputs of each task's policy, as in `views`; empty for files of earlier versions.
 
     Raises:
-        AegisError: what the header says of it is damaged.
+        AegisError: these entries of the header are damaged.
     """
     with reading_meta(path):
         views = list(saved.header.meta.get("views", [{}] * tasks))
@@ -565,7 +566,7 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
 def _view(
     recipe: RobotStreamRecipe, shown: Demonstrations, scales: Scales, backbone: Backbone
 ) -> PolicyMeta:
-    """How a task's policy looks; of a robot that is not simulated also what its numbers are."""
+    """The inputs of a task's policy; for a robot that is not simulated also their meaning."""
     found = assemble.view(shown, backbone)
     if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
         found["action_std"] = shown.action_std
@@ -582,7 +583,7 @@ def _scale(tensors: Mapping[str, Tensor], task: int, kind: str) -> Normalizer:
     return Normalizer(tensors[f"tasks.{task}.{kind}.mean"], tensors[f"tasks.{task}.{kind}.std"])
 
 
-# --- what a stream is made of ---------------------------------------------------------------------
+# --- parts of a stream ----------------------------------------------------------------------------
 
 
 def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Questions:
@@ -596,9 +597,9 @@ def questions(recipe: RobotStreamRecipe, on_event: OnEvent = ignore) -> Question
 
 
 def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEvent) -> None:
-    """Raise AegisError unless what is frozen would learn, and something else of the backbone does.
+    """Raise AegisError if freezing has no effect or leaves nothing of the backbone to learn.
 
-    Each name has to be that of a part.
+    Each name in `train.freeze` must name a part of the backbone.
     """
     still = freezing.named(backbone, recipe.train.freeze)
     if not still.given:
@@ -610,7 +611,7 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
     else:
         grown = grown_maps(backbone)
         left = list(still.without(grown))
-        if len(left) == len(grown):  # no map that would get experts is frozen
+        if len(left) == len(grown):  # none of the maps that get experts is frozen
             raise AegisError(
                 f"{with_learner}, which trains none of it anyway",
                 "parts with maps beside which experts would stand: the MLPs and attention outputs "
@@ -624,8 +625,8 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
 def share(
     backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
 ) -> tuple[Policy, ...]:
-    """One policy per task, with one action expert that follows from the seed."""
-    # Forked, so that the caller's random numbers go on as they were.
+    """One policy per task; all share one action expert, initialized from the seed."""
+    # Forked, so that the caller's random state does not change.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         expert = ActionExpert(shape)
@@ -637,8 +638,8 @@ def share(
 def grown_maps(backbone: Backbone) -> dict[str, nn.Linear]:
     """The maps of a backbone's language layers that may get experts.
 
-    The inputs of attention get none. Nor do the last layer's maps: they are behind the last keys
-    and values, which is all that the action expert reads, so that no action depends on them.
+    The inputs of attention get none. Nor do the last layer's maps: they come after the last keys
+    and values, which are all that the action expert reads, so no action depends on them.
     """
     last_layer = backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]
     last = {id(parameter) for parameter in last_layer}
@@ -651,10 +652,10 @@ def grown_maps(backbone: Backbone) -> dict[str, nn.Linear]:
 
 
 def route(policy: Policy, still: Still) -> dict[str, routing.RoutedLinear]:
-    """Let experts stand beside maps of the backbone's language layers, and all of the expert's.
+    """Prepare maps of the backbone's language layers and all the action expert's maps for experts.
 
     Args:
-        still: the parts of the backbone whose maps get none.
+        still: the parts of the backbone whose maps get no experts.
     """
     maps = {}
     for name, linear in still.without(grown_maps(policy.backbone)).items():
@@ -666,25 +667,25 @@ def route(policy: Policy, still: Still) -> dict[str, routing.RoutedLinear]:
 
 
 def is_added(name: str) -> bool:
-    """Whether a parameter of that name stands beside a map."""
+    """Whether `name` is a parameter of an expert or a router beside a map."""
     return ".experts." in name or ".routers." in name
 
 
 def own_parameters(expert: ActionExpert) -> dict[str, nn.Parameter]:
-    """The action expert's parameters but those beside its maps, named as if nothing stood there."""
+    """The action expert's parameters without experts and routers, under their original names."""
     own = {}
     for name, parameter in expert.named_parameters():
         if not is_added(name):
-            # A map beside which experts stand is the `base` of a `RoutedLinear`.
+            # A map with experts is the `base` of a `RoutedLinear`.
             own[name.replace(".base.", ".")] = parameter
     return own
 
 
-# --- what a task is learned by --------------------------------------------------------------------
+# --- the training objective -----------------------------------------------------------------------
 
 
 class FlowMatchingLoss:
-    """A task's demonstrations, learned by flow matching."""
+    """The flow matching loss on a task's demonstrations."""
 
     def __init__(
         self, number: int, recipe: RobotStreamRecipe, policy: Policy, demos: Demonstrations
@@ -703,7 +704,7 @@ class FlowMatchingLoss:
         if step is None or settings.augment is None:
             return batch
         numbers, drawn = frames.tolist(), (settings.augment, settings.augment_count, self._seed)
-        # By the step of the whole stream: two tasks may have frames of the same numbers.
+        # Seeded by the step in the whole stream, since frame numbers repeat across tasks.
         at, repeats = self._first_step + step, augment.earlier(numbers)
         images = augment.augmented(batch.images, numbers, *drawn, at, repeats)
         return dataclasses.replace(batch, images=images)
@@ -713,7 +714,7 @@ class FlowMatchingLoss:
         return self._loss(batch, draws, share)
 
     def calibration_loss(self, share: Share = WHOLE) -> Tensor:
-        # The same noise at each check, so that routers that stand still are seen to.
+        # The same noise at each check, so that only changes of the routers show.
         draws = generator(self._seed, self._first_step, CALIBRATION_NOISE)
         return self._loss(self._calibration, draws, share)
 
@@ -721,7 +722,7 @@ class FlowMatchingLoss:
         """Nothing is kept from step to step."""
 
     def _loss(self, batch: RobotBatch, draws: torch.Generator, share: Share) -> Tensor:
-        # Each pass draws the whole batch's noise, and takes its own frames' of it.
+        # Each pass draws the noise of the whole batch and uses the part for its own frames.
         of = WholeBatch(len(batch), int((~batch.is_pad).sum()), share)
         part = batch if share == WHOLE else batch.rows(share.rows(len(batch)))
         encoding = self._policy.encode(part.images, part.instructions)
@@ -730,28 +731,28 @@ class FlowMatchingLoss:
 
 
 def calibration_passes(settings: RobotTrain, frames: int) -> int:
-    """In how many passes routers are measured on so many frames, for no more memory than a step's.
+    """Number of passes to measure routers on `frames` frames with no more memory than a step.
 
-    What is measured is no training, in which alone a Hugging Face model checkpoints gradients: one
-    frame at a time takes less than a step with them.
+    A Hugging Face model checkpoints gradients only in training mode, and routers are measured in
+    evaluation mode. With `gradient_checkpointing` each pass therefore has a single frame.
     """
     if settings.gradient_checkpointing:
         return frames
     if settings.accumulate == 1:
-        return 1  # as it always was
+        return 1
     of_a_pass = max(1, settings.batch_size // settings.accumulate)
     return -(-frames // of_a_pass)  # rounded up
 
 
 def generator(seed: int, index: int, purpose: int) -> torch.Generator:
-    """Noise as a function of the seed and the step of the whole stream.
+    """A generator that depends on the seed, the step in the whole stream and the purpose.
 
-    So a resumed run draws what the uninterrupted one drew.
+    A resumed run therefore draws the same noise as an uninterrupted one.
     """
     return torch.Generator().manual_seed(_seed(seed, index, purpose))
 
 
 def _seed(seed: int, index: int, purpose: int) -> int:
-    # Purposes are below 4, so those of one step share no generator; nor do two seeds, in streams of
+    # Purposes are below 4, so no two of one step share a generator. Nor do two seeds in streams of
     # up to a million steps.
     return (seed * 1_000_003 + index) * 4 + purpose

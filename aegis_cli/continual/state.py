@@ -1,8 +1,8 @@
-"""A stream's run in memory, and its state on disk from which it goes on to the same bytes.
+"""A stream's run in memory, and its state on disk, from which it resumes to the same bytes.
 
-`StreamRun` is the protocol between the two kinds of stream, pictures with classes (`images`) and
-robot tasks (`robots`), and what is written once for both: the driver (`train`), the loop over a
-task's steps (`loop`), the files (`files`), the report (`report`) and the probe (`probe`).
+`StreamRun` is the interface between the two kinds of stream, labelled images (`images`) and robot
+tasks (`robots`), and the modules that both share: the driver (`train`), the loop over a task's
+steps (`loop`), the files (`files`), the report (`report`) and the probe (`probe`).
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ _GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
 @dataclass
 class TaskInProgress:
-    """The task that a run is at, and what it measured so far: all of it that is no tensor, as JSON.
+    """The current task of a run and its measurements so far: the state without its tensors.
 
-    The field names are those of the state on disk, where they must stay.
+    It is stored as JSON under these field names, which therefore must not change.
 
     Attributes:
-        task, step: numbers of the next step; step 0 means that the task has not begun.
+        task, step: task and number of the next step; step 0 means that the task has not begun.
         phase: 1 while routers are being identified, else 2.
-        phase1_steps: steps that this task spent in phase 1, once that is over.
+        phase1_steps: steps that this task spent in phase 1, once it is over.
         trained_phase1: parameters that learn in phase 1, per map; None for a learner without one.
-        learning_phase1: all parameters that learn in phase 1, those of no map included.
-        quiet: consecutive checks at which the routers stood still.
+        learning_phase1: all parameters that learn in phase 1, including those outside the maps.
+        quiet: consecutive checks at which the routers did not move.
         masses: mean weights of the experts at the last check, per map.
-        pruned, dropped: experts that left after phase 1, per map.
-        records, oracle, inferred: what was found of the tasks learned so far.
-        intervals: the 95 % interval of each error in `oracle`, where errors are measured; None
-            where that is of one episode.
+        pruned, dropped: experts removed after phase 1, per map, as in `SiteRouting`.
+        records, oracle, inferred: records and matrix rows of the tasks learned so far.
+        intervals: the 95 % interval of each error in `oracle`, if errors are measured; None for an
+            error over a single episode.
         vqa: accuracy and cross-entropy of a robot's backbone, before the first task and after each.
         window: losses since the last line of metrics.
     """
@@ -78,7 +78,7 @@ class TaskInProgress:
     window: list[float] = field(default_factory=list)
 
     def check(self, tasks: int, steps: int) -> None:
-        """Raise ValueError unless this is a place in a stream of so many tasks and steps."""
+        """Raise ValueError unless this is a place in a stream of `tasks` tasks of `steps` steps."""
         if problem := self._of_other_type():
             raise ValueError(problem)
         if not (0 <= self.task <= tasks and 0 <= self.step <= steps and self.phase in (1, 2)):
@@ -90,9 +90,9 @@ class TaskInProgress:
             record_from(record)
 
     def _of_other_type(self) -> str:
-        """Which field is not of its type; "" if all are."""
+        """Names the field with a value of the wrong type; "" if there is none."""
         try:
-            # As JSON: a strict check of Python values takes no mapping for the dataclass.
+            # As JSON, because strict validation of Python values rejects a mapping.
             TypeAdapter(TaskInProgress).validate_json(files.canonical(vars(self)), strict=True)
         except ValidationError as error:
             first = error.errors()[0]
@@ -102,7 +102,7 @@ class TaskInProgress:
         return ""
 
     def next_task(self) -> TaskInProgress:
-        """The beginning of the next task."""
+        """The place at the beginning of the next task."""
         return TaskInProgress(
             task=self.task + 1,
             records=self.records,
@@ -114,12 +114,13 @@ class TaskInProgress:
 
 
 class Objective(Protocol):
-    """What one task asks of the model: its examples and its loss.
+    """The training objective of one task: its examples and its loss.
 
     Attributes:
         name: the task's name.
         size: number of training examples.
-        passes, calibration_passes: in how many a step's loss is taken, and that of a calibration.
+        passes, calibration_passes: number of forward passes of a step's loss and of the
+            calibration loss.
     """
 
     name: str
@@ -131,36 +132,37 @@ class Objective(Protocol):
         """The training examples with these numbers [B].
 
         Args:
-            step: that trains on them, for which they may be changed; None: as they are.
+            step: the step that trains on them, for which they may be augmented; None means
+                unchanged examples.
         """
 
     def loss(self, batch: Any, step: int, share: Share = WHOLE) -> Tensor:
-        """The task's own loss of a batch of `fetch`, with its graph.
+        """The task's own loss on a batch of `fetch`, with its graph.
 
-        Whatever is drawn at random follows from `step`, so that a resumed run draws it again.
+        All random draws depend on `step`, so that a resumed run repeats them.
 
         Args:
-            share: the part of the batch that passes; what all contribute adds up to its loss.
+            share: the part of the batch in this pass; the losses of all parts add up to the loss.
         """
 
     def calibration_loss(self, share: Share = WHOLE) -> Tensor:
-        """The loss of the same few examples every time, on which routers are measured."""
+        """The loss on a few fixed examples, on which routers are measured."""
 
     def trainable_changed(self) -> None:
-        """From now on other parameters learn: what was kept from step to step may be stale."""
+        """Called when other parameters learn from now on, so cached values may be stale."""
 
 
 @dataclass(kw_only=True)
 class StreamRun(ABC, Generic[S]):
-    """A run of a learner through a stream, whatever the tasks are; built once.
+    """A run of a learner through a stream of any kind of tasks.
 
     Attributes:
         recipe: settings of the stream and of the learner.
-        sites: maps beside which experts stand, by name; none for a learner without experts.
-        fingerprint: digest of the model that the stream began with.
+        sites: maps that can have experts, by name; empty for a learner without experts.
+        fingerprint: digest of the model at the start of the stream.
         out: the run folder.
         current: the task that is being learned.
-        gaussians: what tells the tasks apart, one per task; none for a learner that need not know.
+        gaussians: one per task, to infer the task; empty for a learner that does not infer it.
         partial_matrix: whether the matrix of the tasks so far is written after each of them.
     """
 
@@ -176,14 +178,14 @@ class StreamRun(ABC, Generic[S]):
     @property
     @abstractmethod
     def score_name(self) -> str:
-        """What a progress bar calls an entry of the matrix."""
+        """The name of a matrix entry in a progress bar."""
 
     # --- what learns ------------------------------------------------------------------------------
 
     @property
     @abstractmethod
     def model(self) -> nn.Module:
-        """All that a learner may train, maps with experts included."""
+        """All modules that a learner may train, including maps with experts."""
 
     @property
     @abstractmethod
@@ -192,7 +194,7 @@ class StreamRun(ABC, Generic[S]):
 
     @abstractmethod
     def objective(self, task: int) -> Objective:
-        """What the task of that number is learned by."""
+        """The training objective of task `task`."""
 
     @property
     def options(self) -> dict[str, Any]:
@@ -204,14 +206,14 @@ class StreamRun(ABC, Generic[S]):
         return next(self.model.parameters()).device
 
     def growing(self, task: int) -> Routed:
-        """The maps that get experts with that task."""
+        """The maps that get experts in task `task`."""
         return self.sites
 
     def task_begun(self) -> None:
-        """Called after the learner has begun a task; most kinds have nothing more to do."""
+        """Called after the learner has begun a task; does nothing by default."""
 
     def parameters(self) -> dict[str, nn.Parameter]:
-        """What the learner has changed or added, by name."""
+        """The parameters that the learner has changed or added, by name."""
         if self.learner.trains == "model":
             return dict(self.model.named_parameters())
         return routing.named_parameters(self.sites)
@@ -226,7 +228,7 @@ class StreamRun(ABC, Generic[S]):
         if self.learner.trains == "model":
             return f"{own}.lr"
         if ".routers." in name:
-            # A learner may have a rate of its own for them.
+            # A learner may have its own rate for routers.
             section = own if "router_lr" in self.options else "train"
             return f"{section}.router_lr"
         return "train.lr"
@@ -237,11 +239,11 @@ class StreamRun(ABC, Generic[S]):
         return getattr(getattr(self.recipe, section), key)
 
     def slower(self, names: Iterable[str]) -> str:
-        """What to do where these parameters have diverged."""
+        """Advice for the user if these parameters have diverged."""
         return f"try a lower {' or '.join(sorted({self.rate_key(name) for name in names}))}"
 
     def stored(self) -> int:
-        """How many numbers are kept beside the bare model."""
+        """How many numbers are stored beside the bare model."""
         if self.learner.trains == "model":
             return sum(p.numel() for p in self.model.parameters())
         beside_maps = sum(site.count() for site in self.sites.values())
@@ -249,26 +251,26 @@ class StreamRun(ABC, Generic[S]):
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Digests of what the run is made from: a run goes on only with the same."""
+        """Digests of the run's inputs; a run resumes only with the same inputs."""
         return {"recipe": files.sha256_value(recipes.training_part(self.recipe))}
 
-    # --- what is measured -------------------------------------------------------------------------
+    # --- evaluation -------------------------------------------------------------------------------
 
     def before_stream(self) -> None:
-        """Measure what is to be known before the first task is learned; of images, nothing."""
+        """Take measurements before the first task; none by default, as for images."""
 
     def before_task(self) -> Sequence[Tensor]:
-        """Measure what is to be known before the current task is learned.
+        """Take measurements before the current task is learned.
 
         Returns:
-            The mean feature [D] of each task so far in the bare model, this task's last; nothing
+            The mean feature [D] of each task so far in the bare model, this task's last; empty
             for a learner that does not compare them.
         """
         return ()
 
     @abstractmethod
     def after_task(self) -> dict[str, float]:
-        """Measure every task after the current one, as further rows of `current`.
+        """Measure the tasks after learning the current one, and append the rows to `current`.
 
         Returns:
             Further figures for the log.
@@ -279,22 +281,22 @@ class StreamRun(ABC, Generic[S]):
 
     @abstractmethod
     def measure_again(self, before: StreamReport, on_event: OnEvent) -> tuple[StreamReport, int]:
-        """The report of a finished run with its matrix measured anew from the run's files.
+        """The report of a finished run, with its matrix measured again from the run's files.
 
         Returns:
-            The report, and how many rows were measured, which are the last ones: all rows where
-            what serves a learned task never changes, else the one of the end, since the weights of
-            the others are gone. Those are as the training measured them.
+            The report, and how many of the last rows were measured again: all rows if the weights
+            of a learned task never change, otherwise only the last row, since the weights of the
+            others are gone. The remaining rows are as the training measured them.
         """
 
-    # --- what is reported and written -------------------------------------------------------------
+    # --- report and files -------------------------------------------------------------------------
 
     @abstractmethod
     def report(self) -> StreamReport:
-        """What is said of the tasks learned so far."""
+        """The report of the tasks learned so far."""
 
     def summary(self) -> dict[str, Any]:
-        """What the reports of both kinds of stream have in common, by the reports' names."""
+        """The fields that the reports of both kinds of stream have in common."""
         records = [record_from(raw) for raw in self.current.records]
         return {
             "name": self.recipe.name,
@@ -308,7 +310,7 @@ class StreamRun(ABC, Generic[S]):
 
     @abstractmethod
     def save_model(self) -> None:
-        """Write what the run has trained beside experts and routers, which are written already."""
+        """Write what the run has trained, except experts and routers, which are already written."""
 
 
 AnyStreamRun = StreamRun[StreamRecipe] | StreamRun[RobotStreamRecipe]
@@ -317,12 +319,12 @@ AnyStreamRun = StreamRun[StreamRecipe] | StreamRun[RobotStreamRecipe]
 def optimizer(
     run: AnyStreamRun, before: torch.optim.Optimizer | None = None
 ) -> torch.optim.Optimizer:
-    """AdamW over what learns, at the rates of the run; no weight decay on routers and scales.
+    """AdamW over the trainable parameters, at the run's rates; no decay on routers and scales.
 
     Args:
-        before: the optimizer so far; what goes on learning takes its moments from there. Without
-            them Adam's first steps are as long as its rate whatever the gradient is, in the middle
-            of a schedule and with no warm-up.
+        before: the previous optimizer, from which parameters that go on learning keep their
+            moments. Without moments, Adam's first steps are as long as its rate for any gradient,
+            here in the middle of a schedule and with no warm-up.
     """
     groups: dict[tuple[bool, float], list[nn.Parameter]] = {}
     for name, parameter in run.learning().items():
@@ -345,7 +347,7 @@ def optimizer(
 def save(run: AnyStreamRun, current: torch.optim.Optimizer | None) -> None:
     """Write the run's state: experts, routers, scales, optimizer, phase and structure.
 
-    Nothing random is in it: a step's draws follow from its number.
+    It holds no random state, because a step's draws depend on its number.
 
     Args:
         current: the optimizer of the task being learned, if one is.
@@ -371,10 +373,10 @@ def save(run: AnyStreamRun, current: torch.optim.Optimizer | None) -> None:
 
 
 def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
-    """Put the saved state back, and return the optimizer of the task being learned, if one is.
+    """Restore the saved state, and return the optimizer of the task being learned, if one is.
 
     Raises:
-        AegisError: the state is damaged, or of another recipe or encoder.
+        AegisError: the state is damaged, or belongs to another recipe or encoder.
     """
     path = run.out / STATE
     saved = artifacts.load(path, "training-state")
@@ -390,7 +392,7 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
         run.current = TaskInProgress(**meta["place"])
         run.current.check(len(run.names), run.recipe.train.steps)
         run.gaussians = gaussians_from(saved.tensors)
-        # The structure first: the parameters are those of the experts and routers that it makes.
+        # The structure first, because it creates the experts and routers that have parameters.
         rebuild(run.sites, meta["structure"], weights)
         parameters = run.parameters()
         run.model.requires_grad_(False)
@@ -399,14 +401,14 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
         bare = optimizer_state.said_stateless(meta)
     # At step 0 the task has not begun, and nothing of it learns yet.
     made = optimizer(run) if run.current.step else None
-    # All but the Gaussians, which are no parameters.
+    # Without the Gaussians, which are not parameters.
     own = {name: t for name, t in saved.tensors.items() if not name.startswith("tasks.")}
     optimizer_state.from_tensors(own, parameters, [made] if made else [], f"'{path}'", bare)
     return made
 
 
 def place_in(path: Path) -> TaskInProgress:
-    """Where a state is in its stream, by its header alone.
+    """The place of a state in its stream, read from its header only.
 
     Raises:
         AegisError: it is damaged.
@@ -417,9 +419,10 @@ def place_in(path: Path) -> TaskInProgress:
 
 
 def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:
-    """The inputs of a state, those of the run's own recipe as today's version names them.
+    """The inputs of a state, with the digest of the run's own recipe as this version computes it.
 
-    An earlier version digested also the keys that came later and are at their defaults.
+    The recipe digests of earlier versions differ if keys were added since. A digest that an earlier
+    version made of the run's recipe is replaced by today's.
     """
     if not isinstance(run.recipe, RobotStreamRecipe):
         return then
@@ -429,7 +432,7 @@ def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, 
 
 
 def changed_inputs(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Names of the inputs whose digests differ, those that only one of both has included."""
+    """Names of the inputs whose digests differ, including inputs that only one side has."""
     names = sorted(then.keys() | now.keys())
     return [name for name in names if then.get(name) != now.get(name)]
 
@@ -438,11 +441,11 @@ def rebuild(sites: Routed, structure: Mapping[str, Any], tensors: Mapping[str, T
     """Give every map the experts and routers that `structure` lists.
 
     Args:
-        tensors: those that will be copied into them, by name.
+        tensors: the tensors that will be copied into them, by name.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError: a structure that is not one of these maps
-            and tensors. Nothing as large as it says is made then.
+        KeyError, TypeError, ValueError, AttributeError: the structure does not fit these maps and
+            tensors. Memory for the sizes that it states is not allocated then.
     """
     if structure.keys() != sites.keys():
         raise ValueError(f"a structure of the maps {', '.join(structure)}")
@@ -453,15 +456,15 @@ def rebuild(sites: Routed, structure: Mapping[str, Any], tensors: Mapping[str, T
 
 
 def _check_structure(site: str, said: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Raise what is wrong with the structure of one map."""
+    """Raise an error if the structure of one map is invalid."""
     for number, expert in said["experts"].items():
-        # Compared with the tensor, since a damaged number could ask for any amount of memory.
+        # Compared with the tensor, since a damaged number could require any amount of memory.
         rank = tensors[f"{site}.experts.{int(number)}.a"].shape[0]
         if expert["rank"] != rank or type(expert["frozen"]) is not bool:
             raise ValueError(f"expert {number} of '{site}' is {expert}")
         if type(expert["owner"]) is not int:
             raise ValueError(f"expert {number} of '{site}' belongs to {expert['owner']!r}")
-    # `born` counts deleted experts too, so that no number is given twice.
+    # `born` counts deleted experts too, so that no number is used twice.
     newest = max(map(int, said["experts"]), default=-1)
     if type(said["born"]) is not int or said["born"] <= newest:
         raise ValueError(f"{said['born']!r} experts were born in '{site}'")
@@ -477,7 +480,7 @@ def _check_structure(site: str, said: Mapping[str, Any], tensors: Mapping[str, T
 def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
     """Means [T, D], directions [T, D, r], variances [T, r], noises and thresholds [T] by name.
 
-    There are none for no tasks.
+    The result is empty if there are no tasks.
     """
     tensors = {}
     for name in _GAUSSIAN if gaussians else ():
@@ -486,12 +489,12 @@ def gaussian_tensors(gaussians: list[Gaussian]) -> dict[str, Tensor]:
 
 
 def gaussians_from(tensors: Mapping[str, Tensor]) -> list[Gaussian]:
-    """What `gaussian_tensors` wrote."""
+    """The Gaussians from the tensors of `gaussian_tensors`."""
     if "tasks.mean" not in tensors:
         return []
     parts = [tensors[f"tasks.{name}"] for name in _GAUSSIAN]  # of all tasks, [T, ...] each
     found = []
     for one in zip(*parts, strict=True):
-        # Clones, because a view of one task would keep those of all in memory.
+        # Cloned, because a view of one task would keep the tensors of all tasks in memory.
         found.append(Gaussian(*(t.clone() for t in one)))
     return found

@@ -1,16 +1,17 @@
-"""`aegis train` on a stream: its tasks one after the other, and after each a measurement of them.
+"""`aegis train` on a stream: learns its tasks one after the other and measures them after each.
 
     recipe.yaml  metrics.jsonl
-    experts.safetensors  routing.safetensors   of a learner with experts
-    encoder/, backbone/                        of one that trains the model itself
+    experts.safetensors  routing.safetensors   for a learner with experts
+    encoder/, backbone/                        for one that trains the model itself
     expert.safetensors                         a robot's action expert, and scales per task
-    accuracy_matrix.json                       of images
-    success_matrix.json, error_matrix.json     of robots: simulated ones, others
+    accuracy_matrix.json                       for images
+    success_matrix.json, error_matrix.json     for robots: simulated, or not
     parameters.json  stream.json
     state.safetensors                          what --resume needs; gone when the stream is done
-    ../demos/                                  what was recorded, for all runs beside this one
+    ../demos/                                  recordings, for all runs beside this one
 
-All but the metrics, which hold times, are the same bytes in every repetition, interrupted or not.
+All files but the metrics, which hold times, have the same bytes in every equal run, interrupted or
+not.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ def run(
     on_event: OnEvent = ignore,
     overwrite: bool = False,
 ) -> StreamReport:
-    """Learn `recipe.train.method`'s way through the stream, into the run folder `out`.
+    """Learn the stream with the learner `recipe.train.method`, into the run folder `out`.
 
     Args:
-        resume: go on with the run that is there, if there is one.
-        overwrite: remove the run that is there, once everything else has been checked.
+        resume: continue the run in `out`, if there is one.
+        overwrite: remove the run in `out`, once everything else has been checked.
 
     Raises:
-        AegisError: inputs that do not fit, an existing run without either, one that another
-            process is at, or a disk that cannot be written.
-        Diverged: a loss or gradient that is not finite.
+        AegisError: inputs that do not fit, a run in `out` without either flag, a run that another
+            process is using, or a disk that cannot be written.
+        Diverged: a loss or gradient is not finite.
     """
     launch.check_one()
     out = Path(out)
@@ -79,13 +80,13 @@ def _run(
         optimizer = state.restore(built)
         _truncate_metrics(built)
     else:  # also a run that was interrupted before its first state
-        # Written only now, when all that the recipe names has been found to fit.
+        # Written only now, after all inputs of the recipe have been checked.
         folder.begin(out, recipe)
         built.before_stream()
     _learn(built, optimizer, on_event)
     report = built.report()
     files.write(built, report)
-    # Last: a run that is interrupted while it writes goes on from its state.
+    # Last, so that a run that is interrupted while writing can resume from its state.
     (out / state.STATE).unlink(missing_ok=True)
     return report
 
@@ -98,9 +99,9 @@ def read_by(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
 
 
 def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> None:
-    """Raise AegisError if a finished run learned from demonstrations of other settings.
+    """Raise AegisError if a finished run learned from demonstrations with other settings.
 
-    Where files are given instead, they may have been moved.
+    Given files are not compared, because they may have been moved.
     """
     if not isinstance(recipe, RobotStreamRecipe) or recipe.demos.paths is not None:
         return
@@ -116,7 +117,7 @@ def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -
 def build(
     recipe: StreamRecipe | RobotStreamRecipe, out: Path, on_event: OnEvent = ignore
 ) -> AnyStreamRun:
-    """Model, tasks and learner of a run that is to be trained.
+    """Build model, tasks and learner of a run that is to be trained.
 
     Raises:
         AegisError: inputs that do not fit together; nothing has been written to `out` then.
@@ -125,14 +126,14 @@ def build(
 
 
 def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> AnyStreamRun:
-    """A finished run whose figures can be measured again.
+    """Load a finished run whose figures can be measured again.
 
     Args:
         before: the run's report.
 
     Raises:
-        AegisError: files that are missing, damaged or not of one run, or something that the run was
-            measured with is no longer the same.
+        AegisError: files are missing, damaged or not of one run, or an input that the run was
+            measured with has changed.
     """
     recipe = recipes.load_training(path / "recipe.yaml")
     assert not isinstance(recipe, Recipe)
@@ -143,7 +144,7 @@ def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:
     """The module of the stream's kind, with its own `build` and `load`."""
     if isinstance(recipe, StreamRecipe):
         return images
-    from aegis_cli.continual import robots  # loads MuJoCo, which images do without
+    from aegis_cli.continual import robots  # loads MuJoCo, which images do not need
 
     return robots
 
@@ -151,10 +152,10 @@ def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:
 def _learn(
     stream: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent
 ) -> None:
-    """Learn the tasks that are left, and measure after each.
+    """Learn the remaining tasks, and measure after each.
 
     Args:
-        optimizer: of the current task, if it has begun.
+        optimizer: the optimizer of the current task, if it has begun.
     """
     count = len(stream.names)
     while stream.current.task < count:
@@ -162,12 +163,12 @@ def _learn(
         prototypes = stream.before_task()
         record = loop.learn(stream, prototypes, optimizer, on_event)
         started = time.perf_counter()
-        # through JSON, so that a run that goes on holds the same values as one read from disk
+        # Through JSON, so that an uninterrupted run holds the same values as a resumed one.
         learned.records.append(json.loads(canonical(dataclasses.asdict(record))))
         figures = stream.after_task()
         line = {"task": learned.task, "step": stream.recipe.train.steps, **figures}
         folder.append_metrics(stream.out, line | {"seconds": time.perf_counter() - started})
-        # The next task begins with an optimizer of its own: the state says so by step 0.
+        # The next task begins with a new optimizer; step 0 marks this in the state.
         stream.current, optimizer = learned.next_task(), None
         if stream.current.task < count:
             if stream.learner.trains != "nothing":
@@ -179,7 +180,7 @@ def _learn(
 
 
 def _truncate_metrics(stream: AnyStreamRun) -> None:
-    """Forget what was logged after the state was written: a resumed run repeats those steps."""
+    """Drop the lines logged after the state was written: a resumed run repeats those steps."""
     at = (stream.current.task, stream.current.step)
     lines = folder.read_metrics(stream.out, "task", "step")
     kept = [json.dumps(line) for line in lines if (line["task"], line["step"]) <= at]

@@ -1,8 +1,8 @@
 """The learners of streams by name: each is the file of that name in this folder.
 
-A new learner is a file with `LEARNER = Learner(...)`, its name in `recipes.LEARNERS` (in the order
-of tables), and a section of options if it has any. Recipes are read without torch, which is why
-they say the names themselves.
+A new learner needs a file with `LEARNER = Learner(...)`, its name in `recipes.LEARNERS` (in the
+order of tables), and a section of options if it has any. The recipes list the names themselves
+because they are read without torch.
 """
 
 from collections.abc import Iterable
@@ -17,8 +17,8 @@ def find(names: Iterable[str]) -> dict[str, Learner]:
     """The learners of these names from their files.
 
     Raises:
-        ModuleNotFoundError: no file of that name.
-        ValueError: a file that calls its learner otherwise.
+        ModuleNotFoundError: there is no file of that name.
+        ValueError: a file's learner has another name.
     """
     return {name: _load(name) for name in names}
 
@@ -27,7 +27,7 @@ def get(name: str) -> Learner:
     """The learner of that name.
 
     Raises:
-        AegisError: there is none.
+        AegisError: there is no such learner.
     """
     if name not in LEARNERS:
         raise AegisError(

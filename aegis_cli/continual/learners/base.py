@@ -1,4 +1,4 @@
-"""A learner of a stream as parts: what a task adds, what learns, what is frozen afterwards."""
+"""The parts of a stream's learner: what a task adds, what learns, what is frozen afterwards."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TaskContext:
         options: the learner's own part of the recipe.
         prototypes: mean feature of each task's training images in the bare model, this task's last
             [task + 1, D]; empty for a learner that does not compare them.
-        generator: what new experts are drawn from; a function of the seed and the task.
+        generator: draws the weights of new experts; depends only on the seed and the task.
     """
 
     task: int
@@ -44,14 +44,14 @@ class TaskContext:
 class Identification:
     """A first phase, in which the routers decide what the task needs.
 
-    Its options are `identify` (the share of a task's steps that it may take), `check_every`
+    Its options are `identify` (the largest share of a task's steps that it may take), `check_every`
     (steps), `tolerance` and `checks`: it ends as soon as the routers' mean weights have moved by
-    less than `tolerance` (total variation, mean over maps) in that many checks on end.
+    less than `tolerance` (total variation, mean over maps) in `checks` consecutive checks.
 
     Attributes:
-        penalty: what is added to the task's loss, of a pass that is that share of a step; what it
-            charges the traces, it adds to the gradient on the way back.
-        settle: fixes the structure for what is left of the steps, given what flows where.
+        penalty: the term added to the task's loss in a pass that is the given share of a step. It
+            also charges the traces, which adds to the gradient in the backward pass.
+        settle: fixes the structure for the remaining steps, given the flows.
     """
 
     penalty: Callable[[TaskContext, Traces, float], Tensor]
@@ -60,11 +60,11 @@ class Identification:
 
 @dataclass(frozen=True)
 class Constraint:
-    """What holds a task's last phase in a subspace; both functions are called at every step.
+    """Keeps a task's last phase in a subspace; both functions are called at every step.
 
     Attributes:
         gradient: changes `.grad` before the optimizer reads it.
-        update: changes what the optimizer has just done.
+        update: corrects the update that the optimizer has just made.
     """
 
     gradient: Callable[[], None]
@@ -78,17 +78,17 @@ class Learner:
     Attributes:
         name: as users write it; its options are the recipe's key of that name, with '_' for '-'.
         summary: one line for tables and help.
-        trains: nothing, the whole `model`, or `experts` beside frozen maps.
-        shared: one state serves all tasks, those to come too; else each task has a router of its
-            own, and a task that has not come yet gets the bare model.
-        frozen: what serves a learned task never changes again.
-        compares: it asks for the tasks' prototypes.
-        begin: adds what the task needs and makes what learns trainable; everything is frozen before
-            it.
-        router: maps the number of a task to that of the router that serves it.
-        identification: the first of two phases; None for a learner with one.
+        trains: `nothing`, the whole `model`, or `experts` beside frozen maps.
+        shared: one state serves all tasks, including future ones; otherwise each task has its own
+            router, and a task that has not come yet gets the bare model.
+        frozen: the weights that serve a learned task never change again.
+        compares: it needs the tasks' prototypes.
+        begin: adds what the task needs and makes its parameters trainable; everything is frozen
+            before the call.
+        router: maps the number of a task to the number of the router that serves it.
+        identification: the first of two phases; None for a learner with one phase.
         constrain: called at the beginning of the last phase.
-        finish: called after the last step with what flows where, before everything is frozen.
+        finish: called with the flows after the last step, before everything is frozen.
     """
 
     name: str
@@ -124,7 +124,7 @@ def route_task(
 
 
 def keep_experts(context: TaskContext, _: Flows) -> None:
-    """Freeze every expert there is."""
+    """Freeze all experts."""
     for site in context.sites.values():
         for expert in site.of(site.numbers):
             expert.frozen = True

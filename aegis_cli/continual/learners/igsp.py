@@ -1,30 +1,29 @@
-"""iGSP (arXiv 2605.19301): what a task shares is decided by where its optimisation goes.
+"""iGSP (arXiv 2605.19301): a task's optimisation decides which earlier experts it shares.
 
-Phase 1, subspace identification: beside all experts of earlier tasks, `candidates` new ones join
-the task's router. The loss is the task's plus
+Phase 1, subspace identification: the task's router gets all experts of earlier tasks and
+`candidates` new ones. The loss is the task's loss plus
 
     reuse * (sum over maps l of n_l m_l) / (sum over maps of n_l) + norm * sum of ||B_c A_c||_F^2
     over new experts
 
-with n_l the numbers in a map's new experts and m_l the mean weight on them over the positions that
-the loss reads (`identification.charge`): the first term is the share of the new numbers that the
-routers ask for. So a gradient flows into new directions only where old ones do not serve
-(`core/routing.py` says why that is a projection). The second term is needed: with the first alone
-the router's weight of a new expert falls while its norm grows, and the expert carries the fit at a
-weight near zero. Of the first task, which has no history, `reuse` asks nothing. When the routers
-have converged, experts with little weight *and* little load leave the router
-(`identification.needed`): new ones are gone for good, old ones only cost this task a logit. No new
-expert may be left: pure reuse.
+where n_l is the count of numbers in a map's new experts and m_l the mean weight on them over the
+positions that the loss reads (`identification.charge`). The first term is the share of the new
+numbers that the routers use. A gradient therefore flows into new directions only if old ones do not
+suffice (`core/routing.py` explains why that is a projection). The second term is needed: with the
+first alone, the router's weight of a new expert falls while the expert's norm grows, and the expert
+carries the fit at a weight near zero. `reuse` has no effect in the first task, which has no
+history. When the routers have converged, experts with little weight *and* little load leave the
+router (`identification.needed`): new ones are deleted, old ones only lose their logit in this
+task's router. Possibly no new expert remains, which is pure reuse.
 
-Phase 2, orthogonal subspace fine-tuning: structure and routers' parameters are fixed, both terms
-are dropped, and what is left of the new experts learns, with the scales. `orthogonal: true` also
-takes from the survivors' gradients, and from the applied updates (Adam would turn them back), all
-that lies in the columns of earlier tasks' experts.
+Phase 2, orthogonal subspace fine-tuning: the structure and the routers' parameters are fixed, both
+terms are dropped, and the remaining new experts learn, together with the scales. `orthogonal: true`
+also removes all components in the columns of earlier tasks' experts from the gradients of these
+experts, and from the applied updates (Adam would rotate them back).
 
-The two phases, pre-expansion, the regularisation towards history and pruning by routing are the
-paper's, from its abstract. Everything in detail is ours: the form of the penalty, the norm, the
-load rule, what routers start from, rank, candidates, thresholds, sites. `reuse: 0` and `prune:
-false` are ablations.
+The two phases, pre-expansion, the regularisation towards history and pruning by routing come from
+the paper's abstract. All details are ours: the form of the penalty, the norm, the load rule, the
+initial routers, rank, candidates, thresholds, sites. `reuse: 0` and `prune: false` are ablations.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from aegis_cli.core.routing import RoutedLinear, Router
 
 
 def begin(context: TaskContext) -> None:
-    """Pre-expand the basis: history first, new experts after it."""
+    """Pre-expand the basis: earlier tasks' experts first, then the new ones."""
     options = context.options
     for site in context.sites.values():
         history = site.numbers
@@ -63,10 +62,10 @@ def begin(context: TaskContext) -> None:
 
 @torch.no_grad()
 def start(router: Router, old: int, new: int, share: float) -> None:
-    """Let history begin with `share` of the weight, and each new expert at full strength.
+    """Give history `share` of the initial weight, and each new expert full strength.
 
-    Full strength, s p_c = 1 with the scale s and the weight p_c, is that of an expert alone. From
-    uniform weights and a scale of 1 a task would begin deep in what earlier tasks did, and
+    Full strength, s p_c = 1 with the scale s and the weight p_c, is that of a single expert. With
+    uniform weights and a scale of 1 a task would start close to what earlier tasks learned, and
     learn slowly: a step of an expert moves the output by (s p)^2.
     """
     if old:
@@ -79,13 +78,13 @@ def start(router: Router, old: int, new: int, share: float) -> None:
 
 
 def penalty(context: TaskContext, traces: Traces, share: float = 1.0) -> Tensor:
-    """What phase 1 adds to the loss: the norms; the mass is charged on the way back.
+    """The term that phase 1 adds to the loss: the norms; the mass is charged in the backward pass.
 
     Args:
-        share: that a pass is of a step, whose passes pay it together.
+        share: the share of a step that this pass is; the passes of a step add up to the full term.
     """
     used = {name: _used(site, context.task) for name, site in context.sites.items()}
-    # Where a map has no history, there is nothing to prefer to new experts.
+    # A map without history has nothing to prefer to new experts.
     sizes = {}
     for name, (history, new) in used.items():
         if history:
@@ -94,7 +93,7 @@ def penalty(context: TaskContext, traces: Traces, share: float = 1.0) -> Tensor:
         history, new = used[name]
         columns = range(len(history), len(history) + len(new))  # new experts come last in a router
         price = share * context.options["reuse"] * size / sum(sizes.values())
-        # A map that is passed several times in a step pays as much as one that is passed once.
+        # A map that is applied several times in a step pays as much as one that is applied once.
         for passed in traces[name]:
             charge(passed, columns, price / len(traces[name]))
     norms = []
@@ -104,7 +103,7 @@ def penalty(context: TaskContext, traces: Traces, share: float = 1.0) -> Tensor:
 
 
 def settle(context: TaskContext, flows: Flows) -> None:
-    """Prune, and fix the routers but for their scales."""
+    """Prune, and freeze the routers except for their scales."""
     options = context.options
     for name, site in context.sites.items():
         router = site.router(context.task)
@@ -117,17 +116,17 @@ def settle(context: TaskContext, flows: Flows) -> None:
 
 
 def constrain(context: TaskContext) -> Constraint | None:
-    """With `orthogonal`, keep the new experts that are left off the columns of earlier ones."""
+    """With `orthogonal`, keep updates of new experts orthogonal to the columns of earlier ones."""
     if not context.options["orthogonal"]:
         return None
-    held: list[tuple[Tensor, Tensor]] = []  # each new B, and what its columns must not enter
+    held: list[tuple[Tensor, Tensor]] = []  # each new B, and the columns its updates must avoid
     for site in context.sites.values():
         experts = site.of(site.numbers)
         old = [expert.b for expert in experts if expert.owner < context.task]
         if old:
             columns = basis(old)
             held += [(expert.b, columns) for expert in experts if expert.owner == context.task]
-    before = [b.detach().clone() for b, _ in held]  # room for the values before each step
+    before = [b.detach().clone() for b, _ in held]  # buffers for the values before each step
 
     @torch.no_grad()
     def gradient() -> None:
@@ -139,7 +138,7 @@ def constrain(context: TaskContext) -> Constraint | None:
     @torch.no_grad()
     def update() -> None:
         for (b, columns), kept in zip(held, before, strict=True):
-            # Only what was added is projected: what phase 1 has left in the span stays.
+            # Only the update is projected; components in the span that phase 1 left there stay.
             b.copy_(kept + without_span(b - kept, columns))
 
     return Constraint(gradient, update)
@@ -148,7 +147,7 @@ def constrain(context: TaskContext) -> Constraint | None:
 def _used(site: RoutedLinear, task: int) -> tuple[list[int], list[int]]:
     """Numbers of the experts that the task's router uses: those of earlier tasks, and its own.
 
-    They stand in the router in this order.
+    The router has them in this order.
     """
     router = site.router(task)
     assert router is not None

@@ -9,7 +9,7 @@ from aegis_cli.continual.learners.base import Learner, TaskContext, keep_experts
 
 
 def begin(context: TaskContext) -> None:
-    """Each map gets one expert, which the task alone uses."""
+    """Give each map one expert, which only this task uses."""
     for site in context.sites.values():
         own = site.add_expert(context.options["rank"], context.task, context.generator)
         route_task(site, context.task, [own], context)

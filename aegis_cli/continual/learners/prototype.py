@@ -1,8 +1,7 @@
-"""Sharing by how images look: tasks whose mean features are close share an expert.
+"""Sharing by image similarity: tasks whose mean features are close share an expert.
 
-This is a plain form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is
-ours. A shared expert goes on learning, so whatever the new task does to it happens to the earlier
-ones too.
+This is a simple form of what iGSP (arXiv 2605.19301) calls similarity-driven sharing; the rule is
+ours. A shared expert goes on learning, so the new task also changes it for the earlier tasks.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from aegis_cli.continual.learners.base import Learner, TaskContext, route_task
 
 
 def begin(context: TaskContext) -> None:
-    """Go on with the experts of the nearest earlier task, or begin one of its own."""
+    """Continue the experts of the nearest earlier task, or add new ones."""
     partner = nearest(context.prototypes, context.options["similarity"])
     for site in context.sites.values():
         known = None if partner is None else site.router(partner)
-        if known is None:  # also a map that the partner has no router at
+        if known is None:  # also if the partner has no router at this map
             own = site.add_expert(context.options["rank"], context.task, context.generator)
             route_task(site, context.task, [own], context)
             continue
@@ -30,7 +29,7 @@ def begin(context: TaskContext) -> None:
 def nearest(prototypes: Tensor, similarity: float) -> int | None:
     """The earlier task whose prototype has the largest cosine with the last of [T, D].
 
-    There is none if that cosine is under `similarity`.
+    The result is None if that cosine is below `similarity`.
     """
     if len(prototypes) == 1:
         return None

@@ -6,7 +6,7 @@ from aegis_cli.continual.learners.base import Learner, TaskContext
 
 
 def begin(context: TaskContext) -> None:
-    """Every parameter learns."""
+    """Make every parameter trainable."""
     context.model.requires_grad_(True)
 
 

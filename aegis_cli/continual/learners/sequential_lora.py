@@ -8,12 +8,12 @@ _ONLY = 0  # number of the router that serves every task
 
 
 def begin(context: TaskContext) -> None:
-    """The only expert and router come with the first task and learn with every one."""
+    """Add the only expert and router with the first task; both learn in every task."""
     for site in context.sites.values():
         if context.task == 0:
             own = site.add_expert(context.options["rank"], _ONLY, context.generator)
             route_task(site, _ONLY, [own], context)
-        # After each task everything is frozen, the only expert too.
+        # After each task everything is frozen, including the only expert.
         site.experts.requires_grad_(True)
         site.routers.requires_grad_(True)
 
