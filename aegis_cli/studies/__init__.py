@@ -1,1 +1,1 @@
-"""Many runs compared: variants x tasks x seeds, with one tuned knob each."""
+"""Comparisons of many runs: variants x tasks x seeds, with one tuned knob per variant."""

@@ -1,4 +1,4 @@
-"""The cells of a study: what they lead to is kept by key, and only new ones are measured.
+"""The cells of a study: results are stored by key, and only new cells are measured.
 
 Several processes can measure them at once.
 """
@@ -27,8 +27,8 @@ from aegis_cli.studies.figures import Divergence, Figures, Outcome
 from aegis_cli.studies.tuning import Point, Rule
 
 CELLS = "cells.json"
-CLEARING = "clearing.json"  # which measured cell's run is being removed, while it is
-_LISTEN_S = 0.2  # between looks at what the processes report
+CLEARING = "clearing.json"  # names the measured cell whose run is just being removed
+_LISTEN_S = 0.2  # seconds between polls for the processes' events
 _FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
 CellRecipe = Recipe | StreamRecipe | RobotStreamRecipe
 R = TypeVar("R", bound=CellRecipe)  # of all cells of one study
@@ -40,10 +40,10 @@ class Cell(Generic[R]):
     """One training.
 
     Attributes:
-        label: its run folder below the study's.
+        label: its run folder, relative to the study's folder.
         validation: whether it is measured on the validation split.
-        judging: with `validation`, the seeds of the compared cells: on episodes that these hold
-            out, nothing is tuned.
+        judging: with `validation`, the seeds of the compared cells, whose held-out episodes must
+            not be used for tuning.
     """
 
     label: str
@@ -53,22 +53,22 @@ class Cell(Generic[R]):
 
 
 class CellRunner(Protocol[R]):
-    """What trains and measures cells below one folder."""
+    """Trains and measures cells below one folder."""
 
     def key(self, cell: Cell[R]) -> str:
-        """Digest of all that shapes what the cell leads to."""
+        """Digest of everything that affects the cell's result."""
 
     def measure(self, cell: Cell[R]) -> Outcome:
         """Train and measure a cell."""
 
     def clear(self, label: str) -> None:
-        """Remove what a measured cell leaves and nobody reads; others may be at work."""
+        """Remove a measured cell's files that nobody reads; other processes may be at work."""
 
     def tidy(self, labels: Iterable[str]) -> None:
-        """Remove what is left of cleared cells, when nobody is at work any more."""
+        """Remove the rest of cleared cells, once no process is at work any more."""
 
     def begin_anew(self) -> None:
-        """Take nothing in the folder for finished."""
+        """Treat nothing in the folder as finished."""
 
 
 MakeRunner = Callable[[Path, OnEvent], CellRunner[R]]
@@ -79,10 +79,10 @@ class StudyKind(Protocol[R]):
 
     Attributes:
         places: the tasks or streams that every variant is measured on.
-        figures: the dataclass of what a cell leads to, unless it diverges.
-        make_runner: called in each process; it travels there by name.
+        figures: the dataclass of a cell's result, unless it diverges.
+        make_runner: called in each process; it is pickled by name.
         rule: how a knob's value is chosen.
-        tunes_fixed: whether variants without a choice are measured with the tuned ones.
+        tunes_fixed: whether variants without a knob are measured together with the tuned ones.
     """
 
     places: Sequence[str]
@@ -96,43 +96,43 @@ class StudyKind(Protocol[R]):
         """The study, with `variants`, `seeds`, `tuning` and `keep_runs`."""
 
     def cell(self, variant: str, place: str, seed: int, value: Any) -> R:
-        """The recipe of a compared cell; `value` is what the variant's knob is set to.
+        """The recipe of a compared cell; `value` is the value of the variant's knob.
 
         Raises:
-            AegisError: keys or values that make no recipe.
+            AegisError: keys or values that are not a valid recipe.
         """
 
     def trial(self, variant: str, value: Any) -> R:
-        """The recipe by which a knob's value is judged, on the validation split."""
+        """The recipe that evaluates a knob's value on the validation split."""
 
     def check(self, trials: Sequence[R]) -> None:
         """Raise AegisError for a study that cannot be run, before any work."""
 
     def prepare(self, runner: Any, cells: Sequence[Cell[R]], together: bool) -> None:
-        """Check and make what cells share, before they are measured.
+        """Check and create what cells share, before they are measured.
 
         Args:
-            together: whether by several processes, which share nothing but files.
+            together: whether several processes measure them; these share only files.
         """
 
     def point(self, variant: str, value: Any, found: Any) -> Point:
-        """What a knob's value led to."""
+        """The result of a knob's value."""
 
     def costs(self, store: CellStore[R], chosen: Mapping[str, Any]) -> Mapping[str, Cost]:
-        """What the compared variants cost over naive, measured if `store` does not know it.
+        """The compared variants' costs relative to naive, measured if `store` does not have them.
 
-        Where `store` delivers only what is known, nothing is measured.
+        If `store` delivers only known results, nothing is measured.
         """
 
     def report(self, findings: Findings, store: CellStore[R]) -> Report:
-        """The table of what is known."""
+        """The table of the results so far."""
 
 
 class CellStore(Generic[R]):
     """A study's folder, its finished cells, and the runner that measures the others.
 
     Attributes:
-        cells: what `cells.json` holds, by key.
+        cells: the content of `cells.json`, by key.
         done: number of cells that have been delivered, of `total`.
         known_only: whether only finished cells are delivered, and nothing is measured.
     """
@@ -145,7 +145,7 @@ class CellStore(Generic[R]):
         workers: int = 1,
         known_only: bool = False,
     ) -> None:
-        """Read what is finished."""
+        """Read the finished cells."""
         files.make_folder(folder)
         self.kind = kind
         self.folder = folder
@@ -160,13 +160,13 @@ class CellStore(Generic[R]):
         """Remove what a killed process has left of a measured cell's run.
 
         Raises:
-            AegisError: what it has noted about that is damaged.
+            AegisError: the note about it is damaged.
         """
         note = self.folder / CLEARING
         if not note.exists():
             return
         key, label = _noted(note)
-        if key in self.cells:  # else it is measured again, and needs what is there
+        if key in self.cells:  # otherwise it is measured again and needs its files
             self.runner.clear(label)
         note.unlink()
 
@@ -177,16 +177,16 @@ class CellStore(Generic[R]):
         self.runner.begin_anew()
 
     def count_known(self, cells: Sequence[Cell[R]]) -> int:
-        """How many of the cells `measured` would deliver without measuring them, the first ones."""
+        """How many of the cells are finished; `measured` delivers these first."""
         return sum(self.runner.key(cell) in self.cells for cell in cells)
 
     def measured(self, cells: Sequence[Cell[R]]) -> Generator[tuple[Cell[R], Outcome]]:
-        """What the cells led to: the known ones first, then the others as they are measured.
+        """The cells and their results: known ones first, then the others as they are measured.
 
         Equal cells are measured once.
         """
         keys = {cell.label: self.runner.key(cell) for cell in cells}
-        todo: dict[str, Cell[R]] = {}  # of equal cells the first, which is measured for all
+        todo: dict[str, Cell[R]] = {}  # the first of equal cells, measured for all of them
         for cell in cells:
             if keys[cell.label] in self.cells:
                 yield cell, self._deliver(keys[cell.label])
@@ -197,7 +197,7 @@ class CellStore(Generic[R]):
         waiting = [cell for cell in cells if keys[cell.label] in todo]
         together = self.workers > 1 and len(todo) > 1
         self.kind.prepare(self.runner, list(todo.values()), together)
-        # Closed at once if the caller stops: then the processes at work are ended, not waited for.
+        # If the caller stops, this is closed at once, which ends the workers without waiting.
         with contextlib.closing(self._measure(list(todo.values()), together)) as found:
             for first, figures in found:
                 key = keys[first.label]
@@ -215,7 +215,7 @@ class CellStore(Generic[R]):
             self.runner.tidy(cell.label for cell in cells)
 
     def _measure(self, cells: list[Cell[R]], together: bool) -> Generator[tuple[Cell[R], Outcome]]:
-        """What cells led to, as they finish, measured here or by several processes."""
+        """Results of cells as they finish, measured here or by several processes."""
         if not together:
             for cell in cells:
                 yield cell, self.runner.measure(cell)
@@ -231,17 +231,17 @@ class CellStore(Generic[R]):
         return self.known(key, Divergence if diverged else self.kind.figures)
 
     def keep(self, key: str, found: Any) -> None:
-        """Store what was found, a dataclass, at once."""
+        """Store a result, which is a dataclass, in the file at once."""
         self.cells[key] = dataclasses.asdict(found)
         files.write_text(self.folder / CELLS, files.canonical(self.cells) + "\n")
 
     def _keep_and_clear(self, key: str, found: Outcome, label: str) -> None:
-        """Store what was found, and remove the run.
+        """Store a result, and remove the run.
 
-        A process that is killed meanwhile leaves a note, by which the next one removes the rest.
+        If the process is killed meanwhile, its note tells the next process to remove the rest.
         """
-        # In this order: wherever a kill falls, the figures are there before the run goes, and the
-        # note is there as long as some of the run may be left.
+        # The order matters: the figures are stored before the run is removed, and the note exists
+        # as long as parts of the run may be left.
         note = self.folder / CLEARING
         files.save_json(note, {"cell": key, "run": label})
         self.keep(key, found)
@@ -252,7 +252,7 @@ class CellStore(Generic[R]):
         """A finished entry.
 
         Raises:
-            AegisError: something else than what this version writes.
+            AegisError: the entry is not in the format of this version.
         """
         try:
             return decode(kind, self.cells[key])
@@ -268,7 +268,7 @@ class CellStore(Generic[R]):
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """What a folder's `cells.json` holds; nothing where it is not there."""
+    """The content of a folder's `cells.json`; empty if there is none."""
     cells = files.load_json(path) if path.exists() else {}
     if not isinstance(cells, dict):
         raise AegisError(
@@ -286,7 +286,7 @@ def _noted(note: Path) -> tuple[str, str]:
         key, label = left["cell"], left["run"]
         if not isinstance(key, str) or not isinstance(label, str):
             raise TypeError("a name that is no text")
-        # What it names is removed: a damaged note must not lead out of the study's folder.
+        # This path is removed, so a damaged note must not point outside the study's folder.
         if Path(label).is_absolute() or not {".", ".."}.isdisjoint(label.split("/")):
             raise ValueError(f"'{label}' is no run of the study")
     except (TypeError, KeyError, ValueError) as error:
@@ -311,10 +311,10 @@ def _measure_together(
     """Measure cells, `workers` at a time, each with its share of the cores.
 
     Raises:
-        AegisError: what a stage finds wrong, or a process that died; the others are stopped, at a
+        AegisError: a stage raised it, or a process died; the other processes are stopped at a
             step to resume from.
     """
-    reports: Queue[Event] = SPAWN.Queue()  # by which the processes tell this one how far they are
+    reports: Queue[Event] = SPAWN.Queue()  # progress events from the processes to this one
     arguments = (make, folder, reports, threads_per_worker(workers))
     with WorkerPool(workers, "a process of the study", _FIX, _begin, arguments) as pool:
         numbers = {pool.submit(_measure_here, cell): i for i, cell in enumerate(cells)}
@@ -325,25 +325,25 @@ def _measure_together(
 def _finished(
     numbers: dict[Future[Outcome], int], reports: Queue[Event], on_event: OnEvent
 ) -> Iterator[tuple[int, Outcome]]:
-    """The numbers of the cells as they finish, with what they led to; events on the way."""
+    """The numbers and results of the cells as they finish; passes on events meanwhile."""
     waiting = set(numbers)
     while waiting:
-        # With a time limit, since events come while nothing finishes.
+        # With a timeout, since events arrive while no cell finishes.
         done, waiting = wait(waiting, _LISTEN_S, FIRST_COMPLETED)
         while not reports.empty():
             on_event(reports.get())
-        # `done` is a set, whose order changes from run to run.
+        # `done` is a set, so its order differs between runs.
         for future in sorted(done, key=lambda f: numbers[f]):
-            yield numbers[future], future.result()  # raises what the process has raised
+            yield numbers[future], future.result()  # re-raises an error of the process
 
 
-_runner: CellRunner[Any]  # of a process of its own
+_runner: CellRunner[Any]  # one in each worker process
 
 
 def _begin(make: MakeRunner[R], folder: Path, reports: Queue[Event], threads: int) -> None:
     global _runner
     _runner = make(folder, reports.put)
-    torch.set_num_threads(threads)  # else each would take all cores
+    torch.set_num_threads(threads)  # otherwise each process would use all cores
 
 
 def _measure_here(cell: Cell[R]) -> Outcome:

@@ -1,9 +1,9 @@
-"""What a study found: its figures, declared once for each kind of study, and who passes the bar.
+"""The results of a study: its figures, declared once per kind of study, and who passes the bar.
 
-Figures are means over seeds with 95 % intervals. A seed's figure is its mean over tasks or streams,
-which the recipe names and which are not draws of anything: an interval says nothing of other tasks,
-or other orders of a stream. Of other questions and episodes it speaks where the cells have kept
-what they were measured on.
+Figures are means over seeds with 95 % intervals. A seed's figure is its mean over tasks or streams.
+The recipe names these; they are not random draws, so an interval says nothing about other tasks or
+other orders of a stream. It covers other questions and episodes only if the cells have stored the
+units that they were measured on.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ class Cost:
     """Ratios to naive's training step.
 
     Attributes:
-        machine: what they were measured on, since they hold there; so does `code`, the version and
-            digest of the package. None in what an earlier version kept.
+        machine: the machine that they were measured on; they hold only there.
+        code: version and digest of the package that measured them. Both are None in entries that an
+            earlier version stored.
     """
 
     step_time: float
@@ -79,12 +80,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a study knows so far.
+    """The results of a study so far.
 
     Attributes:
         points: the values of knobs that have been tried.
-        chosen: variant -> the value that it is compared with.
-        cells: variant -> task or stream and seed -> what the cell led to, in the recipe's order.
+        chosen: variant -> the knob's value in the comparison.
+        cells: variant -> task or stream and seed -> the cell's result, in the recipe's order.
         costs: variant -> ratios to naive's training step.
     """
 
@@ -104,14 +105,14 @@ class Findings:
 
 
 def measured(found: Outcome) -> bool:
-    """Whether a cell led to figures."""
+    """Whether a cell has figures, that is, did not diverge."""
     return not isinstance(found, Divergence)
 
 
 def _no_units(figures: Figures) -> None:
-    """What the figures are means of is not kept, so that there is one interval: Student's t.
+    """Units of figures whose units are not stored; Student's t is then the only interval.
 
-    A figure that has it is known to be one at which seeds may come out alike by chance.
+    It also marks a figure at which seeds may be equal by chance.
     """
 
 
@@ -119,8 +120,8 @@ def _no_units(figures: Figures) -> None:
 
 
 def _lost_by_image(figures: PolicyFigures) -> Units | None:
-    """The accuracy that a training cost, in points, with an image's questions as a unit."""
-    # Cells that an earlier version measured have kept neither.
+    """The accuracy lost in training, in points; a unit is the questions of one image."""
+    # Cells of an earlier version store neither.
     if figures.lost_per_image is None or figures.questions_per_image is None:
         return None
     import numpy as np
@@ -132,7 +133,7 @@ def _lost_by_image(figures: PolicyFigures) -> Units | None:
 
 
 def _stands_still(figures: PolicyFigures) -> bool:
-    """Whether the backbone has not moved: else no answer is as sure as before to the last digit."""
+    """Whether the backbone is unchanged: any change would show in the digits of cross-entropy."""
     return figures.cross_entropy == figures.baseline_cross_entropy
 
 
@@ -158,7 +159,7 @@ def _error_by_episode(figures: PolicyFigures) -> Units | None:
 
 
 def _error_over_still(figures: PolicyFigures) -> float | None:
-    """The open-loop error less that which needs no policy: of holding, or of the mean action."""
+    """The open-loop error minus the error without a policy (holding, or the mean action)."""
     if figures.open_loop_error is None:
         return None
     return figures.open_loop_error - _without_policy(figures)
@@ -168,21 +169,21 @@ def _over_still_by_episode(figures: PolicyFigures) -> Units | None:
     found = _evaluated(figures, figures.error_per_episode)
     if found is None:
         return None
-    if figures.hold_error != _without_policy(figures):  # the mean action's, 1 in any episode
+    if figures.hold_error != _without_policy(figures):  # the mean action has error 1 everywhere
         return dataclasses.replace(found, values=found.values - found.counts)
     held = _evaluated(figures, figures.hold_per_episode)
     return None if held is None else found.minus(held)
 
 
 def _without_policy(figures: PolicyFigures) -> float:
-    """The lesser error of holding the position and of always the mean action, which has 1."""
+    """The smaller of the errors of holding the position and of the mean action, which is 1."""
     return 1.0 if figures.hold_error is None else min(1.0, figures.hold_error)
 
 
 def _evaluated(figures: PolicyFigures, errors: Sequence[float] | None) -> Units | None:
-    """Errors in held-out episodes; another seed may have held out some of the same ones."""
+    """Errors in held-out episodes; different seeds may have held out the same ones."""
     names, weights = figures.evaluated_episodes, figures.weight_per_episode
-    if errors is None or names is None or weights is None:  # an earlier version measured the cell
+    if errors is None or names is None or weights is None:  # measured by an earlier version
         return None
     import numpy as np
 
@@ -194,9 +195,9 @@ def _episodes(outcomes: str | None, seed: int, whole: float = 100.0) -> Units | 
     """Successes, one unit per episode, from one character per episode.
 
     Args:
-        whole: what a success counts: 100 points, or a share of 1.
+        whole: the value of a success: 100 points, or a share of 1.
     """
-    if outcomes is None:  # nothing was played, or an earlier version played it
+    if outcomes is None:  # no rollouts, or measured by an earlier version
         return None
     import numpy as np
 
@@ -209,19 +210,19 @@ class PolicyResult:
     """One variant on one task.
 
     Shares are in [0, 1], `_points` in percentage points, cross-entropy in nats. On a task measured
-    by its return, `return_share` (1: the highest there is) takes the place of successes and
-    `return_gain_points` of their gains. Where nothing can be rolled out there is an
-    `open_loop_error` instead, of which 1 is that of always the mean action, and
-    `open_loop_difference` is how much more it is than naive's.
+    by its return, `return_share` (1 is the highest return) takes the place of successes and
+    `return_gain_points` that of their gains. If nothing can be rolled out, there is an
+    `open_loop_error` instead (1 is the error of always predicting the mean action), and
+    `open_loop_difference` is its excess over naive's.
 
     Attributes:
-        hold_error: the error of a robot that holds its position, where actions are positions.
-        open_loop_over_still: the error less that which needs no policy: the lesser of `hold_error`
-            and 1.
-        diverged: the seeds whose training did, which no mean counts and which cost the bar.
-        step_time: ratio to naive's training step, or to that of `against`; so is `peak_memory`.
+        hold_error: the error of a robot that holds its position, if actions are positions.
+        open_loop_over_still: the error minus the error without a policy, which is the smaller of
+            `hold_error` and 1.
+        diverged: the seeds whose training diverged; no mean counts them, and the bar fails.
+        step_time: ratio to the training step of naive, or of `against`; likewise `peak_memory`.
         bar: None for naive and for methods that train on VQA data.
-        against: the variant that gains and the difference of the drops are to; None for naive.
+        against: the variant that differences are measured against; None means naive.
     """
 
     variant: str
@@ -343,13 +344,13 @@ class PolicyResult:
 
     @property
     def questions(self) -> float:
-        """VQA questions in training: a method that is trained on some has no bar."""
+        """VQA questions in training: 0, since only methods without them have a bar."""
         return 0.0
 
 
-# A method that trains on no VQA data is one to prefer to naive if it surely keeps VQA, learns as
-# well, generalises better, and costs no more: each by the worse end of its interval. A task that is
-# measured by its return has no colours to generalise to, and so no verdict but by a demand that
+# A method that trains on no VQA data is preferred to naive if it keeps VQA, learns as well,
+# generalises better and costs no more, each judged by the worse end of its interval. A task that is
+# measured by its return has no colours to generalise to, so its bar stays open unless a demand
 # fails.
 _KEEPS = Demand("VQA drop", "drop_points", at_most(0.1, "points"))
 _COSTS_NO_MORE = (
@@ -365,11 +366,11 @@ POLICY_BAR = (
 
 
 def open_loop_bar(most: float) -> tuple[Demand, ...]:
-    """The bar where nothing can be rolled out, so that no success is known.
+    """The bar if nothing can be rolled out, so that no success is known.
 
-    The open-loop error may surely be no more than `most` above naive's. A naive that has learned
-    nothing would be matched by anything, so that the error has to be below what needs no policy,
-    too. It tells nothing of other colours.
+    The open-loop error must be at most `most` above naive's, by the upper end of its interval. It
+    must also be below the error without a policy, since any method would match a naive that has
+    learned nothing. This bar says nothing about other colours.
     """
     return (
         _KEEPS,
@@ -383,13 +384,13 @@ def open_loop_bar(most: float) -> tuple[Demand, ...]:
 class TaskResults:
     """One task's table.
 
-    The baseline is the backbone before training, a mean over the sets of questions that the seeds
-    were asked; it is unknown as long as every training diverged.
+    The baseline is the backbone before training, as a mean over the question sets that the seeds
+    were asked. It is unknown if every training diverged.
 
     Attributes:
-        vqa: the set of questions, where a study asks several; each has a table and a bar.
-        compared: how many cells are compared with another variant's of the same seed.
-        across_versions: how many of these another version of the code has measured.
+        vqa: the question set, if a study asks several; each has its own table and bar.
+        compared: number of comparisons between cells of two variants with the same seed.
+        across_versions: how many of these pair cells that different code versions have measured.
     """
 
     task: str
@@ -428,14 +429,14 @@ class StudyReport:
 
 
 def _cost(name: str, against: str | None, costs: Mapping[str, Cost]) -> Cost | None:
-    """What a variant costs over the one that it is held against."""
+    """A variant's costs relative to the variant that it is compared with."""
     own = costs.get(name)
     if own is None or against is None:
         return own
     reference = costs.get(against)
     if reference is None:
         return None
-    # Both are over naive, which goes out of their ratio.
+    # Both are relative to naive, which cancels in their ratio.
     return dataclasses.replace(
         own,
         step_time=own.step_time / reference.step_time,
@@ -455,9 +456,9 @@ def task_results(
     """One task's table.
 
     Args:
-        found: variant -> seed -> what its training led to; at least one seed per variant.
-        values: variant -> what its knob is set to.
-        costs: variant -> ratios to naive; empty where there is no naive.
+        found: variant -> seed -> the result of its training; at least one seed per variant.
+        values: variant -> the value of its knob.
+        costs: variant -> ratios to naive; empty if there is no naive.
         ceilings: variants that train on VQA data.
         max_error_rise: how far an open-loop error may be above naive's.
     """
@@ -470,8 +471,8 @@ def task_results(
     results, pairs = [], list[tuple[PolicyFigures, PolicyFigures]]()
     for name, own in found.items():
         variant = variants[name]
-        # Contrasts are declared against naive, whose place a variant may give to another: its
-        # `against`. Naive itself is compared with nobody.
+        # Contrasts are declared against naive, but a variant may name another reference with
+        # `against`. Naive itself is not compared unless it names one.
         against = variant.against or (None if name == NAIVE else NAIVE)
         references = {NAIVE: samples[against]} if against in samples else {}
         for other in references.values():
@@ -506,24 +507,24 @@ def task_results(
 
 
 def _only_evaluated(rows: Sequence[PolicyFigures]) -> bool:
-    """Whether an open-loop error is all that is known of how policies act."""
+    """Whether policies have only an open-loop error, and no success or return."""
     acted = any(row.success_seen is not None or row.return_share is not None for row in rows)
     return not acted and any(row.open_loop_error is not None for row in rows)
 
 
 def _pairs(sample: Sample, reference: Sample) -> list[tuple[PolicyFigures, PolicyFigures]]:
-    """Cells of the same task and seed."""
-    # A cell that diverged is in no sample, and its setting then in no pair.
+    """Pairs of cells of the same task and seed."""
+    # Samples hold no diverged cells, so their settings have no pair.
     settings = sample.figures.keys() & reference.figures.keys()
     return [(sample.figures[setting], reference.figures[setting]) for setting in settings]
 
 
 def _each_probed(samples: Iterable[Sample]) -> list[PolicyFigures]:
-    """One cell of each set of questions that was asked, since seeds may have sets of their own."""
+    """One cell for each question set that was asked, since seeds may have different sets."""
     asked: dict[int, PolicyFigures] = {}
     for sample in samples:
         for row in sample.figures.values():
-            # Any will do, because all methods begin with the same backbone.
+            # Any cell will do, because all methods start from the same backbone.
             asked.setdefault(row.probe_seed, row)
     return list(asked.values())
 
@@ -537,7 +538,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class Accuracies:
-    """Means of shares in [0, 1]; None where a stream has one task."""
+    """Means of shares in [0, 1]; None if a stream has one task."""
 
     transfer: Annotated[Mean, Metric("Transfer %", 1, percent=True, more_is_better=True)]
     average: Annotated[Mean, Metric("Average %", 1, percent=True, more_is_better=True)]
@@ -565,18 +566,18 @@ def _first_change_points(figures: StreamFigures) -> float:
 
 @dataclass(frozen=True)
 class PairResult:
-    """What the second of two tasks did.
+    """Effects of the second of two tasks.
 
     Attributes:
-        added: numbers stored for it, as a share of what the first task added, which had nothing to
-            share.
-        new_experts: the same for experts alone, without routers, scales and what tells the task;
-            None without experts.
+        added: numbers stored for it, as a share of those of the first task, which had nothing to
+            reuse.
+        new_experts: the same for experts only, without routers, scales and the numbers that infer
+            the task; None without experts.
         reuse: routing mass of the second task on experts of the first.
-        second_gain_points: the second task's accuracy, told, against the variant isolated-lora's in
-            the same setting.
-        first_change_points: change of the first task's accuracy, told, after it;
-            `worst_change_points` in the worst run.
+        second_gain_points: the second task's accuracy with the task told, against the variant
+            isolated-lora in the same setting.
+        first_change_points: change of the first task's accuracy, with the task told, caused by the
+            second task; `worst_change_points` is that of the worst run.
     """
 
     added: Annotated[Mean, Metric("Stored, % of a fresh task's", 1, percent=True, of=_stored_share)]
@@ -612,7 +613,7 @@ class PairResult:
             summary=lowest,
         ),
     ]
-    # Tables of before it was reported have none.
+    # Tables of earlier versions do not have it.
     reuse: Annotated[Mean, Metric("Mass shared %", 1, percent=True)] = None
 
 
@@ -621,14 +622,15 @@ class StreamResult:
     """One variant, over streams and seeds.
 
     Differences (`_gain_points`) and ratios are between runs of the same stream and seed. A learner
-    that learns nothing has one run per stream, since its seeds are the same, and no interval;
-    differences to it are of each seed.
+    that learns nothing has one run per stream, since all its seeds are equal, and no interval.
+    Differences to it are taken for each seed.
 
     Attributes:
-        diverged: runs, pairs too, which no mean counts and which cost a variant the bar.
+        diverged: diverged runs, including pairs; no mean counts them, and the variant fails the
+            bar.
         told, inferred: accuracies with the task told, and inferred from the image.
         parameters: numbers stored at the end beside the bare encoder, of which
-            `inference_parameters` tell the task.
+            `inference_parameters` are used to infer the task.
         trained_phase1, trained, trained_mean: parameters that learn, mean over tasks: in phase 1
             (None without one), in the last or only phase, and over all steps.
         reuse: routing mass on experts of earlier tasks.
@@ -673,16 +675,16 @@ class StreamResult:
 
     @property
     def forgetting_points(self) -> float | None:
-        """Forgetting with the task told, which is never under 0, in points."""
+        """Forgetting with the task told, in points; it is never negative."""
         return None if self.told.forgetting is None else 100 * self.told.forgetting.mean
 
 
-# A learner is one to prefer to a LoRA per task if it is as accurate, smaller, and loses nothing:
-# each by the end of the interval, and as accurate is less than half a point below.
-# The second task of each pair has to be as accurate too, since a learner that learns nothing loses
-# nothing. Forgetting and the loss on pair B are 0 only where they are in every run. Transfer is
-# asked for inferred tasks too: with the task told, one that has not come is the bare encoder's work
-# for most learners, and nothing could be lost.
+# A learner is preferred to a LoRA per task if it is as accurate (at most half a point below),
+# smaller, and loses nothing, each judged by the worse end of its interval. The second task of each
+# pair must be as accurate too, since a learner that learns nothing loses nothing. Forgetting and
+# the loss on pair B must be 0 in every run. Transfer is also judged with inferred tasks: with the
+# task told, most learners use the bare encoder for tasks that have not come yet, and could lose
+# nothing.
 _NOT_LESS = at_least(-0.5, "points")
 _NOTHING_LOST = Limit("0 points", lambda lost: lost == 0)
 _NO_LOSS = Limit(">= 0 points in every run", lambda points: points >= 0)
@@ -734,14 +736,14 @@ def stream_results(
     """One result per variant.
 
     Args:
-        found: variant -> stream and seed -> what that run led to, those of the pairs too.
-        values: variant -> what its knob is set to.
+        found: variant -> stream and seed -> the run's result, including the pairs.
+        values: variant -> the value of its knob.
         unseeded: methods whose seeds are all the same run, since they learn nothing.
-        frozen: methods that never change what serves a learned task, nor one that has not come.
+        frozen: methods that never change the weights that serve learned tasks or future tasks.
     """
     paired = dataclasses.astuple(pairs) if pairs else ()  # the names of streams a and b
     samples = {stream: _samples(found, variants, (stream,), unseeded) for stream in paired}
-    # The pairs answer questions of their own, and no mean over streams counts them.
+    # The pairs are judged separately, and means over streams do not count them.
     streams = {stream for own in found.values() for stream, _ in own} - {*paired}
     main = _samples(found, variants, streams, unseeded)
     results = []
@@ -752,7 +754,7 @@ def stream_results(
             measured_pair = measure(PairResult, samples[stream][name], samples[stream])
             both.append(PairResult(**measured_pair))
         diverged = [f"{s} {seed}" for (s, seed), row in own.items() if not measured(row)]
-        # Without `bar` at first: it is judged by the figures of the whole result.
+        # `bar` follows below, since it is computed from the figures of the whole result.
         made = StreamResult(
             variant=name,
             method=variant.method,
@@ -778,7 +780,7 @@ def _samples(
     streams: Collection[str],
     unseeded: Collection[str],
 ) -> dict[str, Sample]:
-    """The cells of some streams, by variant."""
+    """The cells of the given streams, by variant."""
     samples = {}
     for name, own in found.items():
         figures = {run: row for run, row in own.items() if run[0] in streams and measured(row)}
@@ -790,7 +792,7 @@ def _samples(
 
 
 def _right_after_learning(figures: RobotStreamFigures) -> float:
-    # The last entry of a row is the task that has just been learned.
+    # The last entry of a row belongs to the task that has just been learned.
     return statistics.fmean(row[-1] for row in figures.success)
 
 
@@ -807,19 +809,19 @@ def _lost_at_the_end(figures: RobotStreamFigures) -> float:
 
 
 def _knows_the_same(figures: RobotStreamFigures) -> bool:
-    """Whether the backbone has not moved: else no answer is as sure as before to the last digit."""
+    """Whether the backbone is unchanged: any change would show in the digits of cross-entropy."""
     return len({*figures.cross_entropy}) == 1
 
 
 def _is_frozen(figures: RobotStreamFigures) -> bool:
-    """Whether nothing changes what serves a learned task."""
-    from aegis_cli.continual import learners  # loads torch, which tables do without
+    """Whether the weights that serve a learned task never change."""
+    from aegis_cli.continual import learners  # loads torch, which tables do not need
 
     return learners.get(figures.method).frozen
 
 
 def _reached(header: str, of: Callable[[RobotStreamFigures], float] | None = None) -> Metric:
-    """A share of successes, or of correct answers, at which seeds may come out alike by chance."""
+    """A share of successes or correct answers, at which seeds may be equal by chance."""
     return Metric(header, 1, percent=True, of=of, units=_no_units, more_is_better=True)
 
 
@@ -843,17 +845,18 @@ class RobotStreamResult:
     """One variant on a stream of robot tasks, over seeds.
 
     Attributes:
-        diverged: the seeds whose training did, which no mean counts.
-        last, average: success on all tasks after the last one, and over the whole triangle.
+        diverged: the seeds whose training diverged, which no mean counts.
+        last, average: success on all tasks after the last one, and over the whole triangular
+            matrix.
         learned: success on each task right after it was learned, mean over tasks.
         forgetting: of success; None for a single task.
-        accuracy, drop_points: VQA after the last task, and what of it was lost since before the
-            first.
+        accuracy, drop_points: VQA after the last task, and the accuracy lost since before the
+            first task.
         parameters: numbers stored at the end beside the bare backbone.
         trained_mean: parameters that learn, mean over steps and tasks.
         reuse: routing mass on experts of earlier tasks.
         last_gain_points, parameters_ratio: against the variant isolated-lora of the same seed.
-        after: the matrix of success, and VQA beside it, task by task.
+        after: the matrix of success with VQA, one entry per task.
     """
 
     variant: str
@@ -933,9 +936,9 @@ def robot_stream_results(
     """One result per variant.
 
     Args:
-        found: variant -> place and seed -> what that run led to.
-        values: variant -> what its knob is set to.
-        tasks: of the stream, in their order.
+        found: variant -> place and seed -> the run's result.
+        values: variant -> the value of its knob.
+        tasks: the stream's tasks in their order.
     """
     samples = {}
     for name, own in found.items():
@@ -963,10 +966,10 @@ def _task_by_task(sample: Sample, tasks: Sequence[str]) -> list[AfterTask]:
     still = all(_knows_the_same(figures) for _, figures in cells)
     for t, task in enumerate(tasks):
         success = []
-        for i in range(t + 1):  # the matrix is a triangle: later tasks have not come yet
+        for i in range(t + 1):  # the matrix is triangular: later tasks have not come yet
             acted = over_seeds({run: figures.success[t][i] for run, figures in cells})
             success.append(acted and unless_alike(acted, sure=False))
-        # `vqa` begins before the first task, so that after task t it is at t + 1.
+        # `vqa` starts before the first task, so its entry after task t is at t + 1.
         lost = over_seeds({r: 100 * (found.vqa[0] - found.vqa[t + 1]) for r, found in cells})
         rows.append(AfterTask(task, success, lost and unless_alike(lost, still)))
     return rows

@@ -1,4 +1,4 @@
-"""Reports and figures read back from JSON, as strictly as they were written."""
+"""Reads reports and figures back from JSON, with strict checks."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from pydantic import TypeAdapter, ValidationError
 
 T = TypeVar("T")
 
-# Figures that older versions wrote. They are no longer measured, and nothing reads them.
+# Figures that only older versions measured and stored. Nothing reads them.
 _RETIRED = frozenset({"leak"})
-_MOST = 3  # problems that a message names
+_MOST = 3  # maximum number of problems in a message
 
 
 class Misfit(ValueError):
-    """JSON that no value of the expected type was written as."""
+    """JSON that does not encode a value of the expected type."""
 
 
 def decode(kind: type[T], raw: Any) -> T:
-    """The dataclass that `dataclasses.asdict` and JSON have made plain.
+    """The dataclass from the plain values of `dataclasses.asdict` and JSON.
 
-    Fields with a default may be missing: older versions did not write them.
+    Fields with a default may be missing, since older versions did not write them.
 
     Raises:
-        Misfit: another type, a missing field, an unknown one, or a number that is not finite.
+        Misfit: a wrong type, a missing or unknown field, or a number that is not finite.
     """
     try:
         text = json.dumps(raw, allow_nan=False)
@@ -36,8 +36,8 @@ def decode(kind: type[T], raw: Any) -> T:
         made: T = _adapter(kind).validate_json(text, strict=True)
     except ValidationError as error:
         raise Misfit(_listed(error.errors())) from None
-    # What was not read, at any depth, is missing in what was. pydantic itself passes over keys that
-    # a standard dataclass does not have.
+    # pydantic ignores keys that a standard dataclass does not have, at any depth. They are found by
+    # comparing the given values with those that were read.
     read, given = json.loads(_adapter(kind).dump_json(made)), json.loads(text)
     unread = [k for k in given if not _was_read({k: given[k]}, read)]
     if unread:
@@ -46,7 +46,7 @@ def decode(kind: type[T], raw: Any) -> T:
 
 
 def _was_read(given: Any, read: Any) -> bool:
-    """Whether everything that was given is in what was read, which may have defaults besides."""
+    """Whether all given values were read; `read` may have additional defaults."""
     if isinstance(given, dict) and isinstance(read, dict):
         kept = given.keys() - _RETIRED
         return all(key in read and _was_read(given[key], read[key]) for key in kept)
@@ -61,7 +61,7 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 
 
 def _listed(problems: Sequence[Any]) -> str:
-    """The first problems, and how many there are besides."""
+    """The first problems, and the number of further ones."""
     said = [_said(problem) for problem in problems[:_MOST]]
     if len(problems) > _MOST:
         said.append(f"and {len(problems) - _MOST} more")
@@ -69,6 +69,6 @@ def _listed(problems: Sequence[Any]) -> str:
 
 
 def _said(problem: Any) -> str:
-    """One problem as pydantic has found it, with the value that it found."""
+    """One problem found by pydantic, with the offending value."""
     where = ".".join(map(str, problem["loc"])) or "all of it"
     return f"{where}: {problem['msg']}, not {problem['input']!r:.40}"

@@ -1,4 +1,4 @@
-"""What a study's cells lead to: the figures of one training, as `cells.json` stores them."""
+"""The results of a study's cells: the figures of one training, as stored in `cells.json`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 @dataclass(frozen=True)
 class VqaFigures:
-    """What one set of questions tells of a policy: the fields of `PolicyFigures` that depend on it.
+    """Figures of a policy on one question set: the fields of `PolicyFigures` that depend on it.
 
     Units are the same.
     """
@@ -27,32 +27,32 @@ class VqaFigures:
 
 @dataclass(frozen=True)
 class PolicyFigures:
-    """One policy, trained once.
+    """The figures of one trained policy.
 
     Shares in [0, 1], `drop_points` in percentage points, cross-entropy in nats, W2^2 as a mean over
     layers; `wrong_target` is on the seen colours. The baseline is the backbone before training,
     asked the same questions. A task that is measured by its return has `return_share` instead of
-    successes: 1 is the highest return there is. Where several sets of questions are asked, the
-    figures of VQA are those of the first, and `others` has those of each further set by its name.
+    successes (1 is the highest possible return). If several question sets are asked, the VQA
+    figures are those of the first set, and `others` has those of each further set by its name.
 
-    What the figures are means of is kept too, where it is known, so that intervals can be drawn
-    over seeds, images and episodes. Cells of one `probe_seed` were asked the same questions, those
-    of one `rollout_seed` played the same episodes.
+    The values per image and episode are stored too, if they are known, so that intervals can be
+    computed over seeds, images and episodes. Cells with equal `probe_seed` were asked the same
+    questions; cells with equal `rollout_seed` played the same episodes.
 
     Attributes:
         lost_per_image: for each image, correct answers before training minus those after it.
         questions_per_image: for each image, the number of its questions.
-        images: a digest of each image's name, where other seeds may have been asked about the same
-            ones; None of scenes.
+        images: a digest of each image's name, if other seeds may have been asked about the same
+            images; None for scenes.
         outcomes_seen, outcomes_held_out: one character per episode, 1 for a success, else 0.
-        open_loop_error: of a policy that cannot be rolled out: the squared error of its actions on
-            held-out episodes over their variance in training; 1 is that of always the mean action.
-            Of several data sets, the mean of theirs.
-        hold_error: the same of a robot that holds its position, where actions are positions.
-        evaluated_episodes: the held-out episodes, each `SET/NUMBER` with the data set's place among
-            several, from 1.
-        weight_per_episode: the share that each has in these errors; together 1.
-        error_per_episode, hold_per_episode: the errors in each.
+        open_loop_error: for a policy that cannot be rolled out, the squared error of its actions on
+            held-out episodes over their variance in training (1 is the error of always predicting
+            the mean action); a mean if there are several data sets.
+        hold_error: the same for a robot that holds its position, if actions are positions.
+        evaluated_episodes: the held-out episodes as `SET/NUMBER`, where SET counts the data sets
+            from 1.
+        weight_per_episode: the weight of each episode in these errors; they sum to 1.
+        error_per_episode, hold_per_episode: the errors in each episode.
         code: version and digest of the package that measured the cell.
     """
 
@@ -90,25 +90,26 @@ class PolicyFigures:
     others: dict[str, VqaFigures] = field(default_factory=dict)
 
     def asked(self, vqa: str) -> PolicyFigures:
-        """The same policy by the figures of one of its sets of questions."""
+        """The same policy with the figures of the question set `vqa`."""
         other = self.others.get(vqa)
         return self if other is None else replace(self, **vars(other))
 
 
 @dataclass(frozen=True)
 class StreamFigures:
-    """One stream, learned once.
+    """The figures of one learned stream.
 
     Shares in [0, 1]. Transfer, Average, Last and forgetting are with the task told, and inferred.
-    `parameters` are the numbers stored beside the bare encoder at the end, `inference_parameters`
-    of them tell the task; `trained_` figures are means over tasks of the parameters that learned:
-    in phase 1, in the last phase, and over all steps.
+    `parameters` counts the numbers stored beside the bare encoder at the end, of which
+    `inference_parameters` are used to infer the task. `trained_` figures are means over tasks of
+    the parameters that learned: in phase 1, in the last phase, and over all steps.
 
     Attributes:
-        own: accuracy on each task, told, right after it was learned.
-        added: numbers stored since the task before, for each task.
+        own: accuracy on each task right after it was learned, with the task told.
+        added: numbers stored since the previous task, for each task.
         new_experts: experts in all maps that belong to the task, for each task.
-        first_change: change of the first task's accuracy, told, from its own learning to the end.
+        first_change: change of the first task's accuracy, with the task told, from right after it
+            was learned to the end.
         minutes: time of training and evaluation.
     """
 
@@ -136,7 +137,7 @@ class StreamFigures:
 
 @dataclass(frozen=True)
 class RobotStreamFigures:
-    """One stream of robot tasks, learned once.
+    """The figures of one learned stream of robot tasks.
 
     Shares in [0, 1]; Average, Last and forgetting are of success, with the task told.
 
@@ -167,9 +168,9 @@ class RobotStreamFigures:
 
 @dataclass(frozen=True)
 class Divergence:
-    """A training that met a number that is not finite, after so many good steps.
+    """A training that met a number that is not finite, after `good_steps` good steps.
 
-    Nothing of it is measured.
+    It has no measurements.
     """
 
     good_steps: int

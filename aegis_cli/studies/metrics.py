@@ -1,8 +1,8 @@
-"""How the figures of a comparison are declared: each once, for measuring, JSON and tables.
+"""Declarations of the figures of a comparison: each once, for measuring, JSON and tables.
 
 A result class declares a figure as an annotated field, `w2: Annotated[Mean, Metric("W2²")]`.
-`measure` computes the fields of a variant from its cells, `dataclasses.asdict` makes JSON of them,
-and a table takes a column's header and digits from the same declaration. A bar is a tuple of
+`measure` computes the fields of a variant from its cells, `dataclasses.asdict` turns them into
+JSON, and a table takes a column's header and digits from the same declaration. A bar is a tuple of
 demands on such a result.
 """
 
@@ -19,7 +19,7 @@ from aegis_cli.common.estimates import Estimate, estimate
 from aegis_cli.common.limits import ROUNDING
 from aegis_cli.evaluation.bootstrap import Units, crossed_interval
 
-Mean = Estimate | None  # over seeds; None where no cell has a value
+Mean = Estimate | None  # over seeds; None if no cell has a value
 Setting = tuple[str, int]  # the task or stream of a cell, and its seed
 Values = Mapping[Setting, float]
 
@@ -29,8 +29,8 @@ class Sample:
     """A variant's cells that did not diverge.
 
     Attributes:
-        figures: what each cell led to, in the recipe's order.
-        seeded: whether the seeds differ. They do not where nothing is learned.
+        figures: the figures of each cell, in the recipe's order.
+        seeded: whether the seeds differ. They do not if nothing is learned.
     """
 
     figures: Mapping[Setting, Any]
@@ -42,7 +42,7 @@ class Sample:
 
 def over_seeds(values: Values) -> Mean:
     """The estimate from each seed's mean over its tasks or streams; None without values."""
-    # First over a seed's tasks, which are no draws of anything: the n of the interval is of seeds.
+    # First over a seed's tasks, which are not random draws: the interval's n counts seeds.
     seeds: dict[int, list[float]] = {}
     for (_, seed), value in values.items():
         seeds.setdefault(seed, []).append(value)
@@ -60,7 +60,7 @@ def points(own: float, other: float) -> float:
 
 
 def ratio(own: float, other: float) -> float | None:
-    """How many times `other` it is; None where that is zero."""
+    """`own / other`; None if `other` is zero."""
     return own / other if other else None
 
 
@@ -72,12 +72,12 @@ class Column:
     """How a figure is shown.
 
     Attributes:
-        header: its column's header, with the unit.
+        header: the column's header, with the unit.
         decimals: digits after the point; None for `significant` digits.
         percent: whether it is a share, shown in percent.
-        signed: whether a positive value has its sign.
+        signed: whether a positive value is shown with its sign.
         axis: its label on a plot's axis, with the unit; None for a figure that no plot shows.
-        more_is_better: which end of the column is the good one; None where neither is.
+        more_is_better: whether larger values are better; None if neither direction is.
     """
 
     header: str
@@ -90,7 +90,7 @@ class Column:
     more_is_better: bool | None = None
 
     def shown(self, value: float) -> float:
-        """The value in the unit of its header and axis."""
+        """The value in the unit of the header and the axis."""
         return 100 * value if self.percent else value
 
 
@@ -99,10 +99,10 @@ class Metric(Column):
     """A figure that is measured.
 
     Attributes:
-        of: what it is of one cell; by default the cell's figure of the field's own name.
-        summary: what becomes of the cells' values.
-        units: what one cell was measured on, if it kept that, for the crossed bootstrap.
-        sure: whether a cell's figure could not have been another; None: it always could.
+        of: computes it for one cell; by default the cell's figure with the field's name.
+        summary: summarizes the values of all cells.
+        units: the units that a cell was measured on, if it stored them, for the crossed bootstrap.
+        sure: whether a cell's figure could not have been different; None means it always could.
     """
 
     _: KW_ONLY
@@ -116,12 +116,12 @@ class Metric(Column):
 class Contrast(Metric):
     """A figure compared with another variant's in the same setting.
 
-    Cells of the same task or stream and seed began alike and saw the same batches, so a paired
+    Cells of the same task or stream and seed start equally and see the same batches, so a paired
     difference varies less than either of its parts.
 
     Attributes:
         against: the name of the other variant.
-        compare: what is made of the two figures.
+        compare: computes the comparison from the two figures.
     """
 
     _: KW_ONLY
@@ -147,7 +147,7 @@ def measure(
 
     Args:
         references: variant -> its cells, for contrasts.
-        prefix: stands before a field's name in the cells' figures: `inferred_`.
+        prefix: prefix of the field names in the cells' figures, such as `inferred_`.
     """
     measured: dict[str, Any] = {}
     for name, column in columns(kind).items():
@@ -160,7 +160,7 @@ def measure(
             values = _compared(column, values, _values(column, prefix + name, other))
             seeded = sample.seeded or other.seeded
         known = {setting: value for setting, value in values.items() if value is not None}
-        # One run counted once per seed would pass for several that agree.
+        # Counting one run once per seed would look like several runs that agree.
         made = column.summary(known if seeded else _once(known))
         if isinstance(made, Estimate) and column.units is not None:
             crossed = _crossed(column.units, known, sample, other)
@@ -171,19 +171,19 @@ def measure(
 
 
 def unless_alike(found: Estimate, sure: bool) -> Estimate:
-    """Without an interval where seeds came out alike by chance: they do not tell how seeds vary.
+    """Drop the interval if seeds are equal by chance, since they do not show how seeds vary.
 
     Args:
-        sure: whether it was no chance, or is known from elsewhere.
+        sure: whether they are not equal by chance, or the variation is known from elsewhere.
     """
     alike = found.interval is not None and found.interval[1] - found.interval[0] <= ROUNDING
     return dataclasses.replace(found, interval=None) if alike and not sure else found
 
 
 def _surely(column: Metric, known: Values, sample: Sample, other: Sample | None) -> bool:
-    """Whether none of these cells, nor of those that they are compared with, could differ.
+    """Whether the figures of these cells, and of the cells compared with them, could not differ.
 
-    A variant that is compared with itself cannot differ from itself.
+    This also holds for a variant that is compared with itself.
     """
     if other is sample:
         return True
@@ -200,8 +200,8 @@ def _crossed(
 ) -> tuple[float, float] | None:
     """The crossed bootstrap's interval of these cells, or of differences to another variant's.
 
-    It is None unless every cell kept what it was measured on. The cells are of one task, since
-    tasks are no draws of anything.
+    It is None unless every cell stored its units and all cells are of one task, since tasks are
+    not random draws.
     """
     seeds = []
     for setting in known:
@@ -228,7 +228,7 @@ def _compared(
     other: Mapping[Setting, float | None],
 ) -> dict[Setting, float | None]:
     made: dict[Setting, float | None] = {}
-    for setting, value in own.items():  # a setting that only one of both has is left out
+    for setting, value in own.items():  # settings that only one variant has are left out
         against = other.get(setting)
         if value is not None and against is not None:
             made[setting] = contrast.compare(value, against)
@@ -252,14 +252,14 @@ _SIGNS: dict[str, Callable[[float, float], bool]] = {
     ">": lambda value, limit: value > limit + ROUNDING,
     "<": lambda value, limit: value < limit - ROUNDING,
 }
-_ALL_DECIMALS = 9  # what differs by less than ROUNDING is judged alike
+_ALL_DECIMALS = 9  # values that differ by less than ROUNDING count as equal
 
 
 @dataclass(frozen=True)
 class Check:
-    """A demand's number, if it could be measured, and whether that is good enough.
+    """A demand's figure, if it could be measured, and whether it is good enough.
 
-    `by_design` says that a variant of its kind could not have failed.
+    `by_design` means that a variant of this kind could not have failed.
     """
 
     name: str
@@ -271,12 +271,12 @@ class Check:
 
 
 def deciding_decimals(value: float, demand: str, decimals: int) -> int:
-    """Digits after the point, `decimals` or more, that show a plain value as it is judged.
+    """Number of digits, `decimals` or more, with which a rounded value is on the right side.
 
-    1.0204 is above a limit of 1.02, and 1.02 is not.
+    For example, 1.0204 is above a limit of 1.02, but 1.02 is not.
 
     Args:
-        demand: in words, as a `Check` has it.
+        demand: the demand in words, as in `Check.demand`.
     """
     sign, _, rest = demand.partition(" ")
     if sign not in _SIGNS:
@@ -290,9 +290,9 @@ def deciding_decimals(value: float, demand: str, decimals: int) -> int:
 
 @dataclass(frozen=True)
 class Bar:
-    """Whether a variant is to be preferred; None where that was not measured.
+    """Whether a variant is to be preferred; None if that was not measured.
 
-    A variant that diverged with some seed can pass all checks and not the bar.
+    A variant that diverged with some seed can pass all checks but not the bar.
     """
 
     checks: list[Check]
@@ -300,10 +300,10 @@ class Bar:
 
 
 def unmeasured(bars: Sequence[Mapping[str, float | None]]) -> str:
-    """The demands that no variant has a figure of, in words: nobody can pass such a bar.
+    """The demands for which no variant has a figure, in words: no variant can pass such a bar.
 
     Args:
-        bars: of each variant, demand -> its figure; all have the same demands.
+        bars: for each variant, demand -> its figure; all have the same demands.
     """
     names = bars[0] if bars else ()
     return ", ".join(name for name in names if all(bar[name] is None for bar in bars))
@@ -311,9 +311,9 @@ def unmeasured(bars: Sequence[Mapping[str, float | None]]) -> str:
 
 @dataclass(frozen=True)
 class Limit:
-    """What is good enough: in words, and as a test of a measured figure.
+    """A limit in words, and as a test of a measured figure.
 
-    The test says None of a figure that cannot tell: one run has no interval to judge by.
+    The test returns None if the figure cannot decide, as for a single run without an interval.
     """
 
     words: str
@@ -322,12 +322,12 @@ class Limit:
 
 @dataclass(frozen=True)
 class Demand:
-    """What a result has to be.
+    """A requirement on a result.
 
     Attributes:
-        of: where the result has the figure: `pair_a.added`.
-        sure_if_frozen: whether a learner that never changes what serves a learned task meets it
-            whatever it does.
+        of: path of the figure in the result, such as `pair_a.added`.
+        sure_if_frozen: whether a learner that never changes the weights of learned tasks always
+            meets it.
     """
 
     name: str
@@ -336,7 +336,7 @@ class Demand:
     sure_if_frozen: bool = False
 
     def check(self, result: Any, frozen: bool = False) -> Check:
-        """The demand made of a result."""
+        """Check a result against the demand."""
         found = result
         for name in self.of.split("."):  # a study without pairs has None for `pair_a`
             found = None if found is None else getattr(found, name)
@@ -351,12 +351,12 @@ class Demand:
 def bar(demands: Sequence[Demand], result: Any, frozen: bool = False) -> Bar:
     """The verdict on a result.
 
-    One failed check, or a training that `diverged`, fails the bar. Otherwise a check that was not
+    One failed check, or a training in `diverged`, fails the bar. Otherwise a check that was not
     measured leaves it open.
     """
     checks = [demand.check(result, frozen) for demand in demands]
     passed = [check.passed for check in checks]
-    # A mean over the seeds that did not diverge is no mean over seeds.
+    # A mean over only the seeds that did not diverge is not a mean over seeds.
     if result.diverged or False in passed:
         return Bar(checks, False)
     return Bar(checks, None if None in passed else True)
@@ -387,12 +387,12 @@ def below(limit: float, unit: str) -> Limit:
 
 
 def _reaches(found: Estimate | float, side: int, limit: float) -> bool | None:
-    """Whether the upper end (`side` 1) is at most `limit`, or the lower one (-1) at least.
+    """Whether the upper end (`side` 1) is at most `limit`, or the lower end (-1) at least `limit`.
 
-    A plain number is both of its ends. Several runs that came out alike, and tell nothing of how
-    runs vary, fail where that is on the bad side.
+    A plain number is its own upper and lower end. Several equal runs without an interval fail if
+    their value is on the bad side; otherwise they leave it open.
     """
-    # Times -1 an inequality turns round: -x <= -limit is x >= limit.
+    # Multiplying by -1 reverses an inequality: -x <= -limit is x >= limit.
     if not isinstance(found, Estimate):
         return side * found <= side * limit
     if found.ends is None:

@@ -1,4 +1,4 @@
-"""`aegis run` with a recipe: every stage in order, what is up to date skipped, and one table."""
+"""`aegis run` with a recipe: runs every stage in order, skips those up to date, makes one table."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from aegis_cli.studies.figures import PolicyFigures
 from aegis_cli.studies.policy_cells import PolicyRunner
 from aegis_cli.training import loading, track
 
-_LEAST_DROP = 1.0  # points of VQA that naive has to lose before protection is worth a word
-_KEPT_SHARE = 0.5  # of naive's drop: at most so much a method loses that is said to keep VQA
+_LEAST_DROP = 1.0  # VQA points that naive must lose before a verdict on protection is given
+_KEPT_SHARE = 0.5  # a method keeps VQA if it loses at most this share of naive's drop
 
 
 @dataclass(frozen=True)
 class PipelineReport:
     """The recipe's table, also written to `table.json`.
 
-    `gate_failed` names the methods past the recipe's `probe.max_drop`, and `verdict` is a sentence
-    on what the table says; "" where there is no naive to compare with, or no success. `merge` has
-    the recipe's keys of that name where each row is of what was merged after its training.
+    `gate_failed` names the methods that exceed the recipe's `probe.max_drop`. `verdict` summarizes
+    the table in a sentence; it is "" if there is no naive to compare with, or no measure of how
+    policies act. `merge` has the recipe's `merge` section if the rows are of merged policies.
     """
 
     name: str
@@ -50,17 +50,17 @@ class PipelineReport:
 def run(
     recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
 ) -> PipelineReport:
-    """Run `recipe` under `root/<name>`; what a stage reads decides whether it runs again.
+    """Run `recipe` under `root/<name>`; a stage runs again only if its inputs have changed.
 
-    Where torchrun has started several processes, each calls this. They share anchor, trainings and
-    probes; the first does all else alone, and writes.
+    If torchrun has started several processes, each calls this. They share the work of anchor,
+    trainings and probes; the first one does everything else alone, and writes the files.
 
     Args:
         overwrite: run every stage again.
 
     Raises:
-        AegisError: another process is at the folder, or whatever a stage finds wrong; the stages
-            before it are kept.
+        AegisError: another process is using the folder, or a stage raised it; the results of
+            earlier stages are kept.
     """
     return leading.led(lambda: _check_and_run(recipe, root, on_event, overwrite))
 
@@ -75,10 +75,10 @@ def _check_and_run(
 
 
 def check(recipe: Recipe) -> None:
-    """Refuse what no stage of a recipe's job could do, before any work.
+    """Refuse a recipe that a stage could not run, before any work.
 
     Raises:
-        AegisError: keys that do not fit together, a tracker, OpenGL or a task that is not there.
+        AegisError: keys that do not fit together, or a tracker, OpenGL or a task is missing.
     """
     recipes.check_run(recipe)
     track.check(recipe)
@@ -91,7 +91,7 @@ def check(recipe: Recipe) -> None:
 def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> PipelineReport:
     runner = PolicyRunner(folder, on_event, plain=recipe)
     check_inputs(runner, recipe)
-    if overwrite:  # after the check, so that a job that is refused forgets nothing
+    if overwrite:  # after the check, so that a refused job does not lose finished stages
         runner.begin_anew()
     rows = []
     for done, method in enumerate(recipe.methods):
@@ -101,7 +101,7 @@ def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> Pi
         on_event(Progress(method, 1, 1, "method", _shown(rows[-1])))
     on_event(Progress(recipe.name, len(rows), len(rows), "methods"))
     rows = _with_ratios(rows)
-    first = rows[0]  # the baseline is the same in each
+    first = rows[0]  # the baseline is the same in every row
     report = PipelineReport(
         recipe.name,
         rows,
@@ -118,7 +118,7 @@ def _run(recipe: Recipe, folder: Path, overwrite: bool, on_event: OnEvent) -> Pi
 
 
 def _shown(row: PolicyFigures) -> dict[str, float]:
-    """A method's main figures, for its line among the progress."""
+    """A method's main figures, for its progress line."""
     figures = {
         "VQA %": 100 * row.accuracy,
         "drop": row.drop_points,
@@ -137,10 +137,10 @@ def _percent(share: float | None) -> float | None:
 def verdict(rows: Sequence[PolicyFigures]) -> str:
     """A sentence on the method that acts best among those that keep VQA.
 
-    To keep it means to lose at most half of what naive loses; of several sets of questions, each
-    counts by the one that it lost most of. Who acts best succeeds most often, or, where nothing can
-    be rolled out, has the least open-loop error. Where the questions do not even tell that naive
-    has lost anything, there is no verdict.
+    A method keeps VQA if it loses at most half of what naive loses. With several question sets,
+    each method counts by the set on which it lost most. The best method has the highest success,
+    or, if nothing can be rolled out, the lowest open-loop error. If the questions do not show that
+    naive lost anything, the sentence says so instead.
     """
     naive = next((row for row in rows if row.method == "naive"), None)
     if naive is None or _acts(naive) is None or len(rows) == 1:
@@ -159,7 +159,7 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
 
     def ability(row: PolicyFigures) -> float:
         acts = _acts(row)
-        return -math.inf if acts is None else acts  # what was not measured is never the best
+        return -math.inf if acts is None else acts  # an unmeasured method is never the best
 
     best = max(kept, key=ability)
     of = ", each of the questions that it lost most of" if naive.others else ""
@@ -170,9 +170,9 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
 
 
 def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
-    """Why naive's questions do not tell that it has lost anything; None where they do."""
+    """Why the questions do not show that naive lost anything; None if they do."""
     sets = [naive, *naive.others.values()]
-    # A VLM that answers no better than by rote has nothing to lose that accuracy would show.
+    # A VLM that is no better than the majority answer has no accuracy to lose.
     if all(asked.baseline_accuracy <= asked.majority_accuracy for asked in sets):
         before, common = 100 * naive.baseline_accuracy, 100 * naive.majority_accuracy
         return (
@@ -183,7 +183,7 @@ def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     if max(_drops(naive)) < _LEAST_DROP:
         return f"naive itself lost {lost}: this training has little to protect."
-    # Of the questions that naive lost most of: an interval that holds 0 does not tell a loss.
+    # On the set where naive lost most: an interval that contains 0 does not show a loss.
     most_lost = max(sets, key=lambda asked: asked.drop_points)
     low, high = most_lost.drop_interval
     if low <= 0:
@@ -195,7 +195,7 @@ def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
 
 
 def _at_what(best: PolicyFigures, naive: PolicyFigures) -> str:
-    """How the best method acts, beside naive."""
+    """How the best method acts, compared with naive."""
     if naive.success_seen is not None:
         ours, its = _percent(best.success_seen), _percent(naive.success_seen)
         return f"{ours:.1f} % success where naive has {its:.1f} %"
@@ -207,19 +207,19 @@ def _at_what(best: PolicyFigures, naive: PolicyFigures) -> str:
 
 
 def _drops(row: PolicyFigures) -> list[float]:
-    """The points lost of each set of questions."""
+    """The points lost on each question set."""
     return [row.drop_points, *(other.drop_points for other in row.others.values())]
 
 
 def _acts(row: PolicyFigures) -> float | None:
-    """How well a policy acts, more being better; None where that is not measured."""
+    """How well a policy acts (higher is better); None if that is not measured."""
     if row.success_seen is not None:
         return row.success_seen
-    return None if row.open_loop_error is None else -row.open_loop_error  # less error is better
+    return None if row.open_loop_error is None else -row.open_loop_error  # lower error is better
 
 
 def _past(row: PolicyFigures, settings: Probe) -> bool:
-    """Whether a method lost more than the gate lets pass on any of its sets of questions."""
+    """Whether a method lost more than the gate allows on any of its question sets."""
     if settings.max_drop is None:
         return False
     for asked in (row, *row.others.values()):
@@ -230,12 +230,12 @@ def _past(row: PolicyFigures, settings: Probe) -> bool:
 
 
 def check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
-    """Refuse files that the recipe names before anything is written.
+    """Refuse bad files that the recipe names, before anything is written.
 
-    Else a fault would show only after the stages before the one that reads them.
+    Otherwise an error would appear only once the stage that reads them runs.
     """
     _refuse_own_models(runner.folder, recipe)
-    runner.backbone_sha256(recipe)  # reads the model, and raises where it cannot
+    runner.backbone_sha256(recipe)  # reads the model, and raises if it cannot
     for method in recipe.methods:
         runner.vqa_state(of_method(recipe, method))
     runner.check_questions(recipe, "probe")
@@ -243,9 +243,9 @@ def check_inputs(runner: PolicyRunner, recipe: Recipe) -> None:
 
 
 def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
-    """Refuse a job that begins with one of its own runs, which it would train anew and remove."""
+    """Refuse a job that starts from one of its own runs, which it would remove and train again."""
     named = {"backbone": recipe.backbone, "expert.start": recipe.expert.start}
-    # A backbone's path may have the path of its layers behind a #.
+    # A backbone's path may end in # and the path of its layers.
     for key, name in named.items():
         if name is not None and files.lies_in(Path(backbones.divided(name)[0]), folder):
             raise AegisError(
@@ -256,12 +256,12 @@ def _refuse_own_models(folder: Path, recipe: Recipe) -> None:
 
 
 def of_method(recipe: Recipe, method: str) -> Recipe:
-    """The recipe of one of its methods."""
+    """The recipe for one of its methods."""
     return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
 
 
 def _with_ratios(rows: list[PolicyFigures]) -> list[PolicyFigures]:
-    """The step times over naive's, if there is a naive."""
+    """The rows with step times relative to naive's, if there is a naive."""
     naive_s = next((row.step_s for row in rows if row.method == "naive"), None)
     if naive_s is None:
         return rows

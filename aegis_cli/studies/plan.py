@@ -1,7 +1,7 @@
 """`aegis run --dry-run`: which stages a job would run, why, and what its trainings need.
 
-What decides is what decides in the job itself: the same stages ask the same records, which here
-answer and let nothing run. Nothing is written.
+The plan is made by the job's own code: the same stages ask their records whether they are up to
+date, but these records let no stage run. Nothing is written.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from aegis_cli.training.dry_run import DryRunReport
 from aegis_cli.training.up_to_date import StageRecords
 
 _AFTER = "follows on "
-_SHARED = ""  # the method of what all methods share
+_SHARED = ""  # stands for the method of stages that all methods share
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class PlannedStage:
     """A stage of a job.
 
     Attributes:
-        method: that it is of; "" of what all methods share.
-        command: that does the same alone.
-        due: why it would run; None where it is up to date and skipped.
+        method: the method that it belongs to; "" if all methods share it.
+        command: the command that runs only this stage.
+        due: why it would run; None if it is up to date and skipped.
     """
 
     stage: str
@@ -48,10 +48,10 @@ class JobPlan:
     """What `aegis run` would do with a recipe.
 
     Attributes:
-        trainings: of each method that would train what `aegis train --dry-run` tells, of memory the
-            estimate alone; None where that cannot be asked before an earlier stage has run.
-        hours, disk_mb: of these trainings together, as far as they are known.
-        disk_free_mb: where they would be; None where no training could be asked.
+        trainings: for each method that would train, the report of `aegis train --dry-run` with
+            estimated memory only; None if an earlier stage has to run first.
+        hours, disk_mb: sums over these trainings, as far as they are known.
+        disk_free_mb: free disk space where they would be; None if there is no report.
     """
 
     name: str
@@ -78,10 +78,10 @@ class _Due(Exception):
 
 
 class _Asked(StageRecords):
-    """Records of a folder's stages that say what would run, and let nothing run.
+    """Records of a folder's stages that note which stages would run, and let none run.
 
     Attributes:
-        reasons: why each stage that was asked would run; None where it is up to date.
+        reasons: why each requested stage would run; None if it is up to date.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent, overwrite: bool) -> None:
@@ -95,19 +95,19 @@ class _Asked(StageRecords):
         """Note whether the stage would run.
 
         Raises:
-            _Due: it would.
+            _Due: the stage would run.
         """
         self.reasons[stage] = "--overwrite" if self._overwrite else self.due(stage, key, outputs)
-        # Raised, for what follows in the stage reads the files that it would make.
+        # Raised, because the code after it reads the files that the stage would make.
         if self.reasons[stage] is not None:
             raise _Due(stage)
 
 
 class _Step(NamedTuple):
-    """A stage of a method's: its name, its command, and what asks the records for it.
+    """A stage: its name, its command, and a function that asks the records for it.
 
     Attributes:
-        makes: whether it makes the policy that the stages after it measure.
+        makes: whether it makes the policy that later stages measure.
     """
 
     name: str
@@ -120,18 +120,18 @@ def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool 
     """What `aegis run` would do with a recipe now; nothing is written.
 
     Args:
-        overwrite: as `aegis run` would be asked to run every stage again.
+        overwrite: plan for `aegis run --overwrite`, which runs every stage again.
 
     Raises:
-        AegisError: what `aegis run` would refuse before its first stage, or a training that could
-            not be begun.
+        AegisError: `aegis run` would refuse the recipe before its first stage, or a training could
+            not start.
     """
     pipeline.check(recipe)
     folder = Path(root) / recipe.name
     records = _Asked(folder, on_event, overwrite)
     runner = PolicyRunner(folder, on_event, plain=recipe, records=records)
     pipeline.check_inputs(runner, recipe)
-    # First what all methods read: the methods' own stages follow on it.
+    # First the shared stages, on which the methods' own stages depend.
     stages = list(_planned(_shared(runner, recipe), _SHARED, records))
     for method in recipe.methods:
         stages += _planned(_of_method(runner, method, recipe), method, records)
@@ -156,15 +156,15 @@ def job(recipe: Recipe, root: Path, on_event: OnEvent = ignore, overwrite: bool 
 
 
 def _planned(steps: Iterator[_Step], method: str, records: _Asked) -> Iterator[PlannedStage]:
-    """Each step with the reason for which it would run."""
-    waits_for = None  # what makes the policy, if that would run
+    """Each step with the reason why it would run."""
+    waits_for = None  # the stage that makes the policy, if it would run
     for step in steps:
         due = None if waits_for is None else _AFTER + waits_for
         if waits_for is None:
             try:
                 step.ask()
             except _Due as end:
-                # Another stage's where this one reads what that one makes, such as the anchor.
+                # The reason may be another stage whose files this one reads, such as the anchor.
                 its_own = end.stage == step.name
                 due = records.reasons[end.stage] if its_own else _AFTER + end.stage
         if step.makes and due is not None:
@@ -203,10 +203,10 @@ def _of_method(runner: PolicyRunner, method: str, recipe: Recipe) -> Iterator[_S
 
 
 def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRunReport | None:
-    """What a training needs; None where what it reads is still to be made.
+    """The needs of a training; None if the files that it reads do not exist yet.
 
     Raises:
-        AegisError: the training could not be begun.
+        AegisError: the training could not start.
     """
     own, out = pipeline.of_method(recipe, method), runner.folder / method
     run_folder.check_ours(out, ours=runner.has_begun(method))
@@ -219,27 +219,27 @@ def _asked_training(runner: PolicyRunner, method: str, recipe: Recipe) -> DryRun
     except _Due:
         if methods.get(method).needs:
             return None
-        anchor = None  # a method that reads none can be asked without it
+        anchor = None  # for a method that reads no anchor
     resumes = anchor is not None and runner.goes_on(
         method, runner.training_key(own, demos.sha256, anchor.sha256)
     )
-    # A run that cannot go on gives way to the new one. Here it stays, and so it must not be met.
+    # The job would remove a run that it cannot resume. The dry run leaves it and uses another path.
     at = out if resumes else out.with_name(f".{out.name}.planned")
     path = None if anchor is None else anchor.path
     report = dry_run.run(own, method, demos.path, path, at, resumes, runner.on_event)
-    # What the process has grown by is no measure: a training takes what one before it has left.
+    # The process's growth does not measure one training, which reuses memory of earlier ones.
     return dataclasses.replace(report, memory_measured_mb=None, out=str(out))
 
 
 def shortage(plan: JobPlan) -> str | None:
-    """What does not fit, on one line; None where everything that is known does."""
+    """What does not fit, on one line; None if everything that is known fits."""
     reports = {method: one for method, one in plan.trainings.items() if one is not None}
     missing = []
     for method, one in reports.items():
         found = dry_run.shortage(one)
         if found is not None:
             missing.append(f"{method}: {found}")
-    # Each may fit by itself, and all of them together not.
+    # Each may fit by itself, but not all together.
     if not missing and plan.disk_free_mb is not None and plan.disk_mb > plan.disk_free_mb:
         missing.append(
             f"the checkpoints of all methods need {plan.disk_mb:,.0f} MB on the disk of "
@@ -254,7 +254,7 @@ def shortage(plan: JobPlan) -> str | None:
 
 @dataclass(frozen=True)
 class PlannedCell:
-    """A cell of a study, by its folder; `due` says why it would be measured, None if it is not."""
+    """A cell of a study, by its folder; `due` says why it would be measured, or None if skipped."""
 
     cell: str
     due: str | None
@@ -283,7 +283,7 @@ _WHY = {
 def of_study(
     recipe: AnyStudy, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
 ) -> StudyPlan:
-    """What `aegis run` would do with a study now; as `job`."""
+    """What `aegis run` would do with a study now; arguments as in `job`."""
     found = study.planned(recipe, root, on_event, overwrite)
     cells = [PlannedCell(label, _WHY[finished]) for label, finished in found]
     finished = sum(cell.due is None for cell in cells)

@@ -1,6 +1,6 @@
 """The cells of a study of policies: trainings that share demonstrations and anchors.
 
-What a stage reads decides whether it runs again.
+A stage runs again only if its inputs have changed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from aegis_cli.training import checkpoint, loading, track, train
 from aegis_cli.training import folder as run_folder
 from aegis_cli.training.up_to_date import BEGUN, Made, StageRecords, digest
 
-_OTHER_SEEDS = 100  # that are tried where the tuning's leaves it no episode of its own
+_OTHER_SEEDS = 100  # how many seeds are tried to suggest one that leaves episodes for tuning
 
 # The files of a checkpoint that a probe or rollout reads.
 POLICY = ("backbone/model.safetensors", "expert.safetensors")
@@ -82,7 +82,7 @@ class PolicyStudy:
         return study_cells.cell(self.recipe, variant, place, seed, value)
 
     def trial(self, variant: str, value: Any) -> Recipe:
-        """The recipe by which a knob's value is judged."""
+        """The recipe that evaluates a knob's value."""
         tuning = self.recipe.tuning or Tuning(task=self.places[0])
         recipe = self.cell(variant, tuning.task, tuning.seed, value)
         asked = dataclasses.replace(recipe.probe, questions=tuning.questions)
@@ -95,8 +95,8 @@ class PolicyStudy:
         """Check the study before any work.
 
         Raises:
-            AegisError: a task that is not there, or values that are to be chosen where nothing
-                tells how well all of them act.
+            AegisError: a task does not exist, or a knob is to be tuned although nothing measures
+                how well all of its values act.
         """
         for recipe in trials:
             track.check(recipe)
@@ -111,31 +111,31 @@ class PolicyStudy:
             _check_tunable(trials, self.recipe.seeds)
 
     def prepare(self, runner: PolicyRunner, cells: Sequence[Cell[Recipe]], together: bool) -> None:
-        """Check questions and demonstrations; record and measure what processes would share.
+        """Check questions and demonstrations; make demonstrations and anchors for all processes.
 
         Raises:
             AegisError: files that cannot be used.
         """
         gl.check()
-        # Tuning's cells are also asked the comparison's questions, which come when tuning is done.
+        # For cells of the tuning, the questions of the later comparison are checked too.
         for cell in cells:
             for split in ("validation", "probe") if cell.validation else ("probe",):
                 runner.check_questions(cell.recipe, split)
         self._warn_of_tasks(cells, runner.on_event)
-        # To load a backbone and demonstrations takes long, so each combination is checked once.
+        # Loading a backbone and demonstrations takes long, so each combination is checked once.
         distinct = {}
         for cell in cells:
             recipe = cell.recipe
             distinct[recipe.backbone, recipe.demos, recipe.task] = recipe
         for recipe in distinct.values():
             loading.check_named(recipe, runner.on_event)
-        # One process makes what it needs when it needs it; of several each would make its own.
+        # A single process makes these when needed, but several would each make their own.
         for cell in cells if together else ():
             runner.demos(cell.recipe)
             runner.anchor(cell.recipe)
 
     def _warn_of_tasks(self, cells: Sequence[Cell[Recipe]], on_event: OnEvent) -> None:
-        """Warn once of tasks that nothing is played on, which a table would seem to be of."""
+        """Warn once of task names in tables whose policies cannot be rolled out on the task."""
         tasks = self.recipe.tasks
         if tasks is None or self._has_warned:
             return
@@ -147,14 +147,14 @@ class PolicyStudy:
                 f"here, so that tasks: [{', '.join(tasks)}] is but a name: without 'tasks' and "
                 "tuning.task, tables and folders have the demonstrations' name"
             )
-            if set(tasks) == {Recipe.task}:  # the default, which cells without one have
+            if set(tasks) == {Recipe.task}:  # the default, so cells without a task have equal keys
                 text += ", and what is finished stays finished"
             on_event(Warned("study", text))
 
     def point(self, variant: str, value: Any, found: PolicyFigures | Divergence) -> PolicyPoint:
-        """What a knob's value led to."""
+        """The result of a knob's value."""
         own = self.recipe.variants[variant]
-        # The margin is of naive as it is, and not of the best of its many merges.
+        # The margin refers to plain naive, not to the best of its merges.
         method = own.method if own.is_plain(own.method) else f"{own.method}, merged"
         if isinstance(found, Divergence):
             return PolicyPoint(variant, method, value, None, None, None)
@@ -170,14 +170,14 @@ class PolicyStudy:
         )
 
     def _sets(self) -> tuple[str | None, ...]:
-        """The sets of questions that have a table each; one alone is not named."""
+        """The question sets, each with its own table; None for a single one."""
         vqa = self.recipe.shared.get("probe", {}).get("vqa", Probe().vqa)
         return (None,) if isinstance(vqa, str) else tuple(vqa)
 
     def costs(self, store: CellStore[Recipe], chosen: Mapping[str, Any]) -> dict[str, Cost]:
-        """Step time and memory over naive's, by variant; nothing where no variant is named naive.
+        """Step time and memory relative to naive's, by variant; empty if there is no naive.
 
-        What is not known of this machine is measured, unless only finished cells are delivered.
+        Costs not yet known for this machine are measured, unless only finished cells are delivered.
         """
         if NAIVE not in self.recipe.variants:
             return {}
@@ -190,10 +190,10 @@ class PolicyStudy:
         if not store.known_only:
             here = machine.name()
             old = {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
-            # Ratios of times hold on the machine that they were measured on alone.
+            # Ratios of times hold only on the machine where they were measured.
             missing = [name for name in made if name not in old or old[name].machine != here]
-            # Variants whose steps take the same are measured once: those of other learning rates,
-            # and those that are merged in several ways.
+            # Variants with equal steps are measured once. These differ only in learning rates or
+            # in how they are merged.
             first = dict[str, str]()
             for name in missing:
                 first.setdefault(keys[name], name)
@@ -202,7 +202,7 @@ class PolicyStudy:
         return {name: store.known(key, Cost) for name, key in keys.items() if key in store.cells}
 
     def _first(self, variant: str, chosen: Mapping[str, Any]) -> Recipe:
-        """The recipe of a variant's first cell, whose costs stand for those of all its cells."""
+        """The recipe of a variant's first cell, which represents the costs of all its cells."""
         study = self.recipe
         return self.cell(variant, self.places[0], study.seeds[0], chosen[variant])
 
@@ -211,10 +211,10 @@ class PolicyStudy:
     ) -> Iterator[tuple[str, tuple[float, float]]]:
         """Ratios of step time and of peak memory for some variants.
 
-        Variants whose anchors differ are timed apart, each with its own.
+        Variants with different anchors are timed separately, each with its own anchor.
         """
         runner = _runner(store)
-        # Each of the different settings once, in the order of the variants.
+        # Each distinct anchor setting once, in the order of the variants.
         for settings in dict.fromkeys(made[name].anchor for name in names):
             group = {name: made[name] for name in names if made[name].anchor == settings}
             anchor_path = runner.anchor(next(iter(group.values()))).path
@@ -224,7 +224,7 @@ class PolicyStudy:
                 yield name, (found[name].step_time, found[name].peak_memory)
 
     def report(self, findings: Findings, store: CellStore[Recipe]) -> StudyReport:
-        """The table of what is known."""
+        """The table of the results so far."""
         study = self.recipe
         ceilings = {name for name in study.variants if self._is_ceiling(name, findings.chosen)}
         tables = []
@@ -256,27 +256,27 @@ class PolicyStudy:
         return self.recipe.tuning.task if self.recipe.tasks else self.places[0]
 
     def _is_ceiling(self, variant: str, chosen: Mapping[str, Any]) -> bool:
-        """Whether a variant trains on VQA data, at the values of its knobs that were chosen."""
+        """Whether a variant trains on VQA data at the chosen value of its knob."""
         study = self.recipe
         value = chosen.get(variant, study.variants[variant].values[0])
         return bool(_trained_on(self.cell(variant, self.places[0], study.seeds[0], value)))
 
 
 def _runner(store: CellStore[Recipe]) -> PolicyRunner:
-    """The runner that a study of policies has had made."""
+    """The runner of a study of policies."""
     assert isinstance(store.runner, PolicyRunner)
     return store.runner
 
 
 def _trained_on(recipe: Recipe) -> list[Cotrain | Insulate]:
-    """The section of the questions that the recipe's method trains on; empty where it has none."""
+    """The section of the questions that the recipe's method trains on; empty if there is none."""
     method = recipe.train.method
     asks = methods.get(method).trains_on_questions(recipes.options(recipe))
     return [getattr(recipe, method)] if asks else []
 
 
 def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
-    """A variant's cells by seed, by the figures of one of several sets of questions."""
+    """A variant's cells by seed, with the figures of one of several question sets."""
     found = dict(cells)
     for seed, cell in cells.items():
         if vqa is not None and isinstance(cell, PolicyFigures):
@@ -285,7 +285,7 @@ def _asked(cells: Mapping[int, Outcome], vqa: str | None) -> dict[int, Outcome]:
 
 
 def _check_tunable(trials: Sequence[Recipe], judging: Sequence[int]) -> None:
-    """Raise AegisError where values cannot be chosen by how well their policies act."""
+    """Raise AegisError if values cannot be chosen by how well their policies act."""
     played = [recipe for recipe in trials if playable_colors(recipe)]
     others = [recipe for recipe in trials if recipe not in played]
     if played and others:
@@ -318,16 +318,16 @@ def _no_episode_to_tune_on(recipe: Recipe, data: Path, judging: Sequence[int]) -
 
 
 def _path(recipe: Recipe) -> str | tuple[str, ...]:
-    """Where demonstrations lie that cannot be rolled out, which are never recorded here."""
+    """The path of demonstrations without rollouts, which are always given and never recorded."""
     assert recipe.demos.path is not None
     return recipe.demos.path
 
 
 def tuning_episodes(recipe: Recipe, data: Path, judging: Sequence[int]) -> list[int]:
-    """The episodes that a trial has held out, and none of the compared trainings of its recipe.
+    """The episodes that a trial holds out and that none of the compared trainings holds out.
 
     Args:
-        judging: the seeds of these trainings.
+        judging: the seeds of the compared trainings.
     """
     only, share = recipe.demos.only, recipe.train.validation_share
     held = {s: demonstrations.held_out_of(data, only, share, s) for s in (recipe.seed, *judging)}
@@ -342,22 +342,22 @@ def cell_key(
     vqa_state: Sequence[Mapping[str, Any]] = (),
     judging: Sequence[int] = (),
 ) -> str:
-    """Digest of all that shapes a cell's figures.
+    """Digest of everything that affects a cell's figures.
 
-    Its label, its folder and where the backbone lies are no part of it.
+    Its label, its folder and the location of the backbone are not part of it.
 
-    Options at the defaults that they came with are left out: an option that is added later, or
-    whose default changes, makes no finished cell stale, and none passes for another.
+    Options at their original defaults are left out. A later option or a changed default therefore
+    does not make finished cells stale, and does not give different cells the same key.
 
     Args:
-        demos_sha256: of the demonstrations that the recipe names; None where it has them recorded.
-        vqa_state: of the question files that it reads, if any.
+        demos_sha256: digest of the demonstrations that the recipe names; None if they are recorded.
+        vqa_state: state of the question files that it reads, if any.
         judging: seeds whose held-out episodes it must not be evaluated on.
     """
     key = _shaping(cell.recipe) | {"backbone": backbone_sha256, "validation": cell.validation}
     for name in ("demos", "anchor", "probe", "rollout"):
         key[name] = recipes.changed(getattr(cell.recipe, name))
-    # What is not there adds no key, so that cells of before there was any are still found.
+    # Unused parts add no key, so that cells stored before these parts existed are still found.
     if cell.recipe.merge.method is not None:
         key["merge"] = recipes.changed(cell.recipe.merge)
     if judging:
@@ -368,27 +368,27 @@ def cell_key(
 
 
 def _cost_key(recipe: Recipe, naive: Recipe, backbone_sha256: str) -> str:
-    """Digest of what shapes a cost: neither the seed nor the learning rates do."""
-    # Naive's own settings count as well: the cost is a ratio to its step.
+    """Digest of everything that affects a cost; seed and learning rates do not."""
+    # Naive's settings count as well, because the cost is a ratio to its step.
     timed = [bench_runs.unmoved(one) for one in (recipe, naive)]
     parts = [{**_shaping(one), "seed": 0, "backbone": backbone_sha256} for one in timed]
     return digest({"cost": parts, "anchor": recipes.changed(recipe.anchor)})
 
 
 def _shaping(recipe: Recipe) -> dict[str, Any]:
-    """What shapes a training, as far as it is not at the default that it came with."""
+    """The settings that affect a training, except those at their original defaults."""
     changed = {}
-    # Of the methods' sections only the one's own; a method without options has none.
+    # Of the methods' sections only that of the recipe's method, if it has options.
     for name in ("train", "expert", recipe.train.method):
         if (section := getattr(recipe, name, None)) is not None:
             changed[name] = recipes.changed(section)
-    if recipe.expert.start is not None:  # the expert itself, wherever it lies
+    if recipe.expert.start is not None:  # the expert's digest instead of its path
         changed["expert"]["start"] = checkpoint.expert_sha256(recipe.expert.start)
     return {"task": recipe.task, "seed": recipe.seed, "method": recipe.train.method, **changed}
 
 
 class Given(NamedTuple):
-    """Demonstrations that a recipe names: one set or several, and their digest together."""
+    """Demonstrations that a recipe names (one set or several), and their combined digest."""
 
     path: mixture.Paths
     sha256: str
@@ -397,7 +397,7 @@ class Given(NamedTuple):
 class PolicyRunner:
     """Trains and measures cells in one folder, and knows which of their files are up to date.
 
-    A label is a cell's place below the folder: `naive`, or `nullspace/3`.
+    A label is a cell's path relative to the folder, such as `naive` or `nullspace/3`.
     """
 
     def __init__(
@@ -407,12 +407,12 @@ class PolicyRunner:
         plain: Recipe | None = None,
         records: StageRecords | None = None,
     ) -> None:
-        """The demonstrations and the anchor of `plain` get plain names.
-
-        The names of others tell their settings apart.
+        """Create a runner for one folder.
 
         Args:
-            records: what says which stages are up to date; default: the folder's own.
+            plain: the recipe whose demonstrations and anchor get plain file names; the names of
+                others contain a digest of their settings.
+            records: tell which stages are up to date; by default the folder's own records.
         """
         self.folder, self.on_event, self.plain = folder, on_event, plain
         self.records = StageRecords(folder, on_event) if records is None else records
@@ -427,14 +427,14 @@ class PolicyRunner:
         """Let every stage of every cell run again."""
         self.records.begin_anew()
 
-    # --- what the cells share -----------------------------------------------------------------
+    # --- shared by the cells ------------------------------------------------------------------
 
     def demos(self, recipe: Recipe) -> Given | Made:
         """The demonstrations that the recipe names, or those of its task and settings."""
         settings = recipe.demos
         if settings.path is not None:
             return self._given_demos(settings.path, settings.selection)
-        # A job's own are `demos.safetensors`; a study may have others, told apart by a digest.
+        # A job's file is `demos.safetensors`; the files of a study have a digest in their names.
         plain = self.plain is not None and (recipe.task, settings) == (
             self.plain.task,
             self.plain.demos,
@@ -458,7 +458,7 @@ class PolicyRunner:
         shown = self.demos(recipe) if recipe.anchor.source == "demos" else None
         key |= self.source(recipe.anchor).state if shown is None else {"demos": shown.sha256}
         if shown is not None:
-            # Which episodes and cameras it is measured on; positions and actions are not read.
+            # Only episodes and cameras count, since positions and actions are not read.
             chosen = recipes.selected(recipe)
             key |= {name: chosen[name] for name in ("only", "rename") if name in chosen}
 
@@ -477,7 +477,7 @@ class PolicyRunner:
         return self.records.shared("anchor" if plain else f"anchor-{digest(key)[:8]}", key, make)
 
     def backbone_sha256(self, recipe: Recipe) -> str:
-        """Digest of the model that the recipe's backbone stands for."""
+        """Digest of the recipe's backbone model."""
         if recipe.backbone not in self._sha256:
             self._sha256[recipe.backbone] = backbones.sha256(recipe.backbone)
         return self._sha256[recipe.backbone]
@@ -491,7 +491,7 @@ class PolicyRunner:
         return self._sources[key]
 
     def vqa_state(self, recipe: Recipe) -> list[dict[str, Any]]:
-        """What changes when the files of the recipe's question sets do."""
+        """The state of the recipe's question sets, which changes when their files do."""
         sections = [
             recipe.anchor,
             *recipe.probe.of_each_set(),
@@ -500,9 +500,9 @@ class PolicyRunner:
         return [self.source(section).state for section in sections]
 
     def questions(self, recipe: Recipe, settings: Probe, split: str) -> VQASet:
-        """The number of questions of one set that `settings` says, which the backbone can read.
+        """As many questions of one set as `settings` says, from one split of the set.
 
-        They are of one part of the set.
+        The backbone can read all of them.
         """
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._questions:
@@ -514,7 +514,7 @@ class PolicyRunner:
         return self._questions[key]
 
     def check_questions(self, recipe: Recipe, split: str) -> None:
-        """Raise AegisError where files have no question for this part, or an unreadable one."""
+        """Raise AegisError if files have no question for this split, or an unreadable one."""
         for settings in recipe.probe.of_each_set():
             key = (recipe.backbone, split, *dataclasses.astuple(settings))
             if self.source(settings).files and key not in self._checked:
@@ -522,7 +522,7 @@ class PolicyRunner:
             self._checked.add(key)
 
     def before(self, recipe: Recipe, settings: Probe, split: str) -> list[Graded]:
-        """The same questions, answered by the backbone before training."""
+        """The backbone's answers to the same questions before training."""
         key = (self.backbone_sha256(recipe), split, *dataclasses.astuple(settings))
         if key not in self._before:
             self._before[key] = leading.together(
@@ -537,7 +537,7 @@ class PolicyRunner:
     # --- a cell -------------------------------------------------------------------------------
 
     def key(self, cell: Cell[Recipe]) -> str:
-        """Digest of all that shapes what the cell leads to."""
+        """Digest of everything that affects the cell's result."""
         recipe = cell.recipe
         given = None if recipe.demos.path is None else self.demos(recipe).sha256
         evaluated = cell.validation and not playable_colors(recipe)
@@ -550,37 +550,37 @@ class PolicyRunner:
         )
 
     def measure(self, cell: Cell[Recipe]) -> PolicyFigures | Divergence:
-        """The cell's figures. A training that diverges is a finding."""
+        """The cell's figures; a training that diverges is a result too."""
         try:
             found = self.figures(cell.label, cell.recipe, cell.validation)
         except Diverged as end:
             return Divergence(end.good_steps)
         if not cell.validation or playable_colors(cell.recipe):
             return found
-        # A value is chosen by episodes of its own.
+        # A knob's value is chosen on separate episodes.
         evaluated = self.open_loop_errors(cell.label, cell.recipe, cell.judging)
         return dataclasses.replace(found, **evaluated.figures())
 
     def clear(self, label: str) -> None:
-        """Remove the checkpoints, which are large and no result."""
+        """Remove the checkpoints, which are large and not needed as results."""
         for run in (self.folder / label, self.folder / label / run_folder.MERGED):
             shutil.rmtree(run / "checkpoints", ignore_errors=True)
 
     def tidy(self, labels: Iterable[str]) -> None:
-        """Nothing: the runs' records stay."""
+        """Do nothing, because the runs' records stay."""
 
     def figures(self, label: str, recipe: Recipe, validation: bool = False) -> PolicyFigures:
         """Train `recipe.train.method`, merge it if the recipe says so, probe it and roll it out.
 
-        With `validation` this is done on the scenes and episodes for tuning.
+        With `validation` it uses the scenes and episodes for tuning.
 
-        A policy trained on demonstrations of no simulated task, or on several cameras, cannot be
-        rolled out: its figures have neither success nor return, but its open-loop error on the
-        episodes that training has held out. With `validation` that is left to `measure`.
+        A policy trained on demonstrations without a simulated task, or on several cameras, cannot
+        be rolled out. Its figures have no success or return, but its open-loop error on the
+        episodes that training held out. With `validation`, `measure` adds this error.
         """
         trained = self._trained(label, recipe)
         asked = self._asked(label, recipe, validation)
-        first, *further = asked  # the table's own columns are of the first set
+        first, *further = asked  # the table's main columns are for the first set
         last = self._policy(label, recipe) / "checkpoints" / "last"
         header = artifacts.read_header(last / checkpoint.EXPERT)
         playable = _playable(cast(PolicyMeta, header.meta), recipe)
@@ -612,7 +612,7 @@ class PolicyRunner:
         )
 
     def _trained(self, label: str, recipe: Recipe) -> dict[str, Any]:
-        """Train and merge; the training's report, with the validation loss of what is measured."""
+        """Train and merge; return the training's report with the measured policy's loss."""
         self.train(label, recipe)
         run_folder.renew_recipe(self.folder / label, recipe)
         report = files.load_json(self.folder / label / run_folder.JOBS_REPORT)
@@ -626,18 +626,18 @@ class PolicyRunner:
         return report
 
     def _asked(self, label: str, recipe: Recipe, validation: bool) -> dict[str, VqaFigures]:
-        """What was kept of each set of questions, by its name."""
+        """The figures on each question set, by its name."""
         asked = {}
         for number, settings in enumerate(recipe.probe.of_each_set(), start=1):
             probed = self.probe(label, recipe, settings, number, validation)
             asked[settings.only_set] = _vqa_figures(probed)
         if recipe.anchor.source == "demos":
-            # The distance of questions from robot frames is no drift.
+            # The distance between questions and robot frames is not a drift.
             asked = {name: dataclasses.replace(found, w2=None) for name, found in asked.items()}
         return asked
 
     def train(self, label: str, recipe: Recipe) -> None:
-        """Train the cell; its report lies in the run."""
+        """Train the cell; the report is written into the run."""
         out, method = self.folder / label, recipe.train.method
         recorded, measured = self.demos(recipe), self.anchor(recipe)
         key = self.training_key(recipe, recorded.sha256, measured.sha256)
@@ -648,7 +648,7 @@ class PolicyRunner:
 
         def make(on_event: OnEvent) -> None:
             self._clear_other_run(label, key, on_event)
-            # `resume` begins a run where none is there, and goes on with one that was interrupted.
+            # `resume` starts a new run if there is none, and continues one that was interrupted.
             report = leading.together(
                 train.run,
                 recipe,
@@ -664,7 +664,7 @@ class PolicyRunner:
         self.records.fresh(f"{label}/train", key, outputs, make)
 
     def training_key(self, recipe: Recipe, demos: str, anchor: str) -> dict[str, Any]:
-        """What shapes a training, given the digests of its demonstrations and its anchor."""
+        """Everything that affects a training, given digests of its demonstrations and anchor."""
         key = {
             "recipe": recipes.training_part(recipe),
             "backbone": self.backbone_sha256(recipe),
@@ -678,20 +678,20 @@ class PolicyRunner:
         return key
 
     def _clear_other_run(self, label: str, key: Mapping[str, Any], on_event: OnEvent) -> None:
-        """Let the cell begin anew where its folder holds no run that can be continued.
+        """Clear the cell's folder for a new start, unless it holds a run that can be continued.
 
-        A run of other settings cannot, nor one that was finished and then damaged, nor one whose
-        process was stopped while it wrote the recipe.
+        A run cannot be continued if its settings differ, if it was finished and then damaged, or
+        if its process was stopped while writing the recipe.
 
         Args:
-            key: what shapes the training.
+            key: everything that affects the training.
         """
-        # Begun with the very same inputs and interrupted: the training goes on with it.
+        # An interrupted run with exactly these inputs is continued.
         if self.goes_on(label, key):
             return
         out, begun_record = self.folder / label, f"{label}/{BEGUN}"
         begun = self.records.key_of(begun_record)
-        # Of `--overwrite` nothing is noted any more, and nobody has to be told.
+        # After `--overwrite` there is no record any more, and no warning is needed.
         if begun and begun != digest(key) and (out / "recipe.yaml").exists():
             changed = ", ".join(self.records.changed(begun_record, key))
             other = f"another {changed}" if changed else "other settings or inputs"
@@ -699,22 +699,22 @@ class PolicyRunner:
         moved = run_folder.clear(out, ours=begun is not None)
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))
-        # Noted before the training begins: by that a killed one is known as ours the next time.
+        # Recorded before the training starts, so that the run of a killed process counts as ours.
         self.records.forget(f"{label}/train")
         self.records.keep(begun_record, key, [])
 
     def has_begun(self, label: str) -> bool:
-        """Whether it is written down that the cell's run was begun here."""
+        """Whether the records say that the cell's run was started here."""
         return self.records.key_of(f"{label}/{BEGUN}") is not None
 
     def goes_on(self, label: str, key: Mapping[str, Any]) -> bool:
-        """Whether the cell's folder holds the beginning of the training of this key."""
+        """Whether the cell's folder holds an unfinished training with this key."""
         begun, finished = (self.records.key_of(f"{label}/{name}") for name in (BEGUN, "train"))
         there = (self.folder / label / "recipe.yaml").exists()
         return begun == digest(key) != finished and there
 
     def merge(self, label: str, recipe: Recipe) -> None:
-        """Merge what the cell has trained; the report lies in the merged run."""
+        """Merge the cell's trained policy; the report is written into the merged run."""
         trained, out = self.folder / label, self.folder / label / run_folder.MERGED
         recorded, measured = self.demos(recipe), self.anchor(recipe)
         settings = MergeSettings(
@@ -733,7 +733,7 @@ class PolicyRunner:
         }
 
         def make(on_event: OnEvent) -> None:
-            moved = run_folder.clear(out, ours=True)  # it lies in a run that is ours
+            moved = run_folder.clear(out, ours=True)  # it is inside a run that is ours
             if moved is not None:
                 on_event(Progress(f"merge (moved {moved.name} aside)", 1, 1, "stage"))
             strength = recipe.merge.strength
@@ -751,17 +751,17 @@ class PolicyRunner:
     def probe(
         self, label: str, recipe: Recipe, settings: Probe, number: int, validation: bool = False
     ) -> dict[str, Any]:
-        """The cell's drift report on one set of questions.
+        """The cell's drift report on one question set.
 
         Args:
-            number: of the set among those that the recipe probes, from 1; the first has a plain
-                name.
+            number: position of the set in the recipe's probe, from 1; the first set's files have
+                no number in their names.
         """
         split, name = ("validation", "probe-validation") if validation else ("probe", "probe")
         name = name if number == 1 else f"{name}-{number}"
         path, measured = self._policy(label, recipe) / f"{name}.json", self.anchor(recipe)
-        # All that the report is made of: weights, the anchor that W2 is measured from, the backbone
-        # that answers before, and the questions.
+        # All inputs of the report: the weights, the anchor that W2 is measured from, the backbone
+        # before training, and the questions.
         key = {
             "policy": _sha256(self._policy(label, recipe)),
             "anchor": measured.sha256,
@@ -782,7 +782,7 @@ class PolicyRunner:
     def _probed(
         self, label: str, recipe: Recipe, settings: Probe, split: str, on_event: OnEvent
     ) -> tuple[ProbeReport, dict[str, Any]]:
-        """The cell's answers compared with those of before, and what is kept of single images."""
+        """The cell's answers compared with those before training, and results per image."""
         measured = self.anchor(recipe)
         asked = self.questions(recipe, settings, split)
         before = self.before(recipe, settings, split)
@@ -817,7 +817,7 @@ class PolicyRunner:
     def rollout(
         self, label: str, recipe: Recipe, colors: str, validation: bool = False
     ) -> dict[str, Any]:
-        """The cell's success on seen or held-out colours; without colours, its only figure."""
+        """The cell's rollout report on seen or held-out colours, or on a task without colours."""
         stream, name = (VALIDATION, "rollout-validation") if validation else (EVALUATION, "rollout")
         path, settings = self._policy(label, recipe) / f"{name}-{colors}.json", recipe.rollout
         key: dict[str, Any] = {
@@ -828,7 +828,7 @@ class PolicyRunner:
         }
         if settings.ensemble is not None:
             key["ensemble"] = settings.ensemble
-        if settings.seed != acting.EVALUATION_SEED:  # what older records do not have
+        if settings.seed != acting.EVALUATION_SEED:  # older records have no seed
             key["seed"] = settings.seed
 
         def make(on_event: OnEvent) -> None:
@@ -854,11 +854,12 @@ class PolicyRunner:
     ) -> OpenLoop:
         """The open-loop errors of the cell and of holding the position, on held-out episodes.
 
-        With several sets of demonstrations each is the mean over the sets in which actions vary,
-        and None where there is no such set. Holding has an error where it has one in all of them.
+        With several sets of demonstrations, each error is the mean over the sets in which actions
+        vary, and None if there is no such set. Holding has an error only if it has one in all these
+        sets.
 
         Args:
-            judging: seeds whose held-out episodes are left out, where a value is to be chosen.
+            judging: seeds whose held-out episodes are left out when a knob's value is chosen.
         """
         given = self.demos(recipe)
         paths = mixture.each(given.path)
@@ -866,7 +867,7 @@ class PolicyRunner:
         for number, data in enumerate(paths, start=1):
             episodes = None if judging is None else tuning_episodes(recipe, data, judging)
             report = self.evaluated(label, recipe, data, given.sha256, number, episodes)
-            # None where no action varied in training: there is no variance to measure by.
+            # None if no action varied in training, so there is no variance to divide by.
             if report["relative_error"] is not None:
                 reports[number] = report
         return OpenLoop.of(reports)
@@ -880,10 +881,10 @@ class PolicyRunner:
         number: int,
         episodes: Sequence[int] | None = None,
     ) -> dict[str, Any]:
-        """The open-loop report on one set of demonstrations, of that number from 1.
+        """The open-loop report on one set of demonstrations, numbered from 1.
 
         Args:
-            episodes: default: all that the training has held out.
+            episodes: by default all episodes that the training held out.
         """
         run = self._policy(label, recipe)
         name = results.OPEN_LOOP if episodes is None else f"{results.OPEN_LOOP}-validation"
@@ -903,7 +904,7 @@ class PolicyRunner:
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Open-loop errors as `PolicyFigures` has them; None where nothing was measured."""
+    """Open-loop errors as in `PolicyFigures`; None if nothing was measured."""
 
     error: float | None = None
     hold: float | None = None
@@ -913,7 +914,7 @@ class OpenLoop:
     holds: tuple[float, ...] | None = None
 
     def figures(self) -> dict[str, Any]:
-        """The same by the names of `PolicyFigures`."""
+        """The same values by the field names of `PolicyFigures`."""
         return {
             "open_loop_error": self.error,
             "hold_error": self.hold,
@@ -925,7 +926,7 @@ class OpenLoop:
 
     @classmethod
     def of(cls, reports: Mapping[int, Mapping[str, Any]]) -> OpenLoop:
-        """What the reports on data sets tell together, by the sets' numbers."""
+        """The combined errors from the reports on data sets, which are given by set number."""
         if not reports:
             return cls()
         each = list(reports.values())
@@ -934,7 +935,7 @@ class OpenLoop:
             statistics.fmean(report["relative_error"] for report in each),
             None if None in held else statistics.fmean(held),
         )
-        # A report that an earlier version has kept does not tell single episodes.
+        # Reports of earlier versions have no errors of single episodes.
         if not all(report.get("episode_errors") for report in each):
             return made
         episodes, weights = list[str](), list[float]()
@@ -942,7 +943,7 @@ class OpenLoop:
             steps = sum(one["steps"] for one in report["episode_errors"])
             for one in report["episode_errors"]:
                 episodes.append(f"{number}/{one['episode']}")
-                weights.append(one["steps"] / (steps * len(reports)))  # each set counts alike
+                weights.append(one["steps"] / (steps * len(reports)))  # equal weight for each set
         every = [one for report in each for one in report["episode_errors"]]
         holds = None if made.hold is None else tuple(one["hold_error"] for one in every)
         return dataclasses.replace(
@@ -955,14 +956,14 @@ class OpenLoop:
 
 
 def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
-    """What a drift report tells of a policy."""
+    """The VQA figures in a drift report."""
     layers = [layer["w2"] for layer in probed["layers"]]
     return VqaFigures(
         accuracy=probed["accuracy"],
         drop_points=probed["drop_points"],
         drop_interval=tuple(probed["drop_interval"]),
         cross_entropy=probed["cross_entropy"],
-        w2=sum(layers) / len(layers) if layers else None,  # every layer counts alike, unweighted
+        w2=sum(layers) / len(layers) if layers else None,  # unweighted mean over layers
         baseline_accuracy=probed["baseline_accuracy"],
         baseline_cross_entropy=probed["baseline_cross_entropy"],
         majority_accuracy=probed["majority"],
@@ -973,14 +974,14 @@ def _vqa_figures(probed: dict[str, Any]) -> VqaFigures:
 
 
 def _tuple(values: list[Any] | None) -> tuple[Any, ...] | None:
-    """A list of a JSON file; None from a file that an older version wrote."""
+    """A list from a JSON file as a tuple; None if an older version wrote the file."""
     return None if values is None else tuple(values)
 
 
 def _probe_settings(settings: Probe) -> dict[str, Any]:
-    """What a probe's record knows of its settings; records older than a key are of its default."""
+    """The settings in a probe's record; keys that older records lack are left out at defaults."""
     keys = dataclasses.asdict(settings)
-    del keys["while_training"]  # what a training asks is none of a probe's questions
+    del keys["while_training"]  # it affects only the training
     if settings.seed == probe.PROBE_SEED:
         del keys["seed"]
     if settings.gate == MEAN:
@@ -989,7 +990,7 @@ def _probe_settings(settings: Probe) -> dict[str, Any]:
 
 
 def _remove_misplaced(trained: Path) -> None:
-    """Remove what an earlier Aegis has left of a merged run's figures in the run around it."""
+    """Remove a merged run's figures that an earlier version wrote into the enclosing run."""
     if (trained / run_folder.MERGE_REPORT).is_file():
         for name in ("probe*.json", "rollout*.json", run_folder.MERGE_REPORT):
             for path in trained.glob(name):
@@ -997,19 +998,19 @@ def _remove_misplaced(trained: Path) -> None:
 
 
 def _sha256(run: Path) -> list[str]:
-    """Digests of what a probe or rollout reads of a run."""
+    """Digests of the files of a run that a probe or rollout reads."""
     last = run / "checkpoints" / "last"
     return [files.sha256_file(last / name) for name in POLICY]
 
 
 def _playable(meta: PolicyMeta, recipe: Recipe) -> tuple[str, ...]:
-    """The colours that a policy is rolled out on, or the one word for a task without colours."""
+    """The colours that a policy is rolled out on, or one default for a task without colours."""
     task = sim.playable(meta["task"], checkpoint.seen_by(meta, meta["task"]))
     return () if task is None else _colors(task, recipe)
 
 
 def playable_colors(recipe: Recipe) -> tuple[str, ...]:
-    """As `_playable` says of a policy that is yet to be trained by the recipe."""
+    """Like `_playable`, for a policy that the recipe has yet to train."""
     task: str | None = recipe.task
     if recipe.demos.path is not None:
         given, chosen = mixture.at(recipe.demos.path), recipe.demos.selection

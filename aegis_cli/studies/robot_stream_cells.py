@@ -1,4 +1,4 @@
-"""The cells of a study of robot streams: learners on one stream of tasks, which share its data."""
+"""The cells of a study of robot streams: learners that share the data of one stream of tasks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from aegis_cli.studies.stream_runs import StreamRuns
 from aegis_cli.studies.tuning import ROBOT_STREAM_RULE, RobotStreamPoint
 from aegis_cli.training.up_to_date import StageRecords, digest
 
-PLACE = "stream"  # the one place on which all variants are measured
+PLACE = "stream"  # the single place on which all variants are measured
 
 
 class RobotStreamStudy:
@@ -38,7 +38,7 @@ class RobotStreamStudy:
 
     figures: type[Figures] = RobotStreamFigures
     rule = ROBOT_STREAM_RULE
-    tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
+    tunes_fixed = False  # variants without a knob are not shown with the tuned ones
     places: Sequence[str] = (PLACE,)
 
     def __init__(self, recipe: RobotStreamStudyRecipe) -> None:
@@ -50,12 +50,12 @@ class RobotStreamStudy:
         return study_cells.cell(self.recipe, variant, self.recipe.tasks, seed, value)
 
     def trial(self, variant: str, value: Any) -> RobotStreamRecipe:
-        """The recipe by which a knob's value is judged."""
+        """The recipe that evaluates a knob's value."""
         tuning = self.recipe.tuning or RobotStreamTuning()
         return self.cell(variant, PLACE, tuning.seed, value)
 
     def check(self, trials: Sequence[RobotStreamRecipe]) -> None:
-        """Raise AegisError for a task that is not there, before any work."""
+        """Raise AegisError for a task that does not exist, before any work."""
         recorded = any(trial.demos.paths is None for trial in trials)
         for task in self.recipe.tasks:
             if recorded:
@@ -65,22 +65,22 @@ class RobotStreamStudy:
     def prepare(
         self, runner: RobotStreamRunner, cells: Sequence[Cell[RobotStreamRecipe]], together: bool
     ) -> None:
-        """Check the questions, and record what processes would share.
+        """Check the questions, and record demonstrations if several processes share them.
 
         Raises:
-            AegisError: questions that cannot be read, or no rendering on this machine.
+            AegisError: questions cannot be read, or this machine cannot render.
         """
         gl.check()
         for asked in dict.fromkeys(cell.recipe.probe for cell in cells):  # each set once
             runner.questions(asked)
-        # One process records what it needs when it needs it; of several each would do so.
+        # A single process records these when needed, but several would each record their own.
         for cell in cells if together else ():
             runner.demonstrations(cell.recipe)
 
     def point(
         self, variant: str, value: Any, found: RobotStreamFigures | Divergence
     ) -> RobotStreamPoint:
-        """What a knob's value led to."""
+        """The result of a knob's value."""
         method = self.recipe.variants[variant].method
         if isinstance(found, Divergence):
             return RobotStreamPoint(variant, method, value, None, None)
@@ -89,13 +89,13 @@ class RobotStreamStudy:
     def costs(
         self, store: CellStore[RobotStreamRecipe], chosen: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """A learner's minutes are among its figures; nothing is timed apart."""
+        """Nothing, because a learner's minutes are among its figures."""
         return {}
 
     def report(
         self, findings: Findings, store: CellStore[RobotStreamRecipe]
     ) -> RobotStreamStudyReport:
-        """The table of what is known."""
+        """The table of the results so far."""
         study = self.recipe
         return RobotStreamStudyReport(
             name=study.name,
@@ -128,12 +128,13 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         self._records.begin_anew()
 
     def key(self, cell: Cell[RobotStreamRecipe]) -> str:
-        """Digest of all that shapes the figures.
+        """Digest of everything that affects the figures.
 
-        The run's label, and where the backbone and given demonstrations lie, are no part of it.
+        The run's label and the locations of the backbone and given demonstrations are not part of
+        it.
         """
         recipe = cell.recipe
-        # To load a backbone takes long, and many cells begin with the same one.
+        # Loading a backbone takes long, and many cells start from the same one.
         if recipe.backbone not in self._fingerprints:
             self._fingerprints[recipe.backbone] = backbones.load(recipe.backbone).fingerprint()
         given = list[str]()
@@ -144,7 +145,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         return cell_key(cell, self._fingerprints[recipe.backbone], given, state)
 
     def questions(self, settings: Probe) -> robots.Questions:
-        """The set of questions that a recipe's probe asks.
+        """The question set that a recipe's probe asks.
 
         Raises:
             AegisError: it cannot be read.
@@ -156,23 +157,23 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         return self._sources[settings]
 
     def demonstrations(self, recipe: RobotStreamRecipe) -> str | tuple[str, ...]:
-        """Where the tasks' demonstrations lie; they are recorded unless they are given."""
+        """Where the tasks' demonstrations are; they are recorded unless they are given."""
         if recipe.demos.paths is not None:
             return recipe.demos.paths
         made = [robot_demos.record(recipe, i, self._records) for i in range(len(recipe.tasks))]
         return tuple(str(one.path) for one in made)
 
     def _digest(self, path: Path, chosen: Selection) -> str:
-        """What changes when given demonstrations do."""
+        """Digest of given demonstrations."""
         if (path, chosen) not in self._digests:
             self._digests[path, chosen] = demonstrations.digest(path, chosen)
         return self._digests[path, chosen]
 
     def learned(self, cell: Cell[RobotStreamRecipe]) -> RobotStreamRecipe:
-        """The recipe that is learned, on validation episodes if the cell is of the tuning."""
+        """The recipe that is learned, measured on validation episodes if the cell is for tuning."""
         recipe = cell.recipe
         split = "validation" if cell.validation else "evaluation"
-        # With the paths filled in, a run finds the demonstrations that all cells share.
+        # Filled-in paths let a run find the demonstrations that all cells share.
         return dataclasses.replace(
             recipe,
             demos=dataclasses.replace(recipe.demos, paths=self.demonstrations(recipe)),
@@ -180,7 +181,7 @@ class RobotStreamRunner(StreamRuns[RobotStreamRecipe]):
         )
 
     def figures(self, report: RobotStreamReport) -> RobotStreamFigures:
-        """The figures of a learned stream that studies compare."""
+        """The figures of a learned stream that a study compares."""
         return RobotStreamFigures(
             method=report.method,
             success=report.success,
@@ -205,17 +206,17 @@ def cell_key(
 ) -> str:
     """Digest of a robot stream's settings.
 
-    Options at their defaults are left out: one that is added later makes no finished cell stale.
+    Options at their defaults are left out, so a later option does not make finished cells stale.
 
     Args:
-        fingerprint: of the backbone that the recipe names.
-        demos_sha256: of given demonstrations, one per task; none where they are recorded.
-        vqa_state: of the question files that it reads, if any.
+        fingerprint: fingerprint of the backbone that the recipe names.
+        demos_sha256: digests of given demonstrations, one per task; empty if they are recorded.
+        vqa_state: state of the question files that it reads, if any.
     """
     recipe = cell.recipe
     method = recipe.train.method
     sections = {name: getattr(recipe, name) for name in ("train", "expert", "rollout", "probe")}
-    sections["demos"] = dataclasses.replace(recipe.demos, paths=None)  # wherever they lie
+    sections["demos"] = dataclasses.replace(recipe.demos, paths=None)  # paths do not count
     sections[method] = getattr(recipe, method.replace("-", "_"), None)
     shaping: dict[str, Any] = {
         name: recipes.changed(section) for name, section in sections.items() if section is not None
@@ -228,9 +229,9 @@ def cell_key(
         "backbone": fingerprint,
     }
     if demos_sha256:
-        shaping["demos"] = list(demos_sha256)  # in place of how they would be recorded
-        if chosen := recipes.selected(recipe):  # the digests say nothing of the choice
+        shaping["demos"] = list(demos_sha256)  # instead of the recording settings
+        if chosen := recipes.selected(recipe):  # the digests do not cover the selection
             shaping["selected"] = chosen
-    if vqa_state:  # scenes come from no file, and add no key
+    if vqa_state:  # scenes do not come from files and add no key
         shaping["vqa"] = dict(vqa_state)
     return digest(shaping)

@@ -1,4 +1,4 @@
-"""The cells of a study of streams of images: learners on streams, and what they lead to."""
+"""The cells of a study of image streams: learners on streams, and their results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StreamStudy:
 
     figures: type[Figures] = StreamFigures
     rule = STREAM_RULE
-    tunes_fixed = False  # a variant without a choice has no figure to be shown with the others
+    tunes_fixed = False  # variants without a knob are not shown with the tuned ones
 
     def __init__(self, recipe: StreamStudyRecipe) -> None:
         self.recipe = recipe
@@ -46,12 +46,12 @@ class StreamStudy:
         return study_cells.cell(self.recipe, variant, place, seed, value)
 
     def trial(self, variant: str, value: Any) -> StreamRecipe:
-        """The recipe by which a knob's value is judged."""
+        """The recipe that evaluates a knob's value."""
         tuning = self.recipe.tuning or StreamTuning(self.recipe.streams[0])
         return self.cell(variant, tuning.stream, tuning.seed, value)
 
     def check(self, trials: Sequence[StreamRecipe]) -> None:
-        """Streams and encoders are loaded to be checked, which `prepare` does."""
+        """Do nothing, because checking streams and encoders means loading them, as in `prepare`."""
 
     def prepare(
         self,
@@ -59,10 +59,10 @@ class StreamStudy:
         cells: Sequence[Cell[StreamRecipe]],
         together: bool,
     ) -> None:
-        """Load all streams and make their images, once: a missing one, or no pair, shows now.
+        """Load all streams and make their images once, which shows missing streams and bad pairs.
 
         Raises:
-            AegisError: a stream or encoder that is not there, or a pair of more or fewer tasks.
+            AegisError: a stream or encoder does not exist, or a pair does not have two tasks.
         """
         study, recipe = self.recipe, cells[0].recipe
         size = images.encoder(recipe.encoder).image_size
@@ -78,23 +78,23 @@ class StreamStudy:
                 )
 
     def point(self, variant: str, value: Any, found: StreamFigures | Divergence) -> StreamPoint:
-        """What a knob's value led to."""
+        """The result of a knob's value."""
         method = self.recipe.variants[variant].method
         if isinstance(found, Divergence):
             return StreamPoint(variant, method, value, None, None)
         return StreamPoint(variant, method, value, found.last, found.parameters)
 
     def costs(self, store: CellStore[StreamRecipe], chosen: Mapping[str, Any]) -> dict[str, Any]:
-        """A learner's minutes are among its figures; nothing is timed apart."""
+        """Nothing, because a learner's minutes are among its figures."""
         return {}
 
     def report(self, findings: Findings, store: CellStore[StreamRecipe]) -> StreamStudyReport:
-        """The table of what is known."""
+        """The table of the results so far."""
         study = self.recipe
         methods = {variant.method for variant in study.variants.values()}
         known = {name: learners.get(name) for name in methods}
-        # What learns nothing has the same run for each seed. A task that has not come is served by
-        # the bare encoder only where each task has a part of its own.
+        # A learner that learns nothing has the same run for each seed. Future tasks are served by
+        # the bare encoder only if each task has its own router.
         unseeded = {name for name, learner in known.items() if learner.trains == "nothing"}
         frozen = {name for name, learner in known.items() if learner.frozen and not learner.shared}
         return StreamStudyReport(
@@ -123,12 +123,12 @@ class StreamRunner(StreamRuns[StreamRecipe]):
         self._image_sets: dict[tuple[Any, ...], str] = {}
 
     def key(self, cell: Cell[StreamRecipe]) -> str:
-        """Digest of all that shapes the figures.
+        """Digest of everything that affects the figures.
 
-        The run's label, and where encoder and images lie, are no part of it.
+        The run's label and the locations of encoder and images are not part of it.
         """
         recipe = cell.recipe
-        # To load an encoder, and to digest its images, takes long: many cells share them.
+        # Loading an encoder and digesting its images takes long, and many cells share them.
         if recipe.encoder not in self._fingerprints:
             self._fingerprints[recipe.encoder] = images.encoder(recipe.encoder).fingerprint()
         which = (recipe.stream, recipe.path, recipe.order)
@@ -137,27 +137,27 @@ class StreamRunner(StreamRuns[StreamRecipe]):
         return cell_key(cell, self._fingerprints[recipe.encoder], self._image_sets[which])
 
     def learned(self, cell: Cell[StreamRecipe]) -> StreamRecipe:
-        """The recipe that is learned, on validation parts if the cell is of the tuning."""
+        """The recipe that is learned, measured on validation parts if the cell is for tuning."""
         return dataclasses.replace(cell.recipe, split=VALIDATION if cell.validation else TEST)
 
     def figures(self, report: ImageStreamReport) -> StreamFigures:
-        """The figures of a learned stream that studies compare."""
+        """The figures of a learned stream that a study compares."""
         return stream_figures(report)
 
 
 def cell_key(cell: Cell[StreamRecipe], fingerprint: str, image_set: str) -> str:
     """Digest of a stream's settings.
 
-    Options at their defaults are left out: one that is added later makes no finished cell stale.
+    Options at their defaults are left out, so a later option does not make finished cells stale.
 
     Args:
-        fingerprint: of the encoder that the recipe names.
+        fingerprint: fingerprint of the encoder that the recipe names.
         image_set: digest of the images that it names.
     """
     recipe = cell.recipe
     method = recipe.train.method
     sections = {"train": recipe.train, method: getattr(recipe, method.replace("-", "_"), None)}
-    if not learners.get(method).shared:  # one state for all tasks need not know which it is asked
+    if not learners.get(method).shared:  # a single state for all tasks does not infer the task
         sections["inference"] = recipe.inference
     changed = {
         name: recipes.changed(section) for name, section in sections.items() if section is not None
@@ -168,15 +168,15 @@ def cell_key(cell: Cell[StreamRecipe], fingerprint: str, image_set: str) -> str:
         "method": method,
         "validation": cell.validation,
     }
-    if learners.get(method).trains != "nothing":  # else every seed is the same
+    if learners.get(method).trains != "nothing":  # otherwise all seeds are the same
         shaping["seed"] = recipe.seed
     return digest({**changed, **shaping, "encoder": fingerprint, "images": image_set})
 
 
 def stream_figures(report: ImageStreamReport) -> StreamFigures:
-    """The figures of a learned stream that studies compare."""
+    """The figures of a learned stream that a study compares."""
     told, inferred = report.scores, report.inferred_scores
-    # Of the experts that a task uses at its end, those of its own, over all maps.
+    # Per task, the number of its own experts that it uses at its end, over all maps.
     owned = []
     for task, record in enumerate(report.records):
         owned.append(sum(site.owners.count(task) for site in record.sites))
@@ -196,7 +196,7 @@ def stream_figures(report: ImageStreamReport) -> StreamFigures:
         trained=report.trained,
         trained_mean=report.trained_mean,
         reuse=report.reuse,
-        # Row t has the accuracies after task t: its diagonal is each task right after its learning.
+        # Row t has the accuracies after task t, so the diagonal is right after learning each task.
         own=tuple(row[task] for task, row in enumerate(report.oracle)),
         added=tuple(record.added for record in report.records),
         new_experts=tuple(owned),

@@ -1,4 +1,4 @@
-"""Runs of streams as cells of a study: begun, gone on with if they are still the same, cleared."""
+"""Runs of streams as cells of a study: started, resumed if they are still the same, cleared."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from aegis_cli.studies.cells import Cell
 from aegis_cli.studies.figures import Divergence, RobotStreamFigures, StreamFigures
 from aegis_cli.training import folder as run_folder
 
-S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)  # of all streams of one study
-_BEGUN = ".begun"  # ends the name of the note beside a run that a study has started
+S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)  # the recipes of one study
+_BEGUN = ".begun"  # suffix of the note beside a run that a study has started
 
 
 class StreamRuns(ABC, Generic[S]):
-    """Learns cells; a label is a run's place below the folder: `primer-1/igsp/0`.
+    """Learns cells; a label is a run's path relative to the folder, such as `primer-1/igsp/0`.
 
-    Beside a run lies a note of what it was begun with.
+    A note beside each run holds the key that it was started with.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -33,23 +33,23 @@ class StreamRuns(ABC, Generic[S]):
 
     @abstractmethod
     def key(self, cell: Cell[S]) -> str:
-        """Digest of all that shapes the figures."""
+        """Digest of everything that affects the figures."""
 
     @abstractmethod
     def learned(self, cell: Cell[S]) -> S:
-        """The recipe that is learned, on validation parts if the cell is of the tuning."""
+        """The recipe that is learned, measured on validation parts if the cell is for tuning."""
 
     @abstractmethod
     def figures(self, report: Any) -> StreamFigures | RobotStreamFigures:
-        """The figures of a learned stream that studies compare."""
+        """The figures of a learned stream that a study compares."""
 
     def begin_anew(self) -> None:
-        """Let every stream be learned again; that a study began its run is remembered."""
+        """Let every stream be learned again, but remember that a study started its run."""
         for note in self.folder.rglob(f"*{_BEGUN}"):
             files.write_text(note, "")
 
     def measure(self, cell: Cell[S]) -> StreamFigures | RobotStreamFigures | Divergence:
-        """Learn the stream. One that diverges is a finding."""
+        """Learn the stream; one that diverges is a result too."""
         out, key = self.folder / cell.label, self.key(cell)
         recipe = self.learned(cell)
         begun = _note(out).exists()
@@ -57,7 +57,7 @@ class StreamRuns(ABC, Generic[S]):
         if not same or _named_otherwise(out, recipe):
             run_folder.clear(out, ours=begun)
             files.make_folder(out.parent)
-            files.write_text(_note(out), key)  # before the run begins: by it a killed one is ours
+            files.write_text(_note(out), key)  # before the start, so that a killed run is known
 
         def named(event: Any) -> None:
             self.on_event(dataclasses.replace(event, stage=f"{cell.label}/{event.stage}"))
@@ -68,10 +68,10 @@ class StreamRuns(ABC, Generic[S]):
             return Divergence(end.good_steps)
 
     def clear(self, label: str) -> None:
-        """Remove a run and its note; one with somebody's own files is moved beside it.
+        """Remove a run and its note; a run with files of the user is moved aside instead.
 
-        The folder that they lay in stays until `tidy`, for another process may be about to begin
-        its run there.
+        The enclosing folder stays until `tidy`, because another process may be about to start a
+        run there.
         """
         out = self.folder / label
         run_folder.clear(out, ours=True)
@@ -80,16 +80,16 @@ class StreamRuns(ABC, Generic[S]):
     def tidy(self, labels: Iterable[str]) -> None:
         """Remove the folders that are empty once the cells of these labels are measured."""
         for label in labels:
-            with contextlib.suppress(OSError):  # other runs are there, or it is gone
-                # From the innermost folder outwards, and none that holds the study itself.
+            with contextlib.suppress(OSError):  # it holds other runs, or is gone
+                # From the innermost folder outwards, up to but not including the study's folder.
                 for folder in (self.folder / label).parents[: len(Path(label).parts) - 1]:
                     folder.rmdir()
 
 
 def _named_otherwise(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -> bool:
-    """Whether a run of the same key cannot go on all the same.
+    """Whether a run cannot be resumed although its key is the same.
 
-    Its recipe tells where its encoder, or backbone, lay, the key does not.
+    Its recipe has the path of its encoder or backbone, which is not part of the key.
     """
     return (out / "recipe.yaml").exists() and not run_folder.goes_on(out, recipe)
 

@@ -1,8 +1,8 @@
 """`aegis run` with a study: tune, train and compare variants x tasks or streams x seeds.
 
-What is finished is never run again. In the study's folder lie:
+Finished cells are never run again. The study's folder holds:
 
-cells.json   what every finished cell led to, by a digest of everything that shapes it
+cells.json   the result of every finished cell, by a digest of everything that affects it
 table.json   the comparison so far
 <task or stream>/<variant>/<seed>/, tuning/<variant>/<value>/   run folders
 """
@@ -32,7 +32,7 @@ from aegis_cli.studies.robot_stream_cells import RobotStreamStudy
 from aegis_cli.studies.stream_cells import StreamStudy
 from aegis_cli.studies.tuning import choose
 
-_LONGEST_NAME = 100  # bytes of a folder's name; file systems take 143 or more
+_LONGEST_NAME = 100  # bytes of a folder's name; file systems allow 143 or more
 Trials = Mapping[str, list[tuple[Any, Cell[R]]]]  # variant -> its knob's values and their cells
 
 
@@ -43,20 +43,20 @@ def run(
     workers: int = 1,
     overwrite: bool = False,
 ) -> Report:
-    """Run `study` under `root/<name>`; called again, it goes on where it was interrupted.
+    """Run `study` under `root/<name>`; another call continues an interrupted study.
 
     The knobs are tuned first. Then all variants are compared on all tasks or streams with the first
     seed, then with the next, so that an interrupted study is balanced; the costs come last.
-    `table.json` is written after every cell that is measured, of tuning too. A training that
-    diverges is a finding: it is written down, and the study goes on.
+    `table.json` is written after every measured cell, including those of tuning. A training that
+    diverges is recorded as a result, and the study continues.
 
     Args:
         workers: number of cells that are measured at once, each with its share of the cores.
-        overwrite: forget what is finished, and measure all of it again.
+        overwrite: forget all finished cells and measure them again.
 
     Raises:
-        AegisError: a cell that is no recipe (before any work), another process that is at the
-            folder, or whatever a stage finds wrong.
+        AegisError: a cell is not a valid recipe (before any work), another process is using the
+            folder, or a stage raised it.
     """
     kind = kind_of(study)
     tried = trials(kind)
@@ -71,19 +71,20 @@ def run(
 
 
 def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
-    """What a study's finished cells say, without anything being measured.
+    """The report of a study's finished cells; nothing is measured.
 
-    Variants that have not been tuned to the end are left out, unless all are. Where one is missing
-    that the margin of all others is of, nothing is chosen, and what was tried is told alone.
+    Variants whose tuning is unfinished are left out, unless none is finished. If a variant that
+    sets the margin for all others is unfinished, no values are chosen, and the report has only the
+    tuning so far.
 
     Args:
         cells: a study's `cells.json`, under any name.
 
     Raises:
-        AegisError: no cells, or none of this study.
+        AegisError: there are no cells, or none of this study.
     """
     kind = kind_of(study)
-    # A copy of its own: a store reads its folder's `cells.json`, and writes a table beside it.
+    # A temporary copy, because a store reads `cells.json` in its folder and writes a table there.
     with tempfile.TemporaryDirectory() as aside:
         shutil.copy(cells, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
@@ -103,15 +104,15 @@ def told(study: AnyStudy, cells: Path, on_event: OnEvent = ignore) -> Report:
 def planned(
     study: AnyStudy, root: Path, on_event: OnEvent = ignore, overwrite: bool = False
 ) -> Iterator[tuple[str, bool | None]]:
-    """Every cell's label and whether it is finished; nothing is measured, and nothing written.
+    """Every cell's label and whether it is finished; nothing is measured or written.
 
-    None stands for a cell whose value the tuning has yet to choose.
+    None stands for a cell whose value has yet to be chosen by tuning.
 
     Args:
-        overwrite: whether what is finished is to be forgotten.
+        overwrite: treat all cells as unfinished.
 
     Raises:
-        AegisError: a cell that is no recipe, or files that cannot be read.
+        AegisError: a cell is not a valid recipe, or files cannot be read.
     """
     kind = kind_of(study)
     tried = trials(kind)
@@ -121,8 +122,8 @@ def planned(
         if kept.exists() and not overwrite:
             shutil.copy(kept, Path(aside) / CELLS)
         store = CellStore(kind, Path(aside), on_event, known_only=True)
-        store.total = sum(map(len, tuned.values()))  # of which those that are known are delivered
-        # In the order in which `run` measures them, so that a plan reads as the study will go.
+        store.total = sum(map(len, tuned.values()))  # the store delivers only the known ones
+        # In the order in which `run` measures them.
         for own in tuned.values():
             for _, cell in own:
                 yield cell.label, store.runner.key(cell) in store.cells
@@ -138,7 +139,7 @@ def planned(
 
 
 def kind_of(study: AnyStudy) -> StudyKind[Any]:
-    """What a study's cells are, and how they are measured and told."""
+    """The kind of a study, which defines how its cells are measured and reported."""
     if isinstance(study, StudyRecipe):
         return PolicyStudy(study)
     if isinstance(study, RobotStreamStudyRecipe):
@@ -147,15 +148,15 @@ def kind_of(study: AnyStudy) -> StudyKind[Any]:
 
 
 def _tuned_whole(kind: StudyKind[R], store: CellStore[R]) -> list[str]:
-    """The variants whose values have all been measured, and those that have none to choose.
+    """The variants whose values have all been measured, and those without values to choose.
 
-    There are none where one is not whole by which all others are judged: without it, they would be
-    judged by another, and other values would be chosen.
+    The result is empty if a variant that sets the margin for all others is not among them. Without
+    it another variant would set the margin, and other values would be chosen.
     """
     variants, tuned = kind.recipe.variants, _tuned(kind, trials(kind))
     whole = []
     for name in variants:
-        # None to measure, where the variant has no choice: then it is whole.
+        # A variant without a choice has no cells here and counts as measured.
         own = [cell for _, cell in tuned.get(name, ())]
         if all(store.runner.key(cell) in store.cells for cell in own):
             whole.append(name)
@@ -163,7 +164,7 @@ def _tuned_whole(kind: StudyKind[R], store: CellStore[R]) -> list[str]:
 
 
 def _judges(kind: StudyKind[R]) -> list[str]:
-    """The variants whose best value sets the margin for all: none where each sets its own."""
+    """The variants whose best value sets the margin for all; empty if each sets its own."""
     variants, reference = kind.recipe.variants, kind.rule.reference
     if reference is None:
         return []
@@ -182,8 +183,8 @@ def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
 
     findings = _tune(kind, store, tuned)
     if tuned and not findings.chosen:
-        return _write(kind, store, findings)  # known cells alone, of which some are not there
-    # A variant that is not tuned has one value, or is compared with its first.
+        return _write(kind, store, findings)  # only known cells are delivered, and some are missing
+    # A variant that is not tuned uses its first value.
     chosen = {name: own[0][0] for name, own in tried.items()} | dict(findings.chosen)
     findings = dataclasses.replace(findings, chosen=chosen)
     found: dict[str, dict[Setting, Outcome]] = {}
@@ -192,11 +193,11 @@ def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
     with contextlib.closing(store.measured(cells)) as measured:
         for number, (cell, figures) in enumerate(measured, 1):
             place, name, seed = cell.label.rsplit("/", 2)  # a task's name may hold a slash
-            # They come as they are finished, and are put in order for the table.
+            # Cells arrive as they finish; they are ordered for the table.
             found.setdefault(name, {})[place, int(seed)] = figures
             findings = dataclasses.replace(findings, cells=_ordered(kind, found))
-            # A table of many cells takes seconds: it is not written for each known one, which come
-            # first, and the last one is written below.
+            # A table of many cells takes seconds, so it is not written after each known cell
+            # (these come first). The last one is written below.
             if known <= number < len(cells):
                 _write(kind, store, findings)
     store.tidy([cell for own in tuned.values() for _, cell in own] + cells)
@@ -207,7 +208,7 @@ def _run(kind: StudyKind[R], tried: Trials[R], store: CellStore[R]) -> Report:
 def trials(kind: StudyKind[R]) -> Trials[R]:
     """Every variant's values and their cells on the validation split.
 
-    They are made at once, so that a bad one is refused before any work.
+    All are created here, so that a bad one is refused before any work.
     """
     made: dict[str, list[tuple[Any, Cell[R]]]] = {}
     judging = tuple(kind.recipe.seeds)
@@ -221,39 +222,39 @@ def trials(kind: StudyKind[R]) -> Trials[R]:
 
 
 def _folders(values: Sequence[Any]) -> list[str]:
-    """A folder's name for each of a knob's values, no two of which are alike."""
+    """A distinct folder name for each of a knob's values."""
     found: list[str] = []
     for value in values:
         slug = _slug(value)
         name = _cut(slug) or "value"
-        if name != slug or name in found:  # texts that differ in what no folder's name may have
+        if name != slug or name in found:  # different values may have the same allowed characters
             name += "-" + hashlib.sha256(repr(value).encode()).hexdigest()[:8]
         found.append(name)
     return found
 
 
 def _slug(value: Any) -> str:
-    """A knob's value in the characters that a folder's name may have."""
+    """A knob's value in characters that are allowed in a folder name."""
     return "fixed" if value is None else re.sub(r"[^\w.+-]+", "_", str(value)).strip("_")
 
 
 def _cut(slug: str) -> str:
-    """What of it fits into a folder's name; nothing of dots alone, which name other folders."""
+    """`slug` shortened to fit a folder name; "" for only dots, which name other folders."""
     if not slug.strip("."):
         return ""
-    # By bytes, as file systems count; a character that is cut in two is left out.
+    # Counted in bytes, as file systems do; a character that is cut in two is dropped.
     return slug.encode()[:_LONGEST_NAME].decode(errors="ignore")
 
 
 def _tuned(kind: StudyKind[R], tried: Trials[R]) -> Trials[R]:
-    """The variants whose values are measured; none without tuning, where no variant has a knob."""
+    """The variants whose values are measured; empty without tuning."""
     if kind.recipe.tuning is None:
         return {}
     return {name: own for name, own in tried.items() if kind.tunes_fixed or len(own) > 1}
 
 
 def _tune(kind: StudyKind[R], store: CellStore[R], tuned: Trials[R]) -> Findings:
-    """Measure the values, and choose the one that each variant is compared with."""
+    """Measure the values, and choose one for each variant to be compared with."""
     tuning = kind.recipe.tuning
     if tuning is None or not tuned:
         return Findings()
@@ -268,7 +269,7 @@ def _tune(kind: StudyKind[R], store: CellStore[R], tuned: Trials[R]) -> Findings
             so_far = [point for own in points.values() for point in own]
             if number >= known and known < len(cells):
                 _write(kind, store, Findings(so_far))
-    if len(found) < len(cells):  # only finished cells are delivered, and some are not there
+    if len(found) < len(cells):  # only finished cells are delivered, and some are missing
         return Findings([point for own in points.values() for point in own])
     best = choose(kind.rule, points, tuning.within)
     decided = []
@@ -279,7 +280,7 @@ def _tune(kind: StudyKind[R], store: CellStore[R], tuned: Trials[R]) -> Findings
 
 
 def _points(kind: StudyKind[R], tuned: Trials[R], found: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What the finished values led to, in the recipe's order, whichever was finished first."""
+    """The results of the finished values, in the recipe's order."""
     points: dict[str, list[Any]] = {}
     for name, own in tuned.items():
         finished = [(value, cell.label) for value, cell in own if cell.label in found]
@@ -294,7 +295,7 @@ def _compared(kind: StudyKind[R], chosen: Mapping[str, Any]) -> Iterator[Cell[R]
 
 def _settings(kind: StudyKind[Any]) -> Iterator[tuple[str, str, int]]:
     """Variant, task or stream, and seed of every compared cell, in the order of measuring."""
-    # Seeds outermost: a study that is interrupted has all variants with the seeds that it has.
+    # Seeds outermost, so that an interrupted study has all variants for its finished seeds.
     for seed in kind.recipe.seeds:
         for place in kind.places:
             for name in kind.recipe.variants:
@@ -312,7 +313,7 @@ def _cell(kind: StudyKind[R], name: str, place: str, seed: int, value: Any) -> C
 def _ordered(
     kind: StudyKind[R], found: Mapping[str, Mapping[Setting, Outcome]]
 ) -> dict[str, dict[Setting, Outcome]]:
-    """Variants and cells in the recipe's order, whichever was finished first."""
+    """Variants and cells in the recipe's order."""
     settings = [(place, seed) for place in kind.places for seed in kind.recipe.seeds]
     ordered: dict[str, dict[Setting, Outcome]] = {}
     for name in kind.recipe.variants:
@@ -323,7 +324,7 @@ def _ordered(
 
 
 def _write(kind: StudyKind[R], store: CellStore[R], findings: Findings) -> Report:
-    """The report of what is known now."""
+    """Write and return the report of the results so far."""
     report = kind.report(findings, store)
     files.save_json(store.folder / "table.json", report.to_json())
     return report

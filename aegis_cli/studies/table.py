@@ -1,4 +1,4 @@
-"""The table of `aegis run`, finished or not, read back from the folder that holds it."""
+"""Reads the table of `aegis run`, finished or not, back from its folder."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Report = PipelineReport | StudyReport | StreamStudyReport | RobotStreamStudyRepo
 def load(at: Path) -> Report:
     """The report as `aegis run` would return it now.
 
-    Its `out` is where it lies, wherever it was written.
+    Its `out` is the folder where it is now, even if it was written elsewhere.
 
     Raises:
-        AegisError: a study that has measured nothing yet, or a table of another version.
+        AegisError: a study has measured nothing yet, or the table is of another version.
     """
     path = at / NAME
     if not path.is_file():
@@ -48,19 +48,19 @@ def load(at: Path) -> Report:
 
 
 def runs(report: PipelineReport) -> list[Path]:
-    """The run of each row: the one whose weights were measured."""
+    """The run of each row, whose weights were measured."""
     found = []
     for row in report.rows:
         trained = Path(report.out) / row.method
-        # An earlier Aegis did not say in its table that it had merged what it trained.
+        # Tables of earlier versions do not say that the trained policy was merged.
         merged = report.merge is not None or folder.measured_in(trained) is None
         found.append(trained / folder.MERGED if merged else trained)
     return found
 
 
 def _kind(raw: object) -> type[Report]:
-    """The report that has the table's keys; an older table has none of those with a default."""
-    # No two kinds need the same keys, so that the first that fits is the one.
+    """The kind of report with the table's keys; older tables may lack keys with a default."""
+    # No two kinds require the same keys, so the first one that fits is right.
     for kind in get_args(Report):
         fields = dataclasses.fields(kind)
         known = {field.name for field in fields}

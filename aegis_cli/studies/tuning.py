@@ -1,6 +1,6 @@
 """How a variant's knob is chosen: one rule for all variants of a study, on validation parts only.
 
-Among a variant's values that are nearly as able as the best, the one of the most merit is chosen.
+Among a variant's values whose ability is close to the best, the one with the most merit is chosen.
 Each kind of study declares what ability and merit are.
 """
 
@@ -19,8 +19,9 @@ class PolicyPoint:
     """One value of a variant's knob (None: it has none), and its figures on the validation split.
 
     They are shares in [0, 1]. `success` is on seen colours or, on a task measured by its return,
-    its share of the highest return. Of what cannot be rolled out `open_loop_error` takes its place,
-    on episodes that judge no compared cell. Both are None if the training diverged.
+    its share of the highest return. For policies that cannot be rolled out, `open_loop_error` takes
+    its place, on episodes that no compared cell is evaluated on. Both are None if the training
+    diverged.
     """
 
     variant: str
@@ -35,7 +36,7 @@ class PolicyPoint:
 
 @dataclass(frozen=True)
 class StreamPoint:
-    """One value of a variant's knob (None: it has none) and what it led to.
+    """One value of a variant's knob (None: it has none) and its result.
 
     `last` is a share in [0, 1], on validation parts with the task told; None if the training
     diverged.
@@ -51,7 +52,7 @@ class StreamPoint:
 
 @dataclass(frozen=True)
 class RobotStreamPoint:
-    """One value of a variant's knob (None: it has none) and what it led to after the last task.
+    """One value of a variant's knob (None: it has none) and its result after the last task.
 
     Shares in [0, 1], on validation episodes and questions; None if the training diverged.
     """
@@ -69,11 +70,11 @@ Point = PolicyPoint | StreamPoint | RobotStreamPoint
 
 @dataclass(frozen=True)
 class Rule:
-    """Ability first, within a margin, and merit then.
+    """Ability first, within a margin, then merit.
 
     Attributes:
-        ability: the more the better, in shares; None for a value that diverged.
-        merit: what decides among able values; the highest is chosen.
+        ability: a share, higher is better; None for a value that diverged.
+        merit: decides among able values; the highest is chosen.
         reference: the method whose best value sets the margin for all variants; without one, each
             variant's own best value does.
         sentence: the rule in words, with {place} and {within} to be filled in.
@@ -103,7 +104,7 @@ POLICY_RULE: Rule = Rule(
     "within, the one with the highest success",
     reference="naive",
 )
-# The same rule, in the words of what cannot be rolled out.
+# The same rule, worded for policies that cannot be rolled out.
 OPEN_LOOP_RULE = replace(
     POLICY_RULE,
     sentence="by validation questions, and episodes of {place} that judge no compared policy: of a "
@@ -112,7 +113,7 @@ OPEN_LOOP_RULE = replace(
 )
 STREAM_RULE: Rule = Rule(
     ability=lambda point: point.last,
-    merit=lambda point: -(point.parameters or 0),  # fewer are better
+    merit=lambda point: -(point.parameters or 0),  # fewer is better
     sentence="on validation parts of {place}: of a variant's values within {within:g} points of "
     "its best Last, the one with the fewest final parameters; ties by Last",
 )
@@ -126,38 +127,38 @@ ROBOT_STREAM_RULE: Rule = Rule(
 
 
 def choose(rule: Rule, points: Mapping[str, Sequence[Point]], within: float) -> dict[str, int]:
-    """Which of its points each variant gets, by number.
+    """The index of the chosen point for each variant.
 
     A value is able if its ability is within `within` percentage points of the best one: the best of
     the rule's reference method, of all variants if none has that method, or of the variant itself
-    if the rule has no reference. Of the able values the one of the most merit is chosen, ties by
-    ability, then the order written. If none is able, the one with the most ability is, ties by
-    merit, then the order written. A value that diverged is chosen only where all did.
+    if the rule has no reference. Among the able values, the one with the most merit is chosen; ties
+    are broken by ability, then by order. If none is able, the one with the most ability is chosen;
+    ties are broken by merit, then by order. A value that diverged is chosen only if all diverged.
     """
     everyone = [point for own in points.values() for point in own]
     measures = [point for point in everyone if point.method == rule.reference] or everyone
     chosen = {}
     for variant, own in points.items():
         compared = measures if rule.reference else own
-        # One margin for all: a method may not buy accuracy with ability that the others keep.
+        # One margin for all, so that a method cannot trade ability for accuracy.
         best = max(_ability(rule, point) for point in compared)
         chosen[variant] = _best(rule, own, best - within / 100 - ROUNDING)
     return chosen
 
 
 def _best(rule: Rule, own: Sequence[Point], least: float) -> int:
-    """Which of a variant's points is chosen; of those that are equal, `max` takes the first."""
+    """The index of a variant's chosen point; among equal points, `max` takes the first."""
     abilities = [_ability(rule, point) for point in own]
     merits = [rule.merit(point) for point in own]
     numbers = range(len(own))
-    # A value that diverged is never an able one, not even where all of the reference's did.
+    # A value that diverged is never able, even if all values of the reference diverged.
     able = [i for i in numbers if -math.inf < abilities[i] >= least]
-    if able:  # else the one nearest to it stands for the variant
+    if able:  # otherwise the value with the most ability is chosen
         return max(able, key=lambda i: (merits[i], abilities[i]))
     return max(numbers, key=lambda i: (abilities[i], merits[i]))
 
 
 def _ability(rule: Rule, point: Point) -> float:
-    """The ability of a value; less than any other's if it diverged."""
+    """The ability of a value, or minus infinity if it diverged."""
     ability = rule.ability(point)
     return -math.inf if ability is None else ability
