@@ -1,4 +1,4 @@
-"""Recipes: what may be said in a YAML file, as frozen dataclasses, and how such a file is read."""
+"""Recipes: the keys of a YAML file as frozen dataclasses, and how such a file is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What no single key of a recipe can tell: keys that do not go together."""
+"""Checks across the keys of a recipe: keys that do not go together."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NO_COLORS = f"no colours: only {' and '.join(TASKS)} have coloured targets"
 def cross_checks(
     recipe: Recipe | PretrainRecipe | DualRecipe | StreamRecipe | RobotStreamRecipe,
 ) -> Iterator[Problem]:
-    """What a single key cannot tell."""
+    """Problems that no single key shows."""
     if isinstance(recipe, StreamRecipe):
         return
     if isinstance(recipe, PretrainRecipe):
@@ -51,7 +51,7 @@ def cross_checks(
             "no more actions executed than predicted",
             f"set rollout.replan to at most {recipe.train.chunk}",
         )
-    # Of a file's questions a probe asks as many as there are.
+    # Only for generated questions: from a file, a probe asks at most as many as there are.
     if recipe.probe.questions > MOST_MADE and "scenes" in recipe.probe.sets:
         found = f"probe.questions: {recipe.probe.questions} with probe.vqa: scenes"
         yield Problem(found, f"at most {MOST_MADE:,}", "ask for fewer")
@@ -66,7 +66,7 @@ def cross_checks(
 
 
 def _width_checks(section: str, model: Model | Towers) -> Iterator[Problem]:
-    """Whether a model's width is a multiple of its heads."""
+    """Check that a model's width is a multiple of its heads."""
     if model.width % model.heads:
         found = f"{section}.width: {model.width} with {section}.heads: {model.heads}"
         fix = f"set {section}.width to {model.heads * max(1, model.width // model.heads)}"
@@ -74,10 +74,10 @@ def _width_checks(section: str, model: Model | Towers) -> Iterator[Problem]:
 
 
 def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
-    """Whether the keys of a policy's recipe go together.
+    """Check that the keys of a policy's recipe go together.
 
-    A key that would have no effect is refused, since whoever has set it has something in mind. It
-    is asked for by `changed`, for at its default nobody has.
+    A key that would have no effect is refused, since a user who sets it expects one. Only keys in
+    `changed` count as set.
     """
     if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
         yield Problem(
@@ -106,7 +106,7 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _method_checks(recipe: Recipe) -> Iterator[Problem]:
-    """Whether a method's options have what they belong to."""
+    """Check that a method's options have the other options that they need."""
     kfac, train = recipe.kfac, recipe.train
     for name in ("growth", "every"):
         if kfac.step == "gradient" and name in changed(kfac):
@@ -122,11 +122,11 @@ def _method_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _train_checks(train: Train) -> Iterator[Problem]:
-    """Whether keys of the training have what they belong to."""
+    """Check that keys of the training have the other keys that they need."""
     if train.optimizer != "sgd" and "momentum" in changed(train):
         found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
-    # 1 says the same in other words.
+    # A final_lr_share of 1 means a constant rate as well.
     if train.schedule == CONSTANT and changed(train).get("final_lr_share", 1) != 1:
         found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
         fix = "delete train.final_lr_share, or set it to 1"
@@ -146,7 +146,7 @@ def _augment_checks(train: Train | RobotTrain) -> Iterator[Problem]:
 
 
 def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
-    """Whether a run can have been made longer as it says."""
+    """Check that a run can have been extended as the recipe says."""
     earlier, plans = recipe.train.extended_from, recipe.train.plans  # `steps` is the last plan
     if list(plans) != sorted(set(plans)):
         named = ", ".join(map(str, plans[:-1]))
@@ -159,7 +159,7 @@ def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _source_checks(recipe: Recipe) -> Iterator[Problem]:
-    """Whether robot frames can tell what the anchor is to hold."""
+    """Check that robot frames suffice for the parts of the anchor."""
     if recipe.anchor.source == "demos" and recipe.anchor.parts != ("moments",):
         yield Problem(
             f"anchor.parts: {', '.join(recipe.anchor.parts)} with anchor.source: demos",
@@ -207,7 +207,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
 
 
 def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    """Whether all tasks are simulated or none is, and what measures them is theirs."""
+    """Check that all tasks are simulated or none is, and that the rollout keys apply to them."""
     own = [task for task in recipe.tasks if not TASK.accepts(task)]
     simulated = [task for task in recipe.tasks if task not in own]
     near = did_you_mean(own[0], TASKS) if own else None
@@ -226,7 +226,7 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
             f"{fix} give '{simulated[0]}' another name, if no simulator has it",
         )
         return
-    # What is not read is refused: whoever has set it has something in mind.
+    # Keys that are not read are refused, since a user who sets them expects an effect.
     read = {"frames", "replan"} if own else {f.name for f in fields(RobotRollout)} - {"frames"}
     for name in sorted(changed(recipe.rollout).keys() - read):
         found = f"rollout.{name}: {getattr(recipe.rollout, name)} with task {recipe.tasks[0]}"
@@ -239,7 +239,7 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
 
 
 def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:
-    """Whether there is one of each for each task, and demonstrations to choose of."""
+    """Check that lists have one item per task, and that there are demonstrations to choose from."""
     if isinstance(demos.paths, tuple) and len(demos.paths) != tasks:
         yield Problem(
             f"demos.paths: {len(demos.paths)} with {tasks} tasks",
@@ -259,7 +259,7 @@ def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:
 
 
 def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
-    """Whether the anchor that `aegis run` measures holds what these methods read."""
+    """Check that the anchor that `aegis run` measures has the parts that these methods read."""
     measured = recipe.anchor
     for method in methods:
         missing = [part for part in NEEDS.get(method, ()) if part not in measured.parts]
@@ -267,7 +267,7 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
             fix = f"set anchor.parts to [{', '.join((*measured.parts, *missing))}]"
             found = f"anchor.parts: {', '.join(measured.parts)} with method {method}"
             yield Problem(found, f"anchor.parts with {' and '.join(missing)}", fix)
-    share = recipe.nullspace.energy  # which the anchor has cut off beyond its own share
+    share = recipe.nullspace.energy  # the anchor stores directions only up to its own share
     if "nullspace" in methods and share is not None and share > measured.energy:
         found = f"nullspace.energy: {share:g} with anchor.energy: {measured.energy:g}"
         yield Problem(
@@ -276,7 +276,7 @@ def anchor_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
 
 
 def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
-    """Whether what these methods train can be merged as the recipe says, if it says so."""
+    """Check that policies of these methods can be merged as the recipe says, if it does."""
     merge, measured = recipe.merge, recipe.anchor.parts
     if merge.method is None:
         for name in changed(merge):
@@ -301,7 +301,7 @@ def merge_checks(recipe: Recipe, methods: Sequence[str]) -> Iterator[Problem]:
 
 
 def check_run(recipe: Recipe) -> None:
-    """Raise AegisError for a recipe whose anchor or merge does not fit its methods."""
+    """Raise AegisError if a recipe's anchor or merge does not fit its methods."""
     checks = (anchor_checks, merge_checks)
     problems = [problem for check in checks for problem in check(recipe, recipe.methods)]
     refuse(problems, f"recipe {recipe.name}")

@@ -1,7 +1,7 @@
-"""Raw keys to the dataclasses of a recipe, every mistake reported at once.
+"""Decodes raw keys into the dataclasses of a recipe, and reports all mistakes at once.
 
-pydantic decides what is wrong; this module says so in the words of `AegisError`: what was found, in
-which line, what is expected, and what was probably meant. It knows nothing about recipes.
+pydantic finds the mistakes. This module describes them in the terms of `AegisError`: what was
+found, in which line, what is expected, and what was probably meant. It knows nothing about recipes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, line_of
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
-# What a key of each type takes. A union is looked up whole first, then by its base type.
+# The values that a key of each type takes. A union is looked up as a whole first, then by its base
+# type.
 _PHRASES: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -52,14 +53,12 @@ def build(
 ) -> Any:
     """The dataclass `kind` from a raw mapping, or None if there are problems.
 
-    What is wrong is appended to `problems`. A text that begins with `~/` names what lies in the
-    home folder.
+    Mistakes are appended to `problems`. A text that starts with `~/` is a path in the home folder.
 
     Args:
         kind: a class made by `keys.section`.
-        prefix: stands before the name of each key: 'lora.'.
-        places: where an unknown key may have been meant to stand; by default the sections where
-            `below` finds it.
+        prefix: put before the name of each key, such as 'lora.'.
+        places: where an unknown key may belong; by default the sections where `below` finds it.
     """
     from pydantic import ValidationError
 
@@ -68,15 +67,15 @@ def build(
     except ValidationError as error:
         wrong = error.errors(include_url=False, include_context=False)
         found = [_problem(kind, raw, each["loc"], prefix, places) for each in wrong]
-        problems += dict.fromkeys(found)  # each alternative of a union says what it minds
+        problems += dict.fromkeys(found)  # each alternative of a union reports its own error
         return None
-    # Problems of before, such as a key given twice, leave it open what was meant.
+    # With earlier problems, such as a key given twice, it is unclear what was meant.
     return None if problems else made
 
 
 @functools.cache
 def _adapter(kind: type) -> TypeAdapter[Any]:
-    """Imported and made where it is needed, since both take a tenth of a second."""
+    """Imported and created on demand, since each takes a tenth of a second."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
@@ -90,8 +89,8 @@ def _problem(
     places: Callable[[str], list[str]] | None = None,
     line: int | None = None,
 ) -> Problem:
-    """What is wrong with the key at `place`, a path from `kind` down; `line` is its section's."""
-    name, *inner = place  # of a union, `inner` also has names of pydantic's for its alternatives
+    """The problem with the key at `place`, a path below `kind`; `line` is its section's line."""
+    name, *inner = place  # for a union, `inner` also has pydantic's names for its alternatives
     fields = {field.name: field for field in dataclasses.fields(kind)}
     dotted, here = f"{prefix}{name}", line_of(raw, name)
     if name not in fields:
@@ -118,18 +117,18 @@ def _wrong_value(field: dataclasses.Field[Any], hint: Any, raw: Any, dotted: str
     limits += [check.expected] if check else []
     items = raw if isinstance(raw, list) else [raw]
     if "number" in phrase and any(map(is_too_large, items)):
-        # Only then: nobody who mistypes a small number wants to read of the largest one.
+        # Only for a number that is too large; otherwise the limit would distract.
         most = f"{LARGEST:,}" if "whole" in phrase else f"{LARGEST_FLOAT:g}"
         limits.append(f"at most {most}")
     expected = f"{dotted}: " + ", ".join(limits)
-    # `methods: naive, lora`, a text to YAML, where a list was meant. A bool is an int, no word.
+    # `methods: naive, lora` is text in YAML, but a list was meant. `type` excludes bool.
     unlisted = base_type(hint) is tuple and type(raw) in (str, int) and str(raw).strip(" ,")
     fix = _as_list(raw, dotted, check) if unlisted else _fix(field, raw, dotted, check, phrase)
     return Problem(f"{dotted}: {_quote(raw)}", expected, fix)
 
 
 def _as_list(raw: str | int, dotted: str, check: Check | None) -> str:
-    """Words without brackets, written as the list that was meant."""
+    """The fix for words without brackets: the list that was meant."""
     words = str(raw).replace(",", " ").split()
     choices = check.choices if check else ()
     meant = ", ".join(did_you_mean(word, choices) or word for word in words)
@@ -146,7 +145,7 @@ def _fix(
     if near:
         return f"did you mean '{near}'?"
     if phrase == "text" and not choices and not isinstance(raw, bool | list | None):
-        # A number as text, or a text that begins with { and is a mapping to YAML.
+        # A number where text is expected, or text that starts with { and is a mapping in YAML.
         meant = raw if isinstance(raw, int | float) else "..."
         return f"put the text in quotes: {dotted}: '{meant}', or --set \"{dotted}='{meant}'\""
     if field.default is dataclasses.MISSING:
@@ -158,10 +157,10 @@ def _fix(
 
 
 def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Problem:
-    """The key that was meant: of that very name elsewhere, else spelled alike or ending so here."""
+    """Suggests a key of this name elsewhere, or one here with a similar spelling or this ending."""
     names = [field.name for field in dataclasses.fields(kind) if not is_retired(field)]
     near = did_you_mean(name, names)
-    holding = [key for key in names if key.endswith(f"_{name}")]  # of `lr` both learning rates
+    holding = [key for key in names if key.endswith(f"_{name}")]  # for `lr` both learning rates
     meant = elsewhere or ([near] if near else holding)
     said = " or ".join(f"'{prefix}{key}'" for key in meant)
     fix = f"did you mean {said}?" if meant else f"delete '{prefix}{name}'"
@@ -170,7 +169,7 @@ def _unknown(prefix: str, name: str, kind: type, elsewhere: list[str]) -> Proble
 
 
 def below(name: str, kind: type) -> list[str]:
-    """Where the sections of a dataclass have a key of this name."""
+    """The dotted keys of this name in the sections of a dataclass."""
     found = []
     for section, hint in get_type_hints(kind).items():
         inner = base_type(hint)

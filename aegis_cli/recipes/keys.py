@@ -1,8 +1,8 @@
-"""The keys of a recipe's section: a default, the values that a key takes, and what it means.
+"""The keys of a recipe's section: a default, the values that a key takes, and its meaning.
 
-A section is a frozen dataclass that pydantic can decode: `TypeAdapter(Train)` takes every value as
-it is written (`1.0` is no whole number, `true` no number) and applies each key's `Check`. pydantic
-is imported only where something is decoded, so that `aegis --help` stays quick.
+A section is a frozen dataclass that pydantic can decode. `TypeAdapter(Train)` takes every value as
+it is written (`1.0` is not a whole number, `true` is not a number) and applies each key's `Check`.
+pydantic is imported only when something is decoded, so that `aegis --help` stays fast.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from typing import (
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.recipes.strict_yaml import plain
 
-LARGEST = 10**12  # whole number that a key takes; from some size on, arrays and times overflow
-LARGEST_FLOAT = 1e30  # float32 overflows at 3e38, and a step multiplies
+LARGEST = 10**12  # largest whole number that a key takes; larger ones overflow arrays and times
+LARGEST_FLOAT = 1e30  # float32 overflows at 3e38, and a step multiplies values
 _SCALARS = (int, float, bool, str)
 T = TypeVar("T")
 
 
 class Check(NamedTuple):
-    """Which values a key takes beyond its type; of a list, `accepts` judges each item.
+    """The values that a key takes, beyond its type; for a list, `accepts` checks each item.
 
-    The items of a list differ, unless it `repeats`.
+    The items of a list must differ, unless `repeats` is set.
     """
 
     expected: str
@@ -62,7 +62,7 @@ SEED = Check("from 0 to 4294967295", lambda v: 0 <= v < 2**32)
 SHARE = Check("above 0 and below 1", lambda v: 0 < v < 1)
 BELOW_ONE = Check("0 or more and below 1", lambda v: 0 <= v < 1)
 BELOW_ONE_EACH = Check("each 0 or more and below 1", lambda v: 0 <= v < 1, repeats=True)
-# What is smaller is 0 in float32, or nearly, and a step would divide 0 by it.
+# Smaller values are 0 or nearly 0 in float32, and a step would divide 0 by them.
 DIVIDES = Check("1e-30 or more", lambda v: v >= 1e-30)
 UP_TO_ONE = Check("from 0 to 1", lambda v: 0 <= v <= 1)
 SHARE_OR_ONE = Check("above 0 and up to 1", lambda v: 0 < v <= 1)
@@ -93,15 +93,14 @@ def key(
     """A key of a section; without a default and a factory, the file must give it.
 
     Args:
-        check: which values it takes beyond its type.
-        first: the default that it came with, if that has changed since: finished work is still
-            found under it.
-        factory: makes the default, where that is a mapping.
-        later: it came when there were runs already, whose records go without it: `recorded` leaves
-            it out at its default.
-        retired: it has no effect any more. Older recipes may have it, and their records do.
-        shapes: whether it shapes what is made. What does not is part of no record: a run goes on
-            whatever it says.
+        check: the values that it takes, beyond its type.
+        first: the original default, if it has changed since; it is used to find finished work.
+        factory: makes the default, if that is a mapping.
+        later: the key was added when runs already existed whose records do not have it, so
+            `recorded` leaves it out at its default.
+        retired: it no longer has an effect. Older recipes may have it, and their records do.
+        shapes: whether it affects the result. Other keys are not part of any record, so a run
+            resumes with any value of them.
         doc: meaning and unit, for docs/recipes.md.
     """
     began = default if first is dataclasses.MISSING else first
@@ -117,12 +116,12 @@ def key(
 
 
 def first_default(field: dataclasses.Field[Any]) -> Any:
-    """The default that a key came with."""
+    """The original default of a key."""
     return field.metadata.get("first", field.default)
 
 
 def changed(section: Any) -> dict[str, Any]:
-    """The keys of a recipe's section whose values are not the defaults that they came with."""
+    """The keys of a recipe's section whose values differ from their original defaults."""
     found = {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
@@ -132,10 +131,10 @@ def changed(section: Any) -> dict[str, Any]:
 
 
 def recorded(section: Any) -> dict[str, Any]:
-    """A section's keys and values as a stage's record has them.
+    """A section's keys and values as in a stage's record.
 
-    Keys that came when there were records already are left out at their defaults, so that those
-    records still hold.
+    Keys that were added after the first records are left out at their defaults, so that older
+    records stay valid.
     """
     values = dataclasses.asdict(section)
     own = changed(section)
@@ -147,7 +146,7 @@ def recorded(section: Any) -> dict[str, Any]:
 
 
 def is_retired(field: dataclasses.Field[Any]) -> bool:
-    """Whether a key has no effect any more."""
+    """Whether a key no longer has an effect."""
     return bool(field.metadata.get("retired"))
 
 
@@ -164,19 +163,19 @@ def is_optional(hint: Any) -> bool:
 def base_type(hint: Any) -> Any:
     """`int | None` -> int, `tuple[str, ...]` -> tuple."""
     inner = next((arg for arg in get_args(hint) if arg is not type(None)), hint)
-    plain = inner if is_optional(hint) else hint  # the first argument of a tuple is an item
+    plain = inner if is_optional(hint) else hint  # a tuple's first argument is its item type
     return get_origin(plain) or plain
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(key, dataclasses.field))
 def section(kind: type[T]) -> type[T]:
-    """Make a class a frozen dataclass that pydantic decodes strictly, each key by its check."""
+    """Make a class a frozen dataclass that pydantic decodes strictly and with each key's check."""
     made = dataclasses.dataclass(frozen=True)(kind)
     assert dataclasses.is_dataclass(made)
-    hints = get_type_hints(made)  # they are texts in a module with `annotations` of the future
+    hints = get_type_hints(made)  # annotations are strings under `from __future__`
     for field in dataclasses.fields(made):
         if not dataclasses.is_dataclass(base_type(hints[field.name])):
-            # pydantic reads a dataclass by the types of its fields
+            # pydantic decodes a dataclass by the types of its fields.
             field.type = Annotated[hints[field.name], _Value(field.metadata.get("check"))]
     made.__pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}
     return made
@@ -184,15 +183,15 @@ def section(kind: type[T]) -> type[T]:
 
 @dataclasses.dataclass(frozen=True)
 class _Value:
-    """How pydantic takes one value: as it is written, then by the key's check."""
+    """Tells pydantic how to decode a value: strictly, then with the key's check."""
 
     check: Check | None
 
     def __get_pydantic_core_schema__(self, hint: Any, handler: Callable[[Any], Any]) -> Any:
-        """The protocol by which pydantic asks a type for its schema."""
+        """Called by pydantic to get the schema of the type."""
         from pydantic_core import core_schema
 
-        # By pydantic's own rules for the type first, and the key's check after that.
+        # pydantic's own rules for the type come first, then the key's check.
         by_type = handler(_strict(hint))
         judged = core_schema.no_info_after_validator_function(self._judged, by_type)
         if self.check is WITH_PLACE:
@@ -200,13 +199,13 @@ class _Value:
         return judged
 
     def _judged(self, value: Any) -> Any:
-        """The value; pydantic collects the errors of all keys."""
+        """Check a value and return it; pydantic collects the errors of all keys."""
         repeats = self.check is not None and self.check.repeats
         items = value if isinstance(value, tuple) else (value,)
         is_twice = isinstance(value, tuple) and not repeats and len(set(value)) < len(value)
         if value == () or is_twice:
             raise ValueError("not empty, and no word twice")
-        # What these errors say is not shown: decoding.py has the words for every key.
+        # The texts of these errors are not shown: decoding.py describes the mistakes.
         if value is not None and self.check and not all(map(self.check.accepts, items)):
             raise ValueError(self.check.expected)
         if any(map(is_too_large, items)):
@@ -215,25 +214,25 @@ class _Value:
 
 
 def is_too_large(value: Any) -> bool:
-    """Whether a number is larger than any key of its type takes."""
+    """Whether a number is larger than any key of its type allows."""
     limit = LARGEST if isinstance(value, int) else LARGEST_FLOAT
     return isinstance(value, int | float) and value > limit
 
 
 def _as_text(value: Any) -> Any:
-    """`{}` without quotes, which YAML takes for an empty mapping, as the text that was meant."""
+    """Turn an unquoted `{}`, which is an empty mapping in YAML, into the text that was meant."""
     return "{}" if value == {} else value
 
 
 def _strict(hint: Any) -> Any:
-    """The same type whose scalars are not converted; lists become tuples, mappings stay open."""
+    """The type with scalars that are not converted; lists become tuples, mappings stay open."""
     if hint in _SCALARS:
         from pydantic import Strict
 
         return Annotated[hint, Strict()]
     origin, args = get_origin(hint), get_args(hint)
     if origin is tuple:
-        return GenericAlias(tuple, tuple(map(_strict, args)))  # `tuple[X, ...]`, or of two
+        return GenericAlias(tuple, tuple(map(_strict, args)))  # `tuple[X, ...]` or `tuple[X, Y]`
     if origin in (Union, UnionType):
         return functools.reduce(operator.or_, map(_strict, args))
     return dict[str, Any] if origin is dict else hint

@@ -1,4 +1,4 @@
-"""The kinds of recipes: how a file names its own, and which commands read it."""
+"""The kinds of recipes: how a file names its kind, and which commands read it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Kind(NamedTuple):
     """A kind of recipe.
 
     Attributes:
-        recipe: the dataclass that has its keys.
-        what: what such a file is, before 'for `aegis run`'.
-        commands: that read it.
+        recipe: the dataclass with its keys.
+        what: a description of such a file, which is followed by 'for `aegis run`'.
+        commands: the commands that read it.
     """
 
     recipe: type
@@ -48,7 +48,7 @@ KINDS: dict[str, Kind] = {
 }
 _NAMES = {kind.recipe: name for name, kind in KINDS.items()}
 
-# A file that names no kind is of that of the first of these keys that it has.
+# If a file names no kind, the first of these keys that it has decides its kind.
 TELLING: dict[str, type] = {
     "streams": StreamStudyRecipe,
     "pairs": StreamStudyRecipe,
@@ -63,10 +63,10 @@ TELLING: dict[str, type] = {
 
 
 def take_kind(raw: dict[Any, Any], path: Path, default: type = Recipe) -> type:
-    """The kind of a recipe, whose key `kind` is taken out of the raw keys.
+    """The kind of a recipe; removes its key `kind` from the raw keys.
 
-    A file says `kind: stream` itself. In an older file without that line, the first key of
-    `TELLING` that it has decides; without any of them, it is what the command reads by default.
+    A file names its kind, such as `kind: stream`. In an older file without that line, the first key
+    of `TELLING` that it has decides. Without any of them, it is the command's default kind.
 
     Raises:
         AegisError: there is no such kind.
@@ -74,7 +74,7 @@ def take_kind(raw: dict[Any, Any], path: Path, default: type = Recipe) -> type:
     if "kind" not in raw:
         return next((kind for name, kind in TELLING.items() if name in raw), default)
     line = line_of(raw, "kind")
-    name = raw.pop("kind")  # no section has such a key: `build` would call it unknown
+    name = raw.pop("kind")  # no section has this key, so `build` would call it unknown
     if isinstance(name, str) and name in KINDS:
         return KINDS[name].recipe
     near = did_you_mean(str(name), KINDS)
@@ -84,11 +84,11 @@ def take_kind(raw: dict[Any, Any], path: Path, default: type = Recipe) -> type:
 
 
 def name_of(recipe: type) -> str:
-    """What a recipe's file says as its `kind`."""
+    """The value of `kind` in a recipe's file."""
     return _NAMES[recipe]
 
 
 def describe(recipe: type) -> str:
-    """What a recipe of a kind is, and which commands read it."""
+    """A description of a kind of recipe, with the commands that read it."""
     kind = KINDS[name_of(recipe)]
     return f"{kind.what} for " + " and ".join(f"`aegis {name}`" for name in kind.commands)

@@ -1,8 +1,8 @@
 """Patterns of dotted names: `vision`, `layers.0-11`, `*.layers.0-5`, `*.bias`.
 
-`*` stands for any characters, dots too, and `?` for one. A word of the form `0-11`, between dots,
-stands for each of these whole numbers. A pattern is of whole names; there are no brackets, because
-`[0-11]` is a 0 or a 1 in a shell.
+`*` stands for any characters, including dots, and `?` for one character. A word of the form `0-11`
+between dots stands for each of these whole numbers. A pattern must match the whole name. There are
+no brackets, because `[0-11]` means 0 or 1 in a shell.
 """
 
 from __future__ import annotations
@@ -14,21 +14,20 @@ EXPECTED = "a dotted name such as vision; `*` and `?` as in a shell, and ranges 
 
 
 def is_pattern(text: str) -> bool:
-    """Whether a text can be a pattern: words between dots, and ranges that rise below 1,000."""
+    """Whether a text can be a pattern: words between dots, with rising ranges below 1,000."""
     words = text.split(".")
     return all(re.fullmatch(r"[\w*?-]+", word) and _rises(word) for word in words)
 
 
 def compiled(pattern: str) -> re.Pattern[str]:
-    """What fully matches the names that the pattern stands for."""
+    """A regular expression that fully matches the names that the pattern stands for."""
     return re.compile(r"\.".join(map(_word, pattern.split("."))))
 
 
 def at_its_ends(pattern: str) -> tuple[str, ...]:
-    """The pattern with the first number of each of its ranges, and with the last.
+    """The pattern with the first number of each of its ranges, and with the last number.
 
-    A range that goes beyond what there is was meant for something else. One without ranges has no
-    ends: ().
+    They serve to find ranges that go beyond the existing names. Without ranges, the result is ().
     """
     words = pattern.split(".")
     if not any(map(_RANGE.fullmatch, words)):
@@ -39,7 +38,7 @@ def at_its_ends(pattern: str) -> tuple[str, ...]:
 
 
 def _end(word: str, number: int) -> str:
-    """The range's first number (1) or its last (2); of another word, the word."""
+    """The range's first number (1) or its last (2); any other word is returned unchanged."""
     found = _RANGE.fullmatch(word)
     return found[number] if found else word
 

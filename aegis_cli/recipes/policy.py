@@ -1,4 +1,4 @@
-"""What a recipe of one policy may say: its sections, each key with its default and meaning."""
+"""The recipe of a policy: its sections, each key with its default and meaning."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from aegis_cli.recipes.keys import (
 )
 from aegis_cli.recipes.patterns import EXPECTED, is_pattern
 
-# The words that keys take. They are names of files, options and records, so that none ever changes.
+# The words that keys take. They are names in files, options and records, so none may ever change.
 METHODS = (
     "naive",
     "stop-gradient",
@@ -79,10 +79,10 @@ NEEDS = {
 }
 # merge -> the part of an anchor that it reads
 MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
-# what a merge leaves unread
+# merge -> the keys that it does not read
 MERGE_UNREAD = {"linear": ("damping", "frames"), "kfac-shrink": ("frames",)}
-# what the names of dm_control's suite tasks, of MetaWorld's and of LIBERO's begin with; which there
-# are, the stages know
+# prefixes of the names of tasks of dm_control's suite, MetaWorld and LIBERO; the stages know which
+# tasks exist
 SUITE, METAWORLD, LIBERO = "suite/", "metaworld/", "libero/"
 
 _BENCHMARK_TASK = re.compile(rf"{SUITE}\w+-\w+|({METAWORLD}|{LIBERO})[a-z0-9-]+")
@@ -96,7 +96,7 @@ TASK = Check(
 
 PART = Check(EXPECTED, is_pattern)
 
-_AS_IT_IS = "{}"  # what `ask` makes of a question where it changes nothing
+_AS_IT_IS = "{}"  # value of `ask` that leaves a question unchanged
 _ASK = (
     "What a question becomes before the model reads it, with {} for it. Chat models that answer in "
     "sentences need e.g. '{} Answer with a single word or phrase.', because answers are compared "
@@ -181,7 +181,7 @@ class Demos:
 
     @property
     def selection(self) -> Selection:
-        """What is learned from the demonstrations in `path`."""
+        """The part of the demonstrations in `path` that is learned."""
         rename = renaming.of(self.rename)
         return Selection(self.camera, self.only, self.state, self.action, rename)
 
@@ -410,7 +410,7 @@ class Train:
         "one.",
     )
     log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
-    # They belonged to a figure that is no longer measured.
+    # These belonged to a figure that is no longer measured.
     leak_every: int = key(POSITIVE, default=10, retired=True)
     leak_energy: float = key(SHARE_OR_ONE, default=0.999, retired=True)
     augment: tuple[str, ...] | None = key(
@@ -474,7 +474,7 @@ class Train:
 
     @property
     def plans(self) -> tuple[int, ...]:
-        """The numbers of steps that the run was planned for, one plan after the other."""
+        """The planned numbers of steps, one per plan, in order."""
         return (*(self.extended_from or ()), self.steps)
 
 
@@ -814,20 +814,20 @@ class Probe:
 
     @property
     def only_set(self) -> str:
-        """The name of the one question set, as one of `of_each_set` and a stream's probe have."""
-        (name,) = self.sets  # of several, to take one would pass over the others
+        """The name of the only question set, as in a stream's probe or one of `of_each_set`."""
+        (name,) = self.sets  # with several sets, taking one would ignore the others
         return name
 
     def of_each_set(self) -> tuple[Probe, ...]:
-        """This probe of each of its question sets alone, in their order."""
+        """This probe with each of its question sets separately, in their order."""
         return tuple(dataclasses.replace(self, vqa=name) for name in self.sets)
 
     @property
     def asking(self) -> tuple[str, ...]:
         """Options of `aegis probe` that ask the questions of this one set as this probe does.
 
-        They do so of a policy without its recipe too. With it, `skip_bad` would not be that of a
-        set which is named.
+        They do so even if the policy has no recipe. If it has one, its `skip_bad` would not apply
+        to a set that is named.
         """
         words: tuple[str, ...] = ("--vqa", str(self.vqa))
         if self.ask != _AS_IT_IS:
@@ -931,5 +931,5 @@ class Recipe:
     rollout: Rollout = Rollout()
 
     def reads_anchor(self, method: str) -> bool:
-        """Whether the weights come about with an anchor: by the method, or the merge after it."""
+        """Whether the weights depend on an anchor, by the method or by the merge after it."""
         return method in NEEDS or self.merge.method in MERGE_NEEDS

@@ -1,4 +1,4 @@
-"""What `aegis pretrain` reads to make the embedded models from nothing."""
+"""The recipes of `aegis pretrain`, which trains the embedded models from scratch."""
 
 from __future__ import annotations
 

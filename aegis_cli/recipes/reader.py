@@ -1,4 +1,4 @@
-"""Recipes as files: how they are read, checked, written and told apart by their values."""
+"""Recipes as files: reading, checking and writing them, and digests of their values."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load(
 ) -> R:
     """Read a recipe file, apply `key.sub=value` overrides and check everything.
 
-    `command` is the one that may read several kinds.
+    `command` is the calling command, if it reads several kinds.
 
     Raises:
         AegisError: the file cannot be read, or the recipe has problems; one error names all of
@@ -52,19 +52,19 @@ def load(
 def load_training(
     path: str | Path, overrides: Sequence[str] = ()
 ) -> Recipe | StreamRecipe | RobotStreamRecipe:
-    """What `aegis train` takes: a recipe for demonstrations or for a stream, as `load` reads."""
+    """Read a recipe for `aegis train`, for demonstrations or for a stream, as `load` does."""
     return _load(Path(path), overrides, (Recipe, *_STREAMS), "train")
 
 
 def load_pretrain(path: str | Path, overrides: Sequence[str] = ()) -> PretrainRecipe | DualRecipe:
-    """What `aegis pretrain` takes: a recipe for one of the embedded models, as `load` reads it."""
+    """Read a recipe for `aegis pretrain`, for one of the embedded models, as `load` does."""
     return _load(Path(path), overrides, (PretrainRecipe, DualRecipe), "pretrain")
 
 
 def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: str | None) -> Any:
-    """A recipe of one of these kinds; the first is that of a file which does not say."""
+    """A recipe of one of these kinds; the first is the default for a file that names no kind."""
     raw, problems = read(path)
-    # Before everything else: by the keys of another kind, nearly every key would be unknown.
+    # First of all, because nearly every key of another kind would be unknown.
     kind = take_kind(raw, path, kinds[0])
     if kind not in kinds:
         expected = _READS.get(command, describe(kinds[0]))
@@ -73,18 +73,18 @@ def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: 
     for setting in overrides:
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
-    # There is a recipe to check as a whole only where each key is right.
+    # The recipe as a whole can be checked only if every key is right.
     refuse(problems or list(cross_checks(recipe)), str(path))
     return recipe
 
 
 def from_mapping(raw: Mapping[str, Any], overrides: Sequence[str] = ()) -> Recipe:
-    """A recipe of keys that no file holds, with `key.sub=value` overrides, checked as a file's.
+    """A recipe from raw keys, with `key.sub=value` overrides, checked like a file.
 
     Raises:
         AegisError: the recipe has problems; one error names all of them.
     """
-    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()  # overrides are put into sections
+    keys, problems = copy.deepcopy(dict(raw)), list[Problem]()  # overrides change its sections
     for setting in overrides:
         problems += override(keys, setting)
     recipe = build(Recipe, keys, problems)
@@ -98,17 +98,17 @@ def is_stream_run(path: Path) -> bool:
 
 
 def is_policy_run(path: Path) -> bool:
-    """Whether it is the run of one policy."""
+    """Whether a folder is the run of one policy."""
     return _kind_of_run(path) is Recipe
 
 
 def is_robot_stream_run(path: Path) -> bool:
-    """Whether it is one of robot tasks."""
+    """Whether a folder is the run of a stream of robot tasks."""
     return _kind_of_run(path) is RobotStreamRecipe
 
 
 def _kind_of_run(path: Path) -> type | None:
-    """The kind of the recipe that a run folder keeps; None of another folder."""
+    """The kind of the recipe in a run folder; None for another folder."""
     saved = path / "recipe.yaml"
     return take_kind(read(saved)[0], saved) if saved.is_file() else None
 
@@ -117,7 +117,7 @@ def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
     """The raw keys of a recipe file of any kind, and the keys given twice.
 
     Raises:
-        AegisError: the file cannot be read, or is no mapping.
+        AegisError: the file cannot be read, or is not a mapping.
     """
     raw, problems = parse(_read(path), str(path))
     if not isinstance(raw, dict):
@@ -130,7 +130,7 @@ def read(path: Path) -> tuple[dict[Any, Any], list[Problem]]:
 
 
 def read_anchor(options: dict[str, Any]) -> Anchor:
-    """Anchor settings from command-line options, checked as a recipe's are."""
+    """Anchor settings from command-line options, checked like those of a recipe."""
     problems: list[Problem] = []
     settings: Anchor = build(Anchor, options, problems, "--")
     refuse(problems, "the options")
@@ -138,15 +138,15 @@ def read_anchor(options: dict[str, Any]) -> Anchor:
 
 
 def to_yaml(recipe: AnyRecipe) -> str:
-    """The resolved recipe, every key written out; `load` reads it back to an equal recipe.
+    """The resolved recipe with every key written out; `load` reads it back as an equal recipe.
 
-    A retired key stands there only with a value of its own.
+    A retired key is written only if it differs from its default.
     """
     return dump({"kind": name_of(type(recipe)), **_plain(recipe)})
 
 
 def _plain(value: Any) -> Any:
-    """Sections as mappings and tuples as lists, as YAML has them."""
+    """Sections as mappings and tuples as lists, as in YAML."""
     if dataclasses.is_dataclass(value):
         own = changed(value)
         written = [f.name for f in dataclasses.fields(value) if not is_retired(f) or f.name in own]
@@ -157,31 +157,32 @@ def _plain(value: Any) -> Any:
 
 
 def every_key(recipe: AnyRecipe) -> dict[str, Any]:
-    """Every key with its value, also retired ones, as a JSON file would give them back."""
+    """Every key with its value, including retired keys, as if read from a JSON file."""
     return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
 
 
 def digest(recipe: AnyRecipe) -> str:
     """sha256 of the recipe's canonical JSON.
 
-    Equal values have equal digests, however the file was written.
+    Equal values have equal digests, no matter how the file was written.
     """
     values = dataclasses.asdict(recipe)
     if isinstance(recipe, PretrainRecipe):
-        # The shipped weights name a digest that is older than these keys.
+        # The shipped weights contain a digest that is older than these keys.
         for name in {"easy_vqa", "start"} - changed(recipe).keys():
             del values[name]
     return sha256_value(values)
 
 
 def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
-    """What shapes the trained weights; other methods' options, probes, rollouts and name do not.
+    """The keys that affect the trained weights, without other methods' options, probe and rollout.
 
-    The last two are part of what a stream of robot tasks writes, and count. So does a stream's
-    `split`, but where it is the default, so that runs that began before there was the key go on.
+    For a stream of robot tasks, probe and rollout count too, because the run contains their
+    results. A stream's `split` counts unless it is the default, so that runs from before this key
+    can be resumed.
     """
-    # What this returns is compared with what a run's folder holds, of any earlier version: a key
-    # that is added here may only stand in it with a value that no older run had.
+    # The result is compared with the records of run folders of all earlier versions. A key may be
+    # added here only with a value that no older run had.
     part: dict[str, Any]
     if isinstance(recipe, RobotStreamRecipe):
         part = {key: getattr(recipe, key) for key in ("tasks", "backbone", "seed")}
@@ -197,18 +198,18 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
         return part | _own_part(recipe)
     part = {"task": recipe.task, "backbone": recipe.backbone, "seed": recipe.seed}
     part |= {key: recorded(getattr(recipe, key)) for key in ("train", "expert")}
-    # Any number of processes trains the same weights, however they share them.
+    # The weights do not depend on how many processes train them or how these share them.
     part["train"].pop("parallel", None)
-    if chosen := drawn(recipe):  # the digest of the data says nothing of the choice
+    if chosen := drawn(recipe):  # the digest of the data does not cover the selection
         part["demos"] = chosen
     return part | _own_part(recipe)
 
 
 def earlier_training_part(recipe: RobotStreamRecipe, written: Mapping[str, Any]) -> dict[str, Any]:
-    """What an earlier version took for the training part of a run whose `recipe.yaml` it wrote.
+    """The training part of a run as an earlier version computed it, from its `recipe.yaml`.
 
-    It wrote every key that it knew, and every one of some sections was in the part, also those that
-    came later and were at their defaults.
+    That version wrote every key that it knew, and its part contained every key of some sections,
+    including later keys at their defaults.
 
     Args:
         written: the raw keys of that file.
@@ -222,20 +223,20 @@ def earlier_training_part(recipe: RobotStreamRecipe, written: Mapping[str, Any])
 
 
 def _own_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str, Any]:
-    """What counts of the options of `recipe.train.method`."""
+    """The recorded options of `recipe.train.method`."""
     own = _own_section(recipe)
     return {recipe.train.method: {} if own is None else recorded(own)}
 
 
 def selected(recipe: Recipe | RobotStreamRecipe) -> dict[str, Any]:
-    """What is learned of the demonstrations' frames, as far as it is not at its default."""
+    """The keys that select what is learned from each frame or episode, without defaults."""
     changes = changed(recipe.demos)
     own = ("only", "state", "action", "rename")
     return {name: changes[name] for name in own if name in changes}
 
 
 def drawn(recipe: Recipe) -> dict[str, Any]:
-    """What is learned of the demonstrations, and how often, as far as it is not at its default."""
+    """The keys that select what is learned from the data and how often, without defaults."""
     changes = changed(recipe.demos)
     return selected(recipe) | {name: changes[name] for name in ("weights",) if name in changes}
 
@@ -252,7 +253,7 @@ def _own_section(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Any:
 
 
 def _instead(path: Path) -> str:
-    """What may have been meant by the path of a recipe that is not there."""
+    """A suggestion for the path of a recipe that does not exist."""
     beside = [other.stem for other in path.parent.glob("*.yaml")]
     near = did_you_mean(path.stem, beside)
     if near:
@@ -263,7 +264,7 @@ def _instead(path: Path) -> str:
 
 
 def _read(path: Path) -> str:
-    refuse_special(path)  # a pipe gives its bytes once, and a recipe is read more than once
+    refuse_special(path)  # a pipe can be read only once, but a recipe is read several times
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -10,14 +10,14 @@ from pathlib import Path
 from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes.kinds import KINDS
 
-_CHECKOUT = Path(__file__).parents[2] / "recipes"  # of the sources
-_INSTALLED = Path(sysconfig.get_path("data")) / "share" / "aegis-vla" / "recipes"  # of a wheel
+_CHECKOUT = Path(__file__).parents[2] / "recipes"  # in a checkout of the sources
+_INSTALLED = Path(sysconfig.get_path("data")) / "share" / "aegis-vla" / "recipes"  # from a wheel
 _FIRST = "quickstart"
 
 
 @dataclass(frozen=True)
 class Shipped:
-    """A recipe, its kind, and what its first lines say: its command, and what it is for."""
+    """A recipe, its kind, and the command and purpose in its first lines."""
 
     name: str
     kind: str
@@ -27,14 +27,14 @@ class Shipped:
 
 @dataclass(frozen=True)
 class Listed:
-    """All recipes, those of a kind together: policies first, and the quickstart before them."""
+    """All recipes, grouped by kind: policies first, and the quickstart before them."""
 
     recipes: list[Shipped]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A recipe as its file has it."""
+    """A recipe with the text of its file."""
 
     name: str
     path: str
@@ -50,10 +50,10 @@ class Copied:
 
 
 def folder() -> Path:
-    """Where the recipes lie.
+    """The folder of the recipes.
 
     Raises:
-        AegisError: this installation has none.
+        AegisError: this installation has no recipes.
     """
     for place in (_CHECKOUT, _INSTALLED):
         if (place / "quickstart.yaml").is_file():
@@ -77,7 +77,7 @@ def path(name: str) -> Path:
     """The file of a recipe by its name.
 
     Raises:
-        AegisError: there is none of this name.
+        AegisError: there is no recipe of this name.
     """
     found = folder() / f"{name}.yaml"
     if not found.is_file():
@@ -92,17 +92,18 @@ def is_one(name: str) -> bool:
 
 
 def find(given: Path) -> Path:
-    """The file that a user means: the one at this path, or else the recipe of this name."""
-    bare = given.name == str(given) and not given.suffix  # `quickstart`; a file goes before it
+    """The file that a user means: the file at this path, or the recipe of this name."""
+    bare = given.name == str(given) and not given.suffix  # `quickstart`; a file takes precedence
     return path(given.name) if bare and not given.exists() else given
 
 
 def _described(path: Path) -> Shipped:
-    """The first sentence of the comment that a recipe begins with stands below its command.
+    """A recipe's description from the comment at its start.
 
-    The line below the comment says its kind.
+    Its first line is the command, followed by a description of which the first sentence is used.
+    The line below the comment gives the kind.
     """
-    # As text, because a comment is no part of what YAML makes of a file.
+    # Read as text, because YAML drops comments.
     lines = path.read_text(encoding="utf-8").splitlines()
     comment = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
     kind = lines[len(comment)].removeprefix("kind:").strip()

@@ -1,4 +1,4 @@
-"""What a recipe of a stream may say: its sections, each key with its default and meaning."""
+"""The recipes of streams: their sections, each key with its default and meaning."""
 
 from __future__ import annotations
 
@@ -45,22 +45,22 @@ LEARNERS = (
     "prototype",
     "igsp",
 )
-ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # of a stream of robot tasks
-# Rates of `train` that a learner never reads -> what it reads instead; None: nothing learns by it.
+ROBOT_LEARNERS = ("sequential", "isolated-lora", "igsp")  # for streams of robot tasks
+# Rates of `train` that a learner never reads -> the key that it reads instead, or None.
 UNREAD_RATES: Mapping[str, Mapping[str, str | None]] = {
     "zero-shot": {"train.lr": None, "train.router_lr": None},
     "sequential": {"train.lr": "sequential.lr", "train.router_lr": None},
     "moe-adapters": {"train.router_lr": "moe_adapters.router_lr"},
 }
-# A task's name in a stream: a simulated one's, or somebody's own. Which of both a stream may have,
-# the cross-checks know.
+# A task's name in a stream: that of a simulated task, or the user's own. The cross-checks decide
+# which of both a stream may have.
 STREAM_TASK = Check(
     f"{TASK.expected}; or where no simulator has them, names of your own ({FOLDER_NAME.expected})",
     lambda v: TASK.accepts(v) or FOLDER_NAME.accepts(v),
     TASKS,
 )
 SPLITS = ("evaluation", "validation")  # of episodes and questions
-PARTS = TEST, VALIDATION = "test", "validation"  # of a task's images, that accuracies are of
+PARTS = TEST, VALIDATION = "test", "validation"  # parts of a task's images, to measure accuracies
 
 
 @section
@@ -253,17 +253,17 @@ class RobotDemos:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """All that `paths` names, each once; () where demonstrations are recorded."""
+        """All demonstrations that `paths` names, each once; () if they are recorded."""
         paths = (self.paths,) if isinstance(self.paths, str) else self.paths or ()
         return tuple(dict.fromkeys(paths))
 
     def of_task(self, number: int) -> str:
-        """What `paths` names for the task of that number."""
+        """The demonstrations that `paths` names for task `number`."""
         assert self.paths is not None
         return self.paths if isinstance(self.paths, str) else self.paths[number]
 
     def selection(self, only: str | None) -> Selection:
-        """What a task learns from the demonstrations in `paths`, of which it takes `only`."""
+        """The part of the demonstrations in `paths` that a task learns, with its own `only`."""
         rename = renaming.of(self.rename)
         return Selection(self.camera, only, self.state, self.action, rename)
 
@@ -496,5 +496,5 @@ class RobotStreamRecipe:
 
     @property
     def simulated(self) -> bool:
-        """Whether the tasks are played in simulation; none is where the first is not."""
+        """Whether the tasks are simulated; the first task decides, since all or none are."""
         return TASK.accepts(self.tasks[0])

@@ -1,6 +1,7 @@
-"""Strict YAML: no key twice, none of the surprises of YAML 1.1, and a line for every key.
+"""Strict YAML: no duplicate keys, none of the surprises of YAML 1.1, and a line for every key.
 
-A `Problem` is one mistake; `refuse` names all of them at once. Knows nothing about recipes.
+A `Problem` is one mistake; `refuse` reports all of them at once. This module knows nothing about
+recipes.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from yaml.resolver import BaseResolver
 
 from aegis_cli.common.errors import AegisError
 
-_LARGEST = 100_000  # values in a text
-# What PyYAML's constructors raise at `!!int ""`, `!!bool maybe` and the like, and at great depth.
+_LARGEST = 100_000  # maximum number of values in a text
+# Raised by PyYAML's constructors for `!!int ""`, `!!bool maybe` and the like, and by deep nesting.
 _DAMAGED = (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError)
 
 
 class Problem(NamedTuple):
-    """One mistake, in the words of `AegisError`; `line` is where it stands in the file."""
+    """One mistake, in the terms of `AegisError`; `line` is its line in the file."""
 
     found: str
     expected: str
@@ -34,17 +35,17 @@ class Problem(NamedTuple):
 
 
 class _Lines(dict[Any, Any]):
-    """A mapping of a file; `lines` says where each key stands that is still the file's own."""
+    """A mapping from a file; `lines` has the line of each key that still comes from the file."""
 
     lines: dict[str, int] = {}
 
     def __setitem__(self, name: Any, value: Any) -> None:
-        # A new mapping, since copies share this one.
+        # A new dict, since copies share this one.
         self.lines = {key: line for key, line in self.lines.items() if key != name}
         super().__setitem__(name, value)
 
     def put(self, name: str, value: Any, line: int | None) -> None:
-        """Set a key that stands in this line of the file; None if it is not from there."""
+        """Set a key with its line in the file, or None if it does not come from the file."""
         self[name] = value
         if line is not None:
             self.lines = {**self.lines, name: line}
@@ -56,19 +57,19 @@ class _Lines(dict[Any, Any]):
 
 
 def line_of(raw: Mapping[Any, Any], name: Any) -> int | None:
-    """The line of a key in its file; None where the key is not from a file."""
+    """The line of a key in its file; None if the key does not come from a file."""
     return raw.lines.get(str(name)) if isinstance(raw, _Lines) else None
 
 
 def put(raw: dict[Any, Any], dotted: str, value: Any, line: int | None = None) -> str | None:
-    """Set the key 'section.name' in place; sections that are missing are added.
+    """Set the key 'section.name' in place; missing sections are added.
 
     Args:
-        raw: as `parse` returns it, or a plain mapping, which keeps no lines.
-        line: where the key stands in its file.
+        raw: a mapping from `parse`, or a plain mapping, which keeps no lines.
+        line: the line of the key in its file.
 
     Returns:
-        The section that is none, in which case nothing is set; None if all went well.
+        None, or the name that is not a section, in which case nothing is set.
     """
     *sections, name = dotted.split(".")
     for section in sections:
@@ -83,7 +84,7 @@ def put(raw: dict[Any, Any], dotted: str, value: Any, line: int | None = None) -
 
 
 def plain(value: Any) -> Any:
-    """The same value, whose mappings no longer know their lines."""
+    """The same value with plain mappings, which have no lines."""
     if isinstance(value, dict):
         return {name: plain(inner) for name, inner in value.items()}
     return [plain(item) for item in value] if isinstance(value, list) else value
@@ -101,7 +102,7 @@ def refuse(problems: Sequence[Problem], source: str) -> None:
         place = source if only.line is None else f"{source}, line {only.line}"
         raise AegisError(f"{only.found} (in {place})", only.expected, only.fix)
     if problems:
-        # What has no line, such as an override, comes first.
+        # Problems without a line, such as those of an override, come first.
         ordered = sorted(problems, key=lambda problem: problem.line or 0)
         found = _numbered(_with_line(problem) for problem in ordered)
         expected = _numbered(problem.expected for problem in ordered)
@@ -120,16 +121,16 @@ def _numbered(lines: Iterable[str]) -> str:
 class _Loader(yaml.SafeLoader):
     """YAML with the scalars of version 1.2.
 
-    There `1e-4` is a number; `no`, `010` and `2024-01-01` are text.
+    In it `1e-4` is a number; `no`, `010` and `2024-01-01` are text.
     """
 
-    yaml_implicit_resolvers: dict[str, Any] = {}  # none of PyYAML's own, which are those of 1.1
+    yaml_implicit_resolvers: dict[str, Any] = {}  # without PyYAML's own, which follow YAML 1.1
     problems: list[Problem]
 
     def construct_lines(self, node: yaml.MappingNode) -> Iterator[_Lines]:
-        """A mapping whose keys know their lines; keys given twice become problems."""
+        """A mapping with the lines of its keys; duplicate keys become problems."""
         mapping = _Lines()
-        yield mapping  # first, as PyYAML's own constructors do, for what refers to itself
+        yield mapping  # first, as in PyYAML's own constructors, for values that refer to themselves
         lines: dict[str, int] = {}
         for name_node, _ in node.value:
             line, name = name_node.start_mark.line + 1, str(name_node.value)
@@ -146,10 +147,9 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_lines)
 
 
 class _LibYaml(Composer, BaseResolver):
-    """Nodes of the events that libyaml finds in a text.
+    """Composes nodes from the events that libyaml finds in a text.
 
-    They are made here, since the function of PyYAML's that makes them of libyaml's events ends the
-    process at a text that is nested too deeply.
+    PyYAML's own function for this ends the process if a text is nested too deeply.
     """
 
     yaml_implicit_resolvers: dict[str, Any] = {}
@@ -164,11 +164,11 @@ class _LibYaml(Composer, BaseResolver):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that YAML 1.1 or 1.2 would take for something else."""
+    """Quotes text that YAML 1.1 or 1.2 would read as something else."""
 
 
-# What a scalar without quotes is, by its letters, and which letters it may begin with: PyYAML only
-# tries the patterns of a scalar's first letter. The dumper has 1.1's patterns too, as its own.
+# The type of an unquoted scalar by its pattern, and the characters that it may start with: PyYAML
+# tries only the patterns for a scalar's first character. The dumper keeps 1.1's patterns as well.
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -195,16 +195,16 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
     """The plain value of a YAML text, and the keys given twice.
 
     Raises:
-        AegisError: the text is not YAML, or its values are nested or repeated beyond measure;
-            nothing else can be judged then.
+        AegisError: the text is not YAML, or its values are nested or repeated too much; no other
+            problem can be found then.
     """
-    loader = _Loader("")  # what makes values of nodes
+    loader = _Loader("")  # constructs values from nodes
     loader.problems = []
     try:
         node = _node(text)
-        if node is None:  # nothing, or comments alone
+        if node is None:  # empty, or only comments
             return None, loader.problems
-        # Before anything is made of it: a few lines of aliases can stand for billions of values.
+        # Before values are constructed: a few lines of aliases can stand for billions of values.
         if _size(node, {}) > _LARGEST:
             raise ValueError(f"more than {_LARGEST} values, counted as often as they are named")
         return _each_its_own(loader.construct_document(node)), loader.problems
@@ -218,10 +218,10 @@ def parse(text: str, source: str) -> tuple[Any, list[Problem]]:
 
 
 def _node(text: str) -> yaml.Node | None:
-    """A text as nodes. libyaml takes a fifth of the time; what it refuses, PyYAML judges.
+    """A text as nodes. libyaml needs a fifth of the time; PyYAML reads what libyaml refuses.
 
     Raises:
-        yaml.YAMLError: the text is not YAML, in PyYAML's words.
+        yaml.YAMLError: the text is not YAML; the message is PyYAML's.
     """
     if yaml.__with_libyaml__:
         with contextlib.suppress(yaml.YAMLError, ValueError):
@@ -230,7 +230,7 @@ def _node(text: str) -> yaml.Node | None:
 
 
 def _each_its_own(value: Any) -> Any:
-    """The same value, in which what an alias names is a copy: to change one leaves the other."""
+    """The same value with aliases replaced by copies, so that changing one leaves the others."""
     if isinstance(value, _Lines):
         copied = _Lines((name, _each_its_own(inner)) for name, inner in value.items())
         copied.lines = value.lines
@@ -239,7 +239,7 @@ def _each_its_own(value: Any) -> Any:
 
 
 def _why(error: Exception) -> str:
-    """What is wrong with the text, by an error that PyYAML's own constructors let pass."""
+    """What is wrong with the text, from an error that PyYAML's constructors do not catch."""
     if isinstance(error, RecursionError):
         return "values nested too deeply"
     if isinstance(error, ValueError) and str(error):
@@ -248,11 +248,11 @@ def _why(error: Exception) -> str:
 
 
 def _size(node: yaml.Node, known: dict[int, int]) -> int:
-    """How many values a node stands for when each alias is written out.
+    """How many values a node stands for if all aliases are expanded.
 
     Args:
-        known: the sizes of the nodes so far by their ids; that of a node that is still being
-            counted is infinite for our purpose, for it holds itself.
+        known: the sizes of the nodes so far by id; a node that is still being counted has a size
+            above the limit, since it contains itself.
     """
     if id(node) in known:
         return known[id(node)]
@@ -268,16 +268,16 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
 
 
 def _quoted(text: str) -> str:
-    """A text in YAML's quotes, and in a shell's."""
+    """A text in quotes for YAML, inside quotes for a shell."""
     return shlex.quote("'" + text.strip().replace("'", "''") + "'")
 
 
 def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
-    """Put one `a.b=c` into the raw mapping; whether a.b and c are any good, `build` says.
+    """Put one `a.b=c` into the raw mapping; `build` checks whether a.b and c are valid.
 
-    `c` is YAML, but for a text that begins with a place for another: `{} Answer briefly.`
+    `c` is YAML, except for a text that starts with a placeholder, such as `{} Answer briefly.`
     """
-    dotted, equals, text = setting.partition("=")  # the value may have further signs
+    dotted, equals, text = setting.partition("=")  # the value may contain further `=`
     dotted = dotted.strip()
     if not equals or not all(dotted.split(".")):
         fix = "write e.g. --set train.steps=200"

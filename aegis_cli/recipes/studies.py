@@ -1,4 +1,4 @@
-"""Studies' recipes: variants compared over tasks or streams and seeds, as frozen dataclasses."""
+"""Recipes of studies: variants compared over tasks or streams and seeds, as frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from aegis_cli.recipes.keys import (
 from aegis_cli.recipes.policy import METHODS, TASK
 from aegis_cli.recipes.streams import LEARNERS, ROBOT_LEARNERS
 
-# what a study may draw anew with every seed -> the section of a recipe whose seed that is
+# what a study may draw anew with every seed -> the recipe section with that seed
 PER_SEED = {"demos": "demos", "anchor": "anchor", "questions": "probe", "episodes": "rollout"}
 _NO_ANCHOR = [name for name in PER_SEED if name != "anchor"]
 _SOME = Check("at least one", bool)
-# A stream may have others, which are measured by their open-loop error.
+# Streams may also have tasks that are not simulated, measured by their open-loop error.
 _SIMULATED = Check(f"simulated ones: {TASK.expected}", TASK.accepts, TASK.choices)
 
 
@@ -48,20 +48,20 @@ class Variant:
 
     @property
     def knob(self) -> str | None:
-        """The knobs' keys, separated by commas; None without one."""
+        """The knobs' keys, separated by commas; None without a knob."""
         return ", ".join(self.tune) or None
 
     @property
     def values(self) -> list[Any]:
-        """What the knob may be: [None] without one, and one tuple per combination of several."""
+        """The knob's values: [None] without a knob, one tuple per combination of several knobs."""
         if len(self.tune) <= 1:
             return next(iter(self.tune.values()), [None])
         return list(itertools.product(*self.tune.values()))
 
     def chosen(self, value: Any) -> dict[str, Any]:
-        """The keys that one of `values` stands for."""
+        """The keys and values that one of `values` stands for."""
         values: Sequence[Any] = value if len(self.tune) > 1 else [value]
-        return dict(zip(self.tune, values, strict=False))  # without a knob, [None] is of no key
+        return dict(zip(self.tune, values, strict=False))  # without a knob, [None] has no key
 
 
 @section
@@ -79,7 +79,7 @@ class PolicyVariant(Variant):
     )
 
     def is_plain(self, method: str) -> bool:
-        """Whether it is this method with nothing done to what it has trained, as a merge would."""
+        """Whether the variant is this method, without a merge after the training."""
         return self.method == method and "merge.method" not in self.set
 
 

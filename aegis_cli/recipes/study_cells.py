@@ -39,31 +39,31 @@ from aegis_cli.recipes.strict_yaml import (
 )
 from aegis_cli.recipes.studies import PER_SEED
 
-# The variants that others are measured against.
+# The variants that others are compared with.
 NAIVE, ISOLATED, ZERO_SHOT = "naive", "isolated-lora", "zero-shot"
-# One of half the rank, if there is one: what iGSP's smaller experts reach without sharing.
+# An optional variant of half the rank: what iGSP's smaller experts reach without sharing.
 HALF = "isolated-lora-half"
 
 
 _LONGEST_NAME = 100  # bytes of a folder's name
-_TAKEN = {"tuning", "stages"}  # what else a study's folder has
+_TAKEN = {"tuning", "stages"}  # other folders in a study's folder
 
 
 @dataclass(frozen=True)
 class _CellRules:
-    """What a study makes of its cells, so that they can be compared.
+    """The rules for the cells of a kind of study, which make them comparable.
 
     Attributes:
         recipe: the kind of a cell's recipe.
-        place: the recipe's key for what variants are measured on; `places` is the study's.
-        listed: whether all that the study names there are one place, a stream of these tasks.
-        given: a recipe's keys that the study gives each cell -> the study's own keys for them.
+        place: the recipe's key for what variants are measured on; `places` is the study's key.
+        listed: whether all names under `places` form one place, a stream of these tasks.
+        given: a recipe's keys that the study sets in each cell -> the study's own keys for them.
         for_all: further keys that no variant may set, since all share them.
-        references: a variant that others are measured against -> the method that it has to have.
-        any_place: a place for checks where the study names none that can be read.
-        tuning_seed: the default of `tuning.seed`; `tuning_keys` are the section's.
-        together: what a single key of a cell's recipe cannot tell.
-        problems: what a single key of the study cannot tell.
+        references: a variant that others are compared with -> the method that it must have.
+        any_place: a place for checks if the study names none that can be read.
+        tuning_seed: the default of `tuning.seed`; `tuning_keys` are the keys of `tuning`.
+        together: checks across the keys of a cell's recipe.
+        problems: checks across the keys of the study.
     """
 
     recipe: type
@@ -82,7 +82,7 @@ class _CellRules:
 
 
 def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | AnyStudy:
-    """What `aegis run` takes: a recipe, or a study of tasks or of streams.
+    """Read a recipe for `aegis run`, or a study of tasks or of streams.
 
     Raises:
         AegisError: the file cannot be read, or has problems in any of its cells; one error names
@@ -91,13 +91,13 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Recipe | AnyStudy:
     path = Path(path)
     raw, problems = recipes.read(path)
     kind = recipes.take_kind(raw, path)
-    if kind not in _CELL_RULES:  # a recipe, or one that another command reads, which is refused
+    if kind not in _CELL_RULES:  # a recipe for `aegis run`, or for another command (refused)
         return recipes.load(path, overrides, command="run")
     for setting in overrides:
         problems += override(raw, setting)
     study = build(kind, raw, problems, places=lambda name: _places(name, kind))
     checked = _check(raw, _CELL_RULES[kind], problems)
-    refuse(list(dict.fromkeys(problems)), str(path))  # many cells have the same one
+    refuse(list(dict.fromkeys(problems)), str(path))  # many cells have the same problem
     return dataclasses.replace(study, variants=checked)
 
 
@@ -127,19 +127,19 @@ def cell(
     """The recipe of one training.
 
     Args:
-        place: the task or stream; of a stream of robot tasks its tasks. In a study without tasks
-            it is but a name.
-        value: what the variant's knob is set to, if it has one.
+        place: the task or stream; for a stream of robot tasks, its tasks. In a study without tasks
+            it is only a name.
+        value: the value of the variant's knob, if it has one.
 
     Raises:
-        AegisError: keys or values that make no recipe.
+        AegisError: keys or values that are not a valid recipe.
     """
     rules = _CELL_RULES[type(study)]
     problems: list[Problem] = []
     raw = variants.merged(study.shared, study.variants[variant], value)
     if rules.recipe is Recipe:
         raw["methods"] = [study.variants[variant].method]
-    # Last, for they win against what `shared` and the variant say.
+    # Last, because these override `shared` and the variant.
     raw |= {"name": study.name, "seed": seed}
     if not isinstance(study, StudyRecipe) or study.tasks is not None:
         raw[rules.place] = place
@@ -151,9 +151,9 @@ def cell(
 
 
 def places(study: StudyRecipe) -> tuple[str, ...]:
-    """The tasks of a study, or a name for the demonstrations that all its cells are given.
+    """The tasks of a study, or a name for the demonstrations that all its cells use.
 
-    It is that of their file or folder, in the characters that a folder of the study may have.
+    The name is that of their file or folder, in characters that are allowed in a folder name.
     """
     if study.tasks is not None:
         return study.tasks
@@ -172,7 +172,7 @@ def _name_of(path: str) -> str:
 
 
 def load_any(path: str | Path) -> AnyRecipe:
-    """A recipe of whichever kind its file is.
+    """Read a recipe of any kind.
 
     Raises:
         AegisError: the file cannot be read, or has problems; one error names all of them.
@@ -183,9 +183,9 @@ def load_any(path: str | Path) -> AnyRecipe:
 
 
 def written_out(recipe: AnyRecipe) -> dict[str, Any]:
-    """Every key with its value, as plain ones.
+    """Every key with its value, as plain values.
 
-    A study's `shared` has every key of its cells' recipes that the study does not give them.
+    A study's `shared` has every key of its cells' recipes that the study itself does not set.
     """
     plain = {"kind": recipes.name_of(type(recipe)), **recipes.every_key(recipe)}
     if not isinstance(recipe, AnyStudy):
@@ -195,16 +195,16 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     shared = recipes.every_key(build(rules.recipe, {**recipe.shared, **given}, []))
     given_below = [dotted for dotted in rules.given if "." in dotted]
     for dotted in (*given_below, *_drawn(recipe)):
-        section, name = dotted.split(".")  # every such key is one of a section
+        section, name = dotted.split(".")  # every such key is in a section
         del shared[section][name]
     plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
     return plain
 
 
 def _places(name: str, study: type) -> list[str]:
-    """Where a study has a key of a plain recipe.
+    """Where a key of a plain recipe belongs in a study.
 
-    That is the study's own key for it, or one of the same name in a section or in 'shared'.
+    That is the study's own key for it, or a key of the same name in a section or in 'shared'.
     """
     rules = _CELL_RULES[study]
     if name in rules.given:
@@ -220,8 +220,8 @@ def _places(name: str, study: type) -> list[str]:
 def _check(
     raw: Mapping[str, Any], rules: _CellRules, problems: list[Problem]
 ) -> dict[str, Variant]:
-    """The variants that can be read; everything wrong in any cell is appended."""
-    # All is read from the raw keys, since one that is wrong leaves no study to ask.
+    """The variants that can be read; the problems of all cells are appended."""
+    # From the raw keys, since there is no study object if one of them is wrong.
     drawn = raw.get("per_seed")
     per_seed = _per_seed(drawn if isinstance(drawn, list) else ())
     places_given = {**rules.given, **dict.fromkeys(per_seed, "per_seed")}
@@ -229,7 +229,7 @@ def _check(
     readable = variants.read(
         raw.get("variants"), rules.variant, reserved, rules.references, problems
     )
-    # Which streams there are is known to the stage alone: one name is as good as another here.
+    # Only the stage knows which streams exist, so any name will do here.
     places = [] if rules.recipe is StreamRecipe else _readable(raw.get(rules.places))
     checked: list[Any] = [*places] or [rules.any_place]
     if rules.listed and places:
@@ -251,24 +251,24 @@ def _check(
 
 
 def _drawn(study: AnyStudy) -> list[str]:
-    """The keys of a cell's recipe that are its seed, in a study that has been read."""
+    """The keys of a cell's recipe that get its seed, for a study that has been read."""
     return [] if isinstance(study, StreamStudyRecipe) else _per_seed(study.per_seed or ())
 
 
 def _per_seed(names: Iterable[str]) -> list[str]:
-    """The keys of a cell's recipe that are its seed."""
+    """The keys of a cell's recipe that get its seed."""
     known = [name for name in names if isinstance(name, str) and name in PER_SEED]
     return [f"{PER_SEED[name]}.seed" for name in known]
 
 
 def _readable(tasks: Any) -> list[str]:
-    """The tasks that can be read; `build` has complained of the others."""
+    """The tasks that can be read; `build` has reported the others."""
     listed = tasks if isinstance(tasks, list) else []
     return [task for task in listed if isinstance(task, str) and recipes.TASK.accepts(task)]
 
 
 def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
-    """Demonstrations that are given are the same with every seed."""
+    """Problems of `per_seed: demos` with given demonstrations, which are equal for all seeds."""
     names = raw.get("per_seed")
     if not isinstance(names, list) or "demos" not in names:
         return []
@@ -283,7 +283,7 @@ def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 
 def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
-    """Where a study names demonstrations: for all cells, or for those of a variant."""
+    """Where a study names demonstrations, for all cells or for those of a variant."""
     shared, named = raw.get("shared"), raw.get("variants")
     settings = shared.get("demos") if isinstance(shared, dict) else None
     if isinstance(settings, dict):
@@ -301,7 +301,7 @@ def _given_demos(raw: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _place_problems(raw: Mapping[str, Any]) -> list[Problem]:
-    """What a study without tasks lacks, or says of them all the same."""
+    """Problems of a study without tasks: missing demonstrations, or a task for tuning."""
     if raw.get("tasks") is not None:
         return []
     named, given = raw.get("variants"), [*_given_demos(raw)]
@@ -329,7 +329,7 @@ def _place_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 
 def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
-    """A gate of one run; a study says of every variant whether it passes its bar."""
+    """Problems with a gate, which is for single runs; a study judges every variant by its bar."""
     shared = raw.get("shared")
     settings = shared.get("probe") if isinstance(shared, dict) else None
     limit = settings.get("max_drop") if isinstance(settings, dict) else None
@@ -345,7 +345,7 @@ def _gate_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 
 def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
-    """Variants that are to be compared with none of the others."""
+    """Problems of variants whose `against` is not another variant."""
     given = raw.get("variants")
     named = given if isinstance(given, dict) else {}
     found = []
@@ -362,7 +362,7 @@ def _reference_problems(raw: Mapping[str, Any]) -> list[Problem]:
 
 
 def _together(made: Recipe) -> list[Problem]:
-    """What a single key cannot tell."""
+    """Problems across the keys of a cell's recipe."""
     found = list(recipes.cross_checks(made))
     for check in (recipes.anchor_checks, recipes.merge_checks):
         found += check(made, (made.train.method,))
@@ -378,7 +378,7 @@ def _together(made: Recipe) -> list[Problem]:
 
 
 def _pair_problems(raw: Mapping[str, Any]) -> list[Problem]:
-    """Pairs that are also a stream of the main table, or the other pair."""
+    """Problems of pairs that are also a stream of the main table, or the other pair."""
     pairs, streams = raw.get("pairs"), raw.get("streams")
     named = [pairs.get("a"), pairs.get("b")] if isinstance(pairs, dict) else []
     named = [name for name in named if isinstance(name, str)]

@@ -1,4 +1,4 @@
-"""Variants of a study: how they are written, and what their keys make of the shared ones."""
+"""Variants of a study: how they are written, and how their keys change the shared ones."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ def merged(
 ) -> dict[str, Any]:
     """The raw keys of a cell's recipe.
 
-    Where something else than a section is in a key's way, it is left out: `build` complains of
-    what is in the way.
+    A key is left out if its section has a value that is not a mapping; `build` reports that value.
 
     Args:
-        lines: where the variant's dotted keys stand in the study's file.
+        lines: the lines of the variant's dotted keys in the study's file.
     """
-    raw = copy.deepcopy(shared)  # variants are put into its sections
+    raw = copy.deepcopy(shared)  # variants change its sections
     for dotted, its_value in {**variant.set, **variant.chosen(value)}.items():
         put(raw, dotted, copy.deepcopy(its_value), (lines or {}).get(dotted))
     put(raw, "train.method", variant.method)
@@ -40,7 +39,7 @@ def merged(
 
 
 def _lines(keys: Any) -> dict[str, int | None]:
-    """Where the dotted keys of a variant stand in the file: those of its 'set' and its 'tune'."""
+    """The lines in the file of a variant's dotted keys in 'set' and 'tune'."""
     found: dict[str, int | None] = {}
     for part in ("set", "tune"):
         section = keys.get(part)
@@ -52,14 +51,14 @@ def _lines(keys: Any) -> dict[str, int | None]:
 def read(
     raw: Any, kind: type[V], places: Places, anchors: Mapping[str, str], problems: list[Problem]
 ) -> dict[str, V]:
-    """The variants that can be read; the others' problems are appended.
+    """The variants that can be read; the problems of the others are appended.
 
     Args:
-        anchors: name -> the method that a variant of that name has to have, since others are
-            measured against it.
+        anchors: name -> the method that a variant of that name must have, since others are
+            compared with it.
     """
     found = {}
-    # Of what is no mapping, `build` has complained.
+    # `build` has reported a value that is not a mapping.
     for name, keys in (raw if isinstance(raw, dict) else {}).items():
         where, own = f"variants.{name}", []  # the problems of this variant
         if not isinstance(name, str) or not FOLDER_NAME.accepts(name):
@@ -85,19 +84,19 @@ def read(
                 own.append(Problem(wrong, expected, "rename the variant"))
         if variant is not None and not own:
             found[name] = variant
-        line = line_of(raw, name)  # that of the variant, where no key of its own is to blame
+        line = line_of(raw, name)  # the variant's line, for problems without a line of their own
         problems += [p if p.line else p._replace(line=line) for p in own]
     return found
 
 
-# The sections that one method or learner alone reads.
+# The sections that only one method or learner reads.
 SECTIONS = frozenset(name.replace("-", "_") for name in (*METHODS, *LEARNERS))
 
 
 def _problems(
     where: str, variant: Variant, places: Places, lines: Mapping[str, int | None]
 ) -> Iterator[Problem]:
-    """What is wrong with a variant's keys, whatever the recipe's own checks say of their values."""
+    """Problems of a variant's keys, beyond the recipe's own checks of their values."""
     for part, keys in (("set", variant.set), ("tune", variant.tune)):
         for dotted, value in keys.items():
             for problem in _key_problems(f"{where}.{part}", dotted, value, variant.method, places):
@@ -115,7 +114,7 @@ def _problems(
 def _key_problems(
     where: str, dotted: str, value: Any, method: str, places: Places
 ) -> Iterator[Problem]:
-    """What is wrong with one key of a variant of this method."""
+    """Problems of one key of a variant of this method."""
     if not all(dotted.split(".")) or isinstance(value, dict):
         expected, fix = "dotted recipe keys", "write e.g. train.backbone_lr: 1e-4"
         yield Problem(f"{where}: {dotted}", expected, fix)
@@ -133,18 +132,18 @@ def _key_problems(
 
 
 def _distinct(values: Any) -> bool:
-    """Whether it is a list of values, each another one."""
+    """Whether it is a list of different values, and not empty."""
     if not isinstance(values, list):
         return False
     try:
-        texts = {canonical(value) for value in values}  # a list among them cannot be in a set
-    except (TypeError, ValueError):  # NaN, or what only YAML can write
+        texts = {canonical(value) for value in values}  # lists could not be in a set
+    except (TypeError, ValueError):  # NaN, or values that only YAML can express
         return False
     return 0 < len(texts) == len(values)
 
 
 def _reserved(where: str, dotted: str, places: Places) -> Iterator[Problem]:
-    """A key that may not stand there."""
+    """The problem of a key that is not allowed here."""
     if not any(dotted == key or dotted.startswith(f"{key}.") for key in places):
         return
     place = places.get(dotted)
@@ -163,19 +162,19 @@ def cell_problems(
     given: Sequence[dict[str, Any]],
     together: Callable[[Any], Iterable[Problem]],
 ) -> Iterator[Problem]:
-    """What the ordinary checks say of each cell's recipe; what is wrong in `shared` is said once.
+    """Problems that the ordinary checks find in each cell's recipe; those of `shared` come once.
 
     Args:
-        raw: the variants as the file has them, which knows their lines.
-        places: of the keys that the study itself gives every cell.
-        given: raw keys of what the study gives, of each cell of a variant and value.
-        together: what a single key of a recipe cannot tell.
+        raw: the variants as in the file, with their lines.
+        places: places of the keys that the study itself sets in every cell.
+        given: raw keys that the study sets, one mapping per cell of a variant and value.
+        together: checks across the keys of a recipe.
     """
     if not isinstance(shared, dict):
         return
     for dotted in _dotted(shared):
         yield from _reserved("shared", dotted, places)
-    common: list[Problem] = []  # they come again in every cell
+    common: list[Problem] = []  # problems that every cell has again
     build(kind, {**shared, **given[0]}, common)
     yield from _within("shared", common)
     for name, variant in variants.items():
@@ -184,7 +183,7 @@ def cell_problems(
             found: list[Problem] = []
             made = build(kind, merged(shared, variant, value, lines) | keys, found)
             own: Iterable[Problem] = [problem for problem in found if problem not in common]
-            if not own and made is not None:  # only a whole recipe can be judged as a whole
+            if not own and made is not None:  # only a complete recipe can be checked as a whole
                 own = together(made)
             own = [p if p.line else p._replace(line=line_of(raw, name)) for p in own]
             yield from _within(f"variants.{name}", own)
@@ -200,11 +199,11 @@ def _dotted(raw: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 def tuning_problems(
     raw: Mapping[str, Any], variants: Mapping[str, Variant], default: int, fix: str
 ) -> Iterator[Problem]:
-    """Knobs without a section 'tuning', and a tuning seed that is one of the study's.
+    """Problems of tuning, such as knobs without a section 'tuning' or a seed of the comparison.
 
     Args:
-        default: of the tuning's seed.
-        fix: what to do where the section is missing.
+        default: the default of the tuning's seed.
+        fix: what to do if the section is missing.
     """
     tuned = {name: variant for name, variant in variants.items() if variant.tune}
     tuning, seeds = raw.get("tuning"), raw.get("seeds")
@@ -213,7 +212,7 @@ def tuning_problems(
     if not isinstance(tuning, dict):
         return
     seed, runs = tuning.get("seed", default), tuning.get("runs")
-    # Else a knob would be chosen by a run that is then compared. A wrong type is told elsewhere.
+    # Otherwise a knob would be chosen by a run that is also compared. `build` reports wrong types.
     if isinstance(seed, int) and isinstance(seeds, list) and seed in seeds:
         said = f"set tuning.seed to {max(s for s in seeds if isinstance(s, int)) + 1000}"
         yield Problem(
@@ -228,5 +227,5 @@ def tuning_problems(
 
 
 def _within(where: str, found: Iterable[Problem]) -> list[Problem]:
-    """The problems, with where they were found."""
+    """The problems with the place where they were found."""
     return [p._replace(found=f"{where}: {p.found}") for p in found]
