@@ -1,1 +1,1 @@
-"""What is known of a run, a job or a study, gathered for a page or a table."""
+"""Gathers what is known about a run, a job or a study, for a page or a table."""

@@ -24,19 +24,19 @@ from aegis_cli.training import checkpoint, folder
 from aegis_cli.training.up_to_date import refuse_unfinished
 
 Interval = tuple[float, float] | None
-_Named = tuple[Any, results.Result]  # by what two runs' results are compared
-_FRAMES = ("episodes", "trained_on", "frames", "seed")  # the figures that say which they were
-_MOST = 60  # letters of a list of episodes in a warning
+_Named = tuple[Any, results.Result]  # a result and the name by which runs are matched
+_FRAMES = ("episodes", "trained_on", "frames", "seed")  # figures that identify the frames
+_MOST = 60  # characters of a list of episodes in a warning
 
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One run's figures; None for what was not measured of it.
+    """One run's figures; None for those that were not measured.
 
-    `method` says whether what it trained was merged afterwards, as in `naive, merged`.
+    `method` says whether the trained policy was merged afterwards, as in `naive, merged`.
     Shares are in [0, 1], the drop in percentage points, times in seconds, W2^2 a mean over layers.
-    The figures of VQA are those of one probe, on the question set `vqa`, and the open-loop error is
-    that of one evaluation, on the episodes that `open_loop_on` says in words.
+    The VQA figures are those of one probe, on the question set `vqa`. The open-loop error is that
+    of one evaluation, on the episodes that `open_loop_on` describes.
     """
 
     run: str
@@ -71,8 +71,8 @@ class Comparison:
     """The runs, in the order given.
 
     `same_open_loop` says whether all open-loop errors are of the same frames, `same_episodes`
-    whether all rollouts of the same colours played the same episodes.
-    `differs` has what the runs do not share beside their methods, with each run's value.
+    whether all rollouts on the same colours played the same episodes. `differs` has the settings
+    other than the method in which the runs differ, with each run's value.
     """
 
     rows: list[ComparedRun]
@@ -82,17 +82,17 @@ class Comparison:
 
     @property
     def same_validation(self) -> bool:
-        """Whether all validation losses are of the same held-out frames."""
+        """Whether all validation losses are on the same held-out frames."""
         return differences.same_validation(self.differs)
 
     @property
     def same_questions(self) -> bool:
-        """Whether the figures of VQA are of the same questions."""
+        """Whether the VQA figures are on the same questions."""
         return "questions" not in self.differs
 
     @property
     def question_sets(self) -> list[str]:
-        """Those that the figures of VQA are of."""
+        """The question sets of the VQA figures."""
         return list(dict.fromkeys(row.vqa for row in self.rows if row.vqa is not None))
 
     def to_json(self) -> dict[str, Any]:
@@ -100,19 +100,19 @@ class Comparison:
 
 
 def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
-    """Read what was measured of each run.
+    """Read the measurements of each run.
 
-    The first question set that every run was probed on is compared. Where there is none, each
-    run's own first is shown, and a warning says so. Likewise with open-loop evaluations: they are
-    compared where episodes, frames and seed are the same, trained on or not.
+    The first question set that every run was probed on is compared. If there is none, each run's
+    own first set is shown, with a warning. Open-loop evaluations are compared likewise if they have
+    the same episodes, frames and seed, whether the episodes were trained on or not.
 
     Raises:
-        AegisError: a path that is no run of a policy, and no folder with such.
+        AegisError: a path is not a run of a policy, nor a folder with such runs.
     """
     found = []
     for given in paths:  # a run, or a folder with several
         found += [(path, _inspected(path)) for path in _runs(Path(given), on_event)]
-    # What is compared is chosen over all runs together.
+    # The compared results are chosen over all runs together.
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(path, one) for path, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
@@ -132,7 +132,7 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
 def _warn_of_differences(
     made: Comparison, evaluated: Sequence[_Named | None], on_event: OnEvent
 ) -> None:
-    """Say in what the runs differ beside their methods."""
+    """Warn of settings other than the method in which the runs differ."""
     if made.differs:
         text = f"the runs differ in {differences.said(made.differs)}"
         on_event(Warned("compare", f"{text}: their figures tell more than their methods"))
@@ -145,7 +145,7 @@ def _warn_of_differences(
 
 
 def _other_frames(made: Comparison, evaluated: Sequence[_Named | None]) -> str:
-    """What each run's open-loop error is of, with the figures by which these are not the same."""
+    """The frames of each run's open-loop error, with the figures in which they differ."""
     shown = [(row, *own) for row, own in zip(made.rows, evaluated, strict=True) if own]
     differ = []
     for name in _FRAMES:
@@ -153,7 +153,7 @@ def _other_frames(made: Comparison, evaluated: Sequence[_Named | None]) -> str:
             differ.append(name)
     said = []
     for row, (data, *_), one in shown:
-        # Two folders of one name may be all that is different.
+        # The only difference may be the folder, even with the same name.
         told = [] if differ else [f"in {data}"]
         told += [f"{name.replace('_', ' ')} {_short(one.figures[name])}" for name in differ]
         said.append(f"{row.run}, {row.open_loop_on} ({', '.join(told)})")
@@ -161,7 +161,7 @@ def _other_frames(made: Comparison, evaluated: Sequence[_Named | None]) -> str:
 
 
 def _short(value: Any) -> str:
-    """A number, or a list of episodes, of which a warning names the first."""
+    """A value as text; a long list of episodes is shortened to the first ones."""
     if not isinstance(value, list):
         return str(value)
     listed = as_text(value) or "none"
@@ -169,7 +169,7 @@ def _short(value: Any) -> str:
 
 
 def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
-    """Say which runs have steps left, for the others may only have had more of them."""
+    """Warn of runs with steps left, since other runs may only have trained for longer."""
     left = []
     for path, report in found:
         steps, planned = report.facts.get("steps"), report.facts.get("planned_steps")
@@ -181,7 +181,7 @@ def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: O
 
 
 def _what_goes_on(path: Path, report: InspectReport) -> str:
-    """How an unfinished run comes to its end; nothing where its training state is gone."""
+    """How to finish an unfinished run; "" if its training state is gone."""
     if "merge" in report.facts:
         return " (merged before its training had ended: what that ends in can be merged again)"
     state = path / "checkpoints" / checkpoint.LAST / checkpoint.STATE
@@ -189,7 +189,7 @@ def _what_goes_on(path: Path, report: InspectReport) -> str:
 
 
 def _warn_of_merges(found: Sequence[tuple[Path, InspectReport]], on_event: OnEvent) -> None:
-    """Say which runs have been merged by `aegis run`, which has measured what came of that."""
+    """Warn of runs that `aegis run` has merged, since it measured the merged policy instead."""
     given = {path.resolve() for path, _ in found}
     for path, report in found:
         merged = report.facts.get("merged_into")
@@ -205,14 +205,14 @@ def _inspected(path: Path) -> InspectReport:
 
 
 def _gate(path: Path, asked: _Named | None) -> bool | None:
-    """The verdict on the drop that the row shows; `aegis inspect` tells of all the probes."""
+    """The verdict on the drop in the row; `aegis inspect` judges all probes."""
     if asked is None:
         return None
     return results.gate([asked[1]], results.recipe_of(path).probe)
 
 
 def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
-    """The run's probes by their question sets, the first of each."""
+    """The run's first probe on each question set."""
     recipe, probed = results.recipe_of(path), dict[str, results.Result]()
     for result in found.probes:
         probed.setdefault(results.question_set(result, recipe), result)
@@ -220,8 +220,9 @@ def _by_set(path: Path, found: InspectReport) -> dict[str, results.Result]:
 
 
 def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
-    """The run's rollouts by their colours, the first of each; None where a task has no colours."""
-    # The last of each wins: the first one in the run's own task. LIBERO's policies play others too.
+    """The run's first rollout on each colour set; the key is None if a task has no colours."""
+    # In the dict the last one wins, so the first rollout in the run's own task comes last. LIBERO's
+    # policies are rolled out on other tasks too.
     task = found.facts.get("task")
     backwards = reversed(found.rollouts)
     in_order = sorted(backwards, key=lambda result: result.figures.get("task") == task)
@@ -229,7 +230,7 @@ def _by_colors(found: InspectReport) -> dict[str | None, results.PlayedResult]:
 
 
 def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) -> bool:
-    """Whether all rollouts of the same colours played the same episodes, in whatever way."""
+    """Whether all rollouts on the same colours played the same episodes."""
     known = dict[str | None, tuple[Any, ...]]()
     for rollouts in each:
         for colors, one in rollouts.items():
@@ -240,29 +241,29 @@ def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) ->
 
 
 def _by_episodes(path: Path, found: InspectReport) -> dict[Any, results.Result]:
-    """The run's open-loop evaluations by what has to be the same for them to be compared."""
+    """The run's open-loop evaluations, by the values that must be equal for a comparison."""
     by_episodes = {}
     for one in found.open_loops:
-        told = [str(one.figures[name]) for name in _FRAMES]  # lists as texts, which can be keys
+        told = [str(one.figures[name]) for name in _FRAMES]  # as texts, since lists are no keys
         by_episodes[results.evaluated_data(path, one), *told] = one
     return by_episodes
 
 
 def _one_of_each(measured: Sequence[Mapping[Any, results.Result]]) -> list[_Named | None]:
-    """Each run's first result whose name all runs with any have, else its own first."""
+    """Each run's first result whose name all runs with results have, otherwise its own first."""
     some = [own for own in measured if own]
     shared = [name for name in next(iter(some), {}) if all(name in own for own in some)]
     chosen: list[_Named | None] = []
     for own in measured:
-        name = next(iter([*shared, *own] if own else ()), None)  # where none is shared, its first
+        name = next(iter([*shared, *own] if own else ()), None)  # its own first if none is shared
         chosen.append(None if name is None else (name, own[name]))
     return chosen
 
 
 def _runs(path: Path, on_event: OnEvent) -> list[Path]:
-    """The path of a run, or those of all runs in the folder of a job, or in any folder.
+    """The path of a run, or the paths of all runs in a job's folder or in any other folder.
 
-    Of any folder, runs without a checkpoint are left out with a warning.
+    In other folders, runs without a checkpoint are left out with a warning.
     """
     if (path / table.NAME).is_file():
         found = table.load(path)
@@ -270,7 +271,7 @@ def _runs(path: Path, on_event: OnEvent) -> list[Path]:
             return table.runs(found)
     elif _is_run(path):
         return [path]
-    elif not (path / CELLS).is_file():  # a study's has stages too, and no table of runs
+    elif not (path / CELLS).is_file():  # a study's folder has no table of runs
         refuse_unfinished(path, "compare")
         if inside := _runs_inside(path, on_event):
             return inside
@@ -293,7 +294,7 @@ def _is_run(path: Path) -> bool:
 
 
 def _runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
-    """The runs right in a folder by their names, as far as they have a checkpoint."""
+    """The runs directly in a folder that have a checkpoint, sorted by name."""
     runs: list[Path] = []
     for saved in sorted(folder.glob("*/recipe.yaml")):
         try:
@@ -313,14 +314,14 @@ def _compared(
     """A run's row.
 
     Args:
-        asked: the question set to show with its probe; None where the run was probed on none.
+        asked: the question set to show with its probe; None if the run was not probed.
         evaluated: the open-loop evaluation to show; None without one.
     """
     vqa, probed = (None, {}) if asked is None else (asked[0], asked[1].figures)
     open_loop = {} if evaluated is None else evaluated[1].figures
     played = {colors: result.figures for colors, result in _by_colors(found).items()}
     seen, held_out = played.get("seen", {}), played.get("held-out", {})
-    # A task without colours has one rollout, by its return or its success.
+    # A task without colours has a single rollout, with its return or its success.
     only = played.get(None, {})
     lines = folder.read_metrics(path)
     times = [line["step_s"] for line in lines if "step_s" in line]

@@ -1,4 +1,4 @@
-"""In what the runs of a comparison differ beside their methods: their figures mean less then."""
+"""Settings other than the method in which compared runs differ, so their figures mean less."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from aegis_cli.evaluation.results import PlayedResult, Result
 from aegis_cli.training.up_to_date import digest
 
 Value = str | int | float | None
-_DIGITS = 12  # of a digest, which tell two files apart
-# The facts that decide which frames a validation loss is of, and of which actions.
+_DIGITS = 12  # digits of a digest that suffice to distinguish two files
+# The settings that determine the frames and actions of a validation loss.
 _OF_VALIDATION = {"demonstrations", "seed", "episodes", "share held out", "chunk"}
 
 
@@ -23,7 +23,7 @@ def of_run(
     asked: tuple[str, Result] | None,
     played: Mapping[str | None, PlayedResult],
 ) -> dict[str, Value]:
-    """What has to be alike for two runs to differ in their methods alone, by its name.
+    """The settings that must be equal for two runs to differ only in their methods, by name.
 
     Args:
         asked: the question set whose figures are compared, and its probe; None without any.
@@ -47,31 +47,31 @@ def of_run(
 
 
 def _rollout(found: PlayedResult | None) -> str | None:
-    """Which episodes a rollout played, and how; None without one."""
+    """The episodes of a rollout and its settings; None without a rollout."""
     if found is None:
         return None
     words = [f"{found.figures['episodes']} episodes of {found.figures.get('task')}"]
     for name, value in vars(found.played).items():
-        if value is not None and value is not False:  # a delay of 0 is something
+        if value is not None and value is not False:  # a delay of 0 counts as a setting
             words.append(f"{name} {value}")
     return ", ".join(words)
 
 
 def _questions(path: Path, vqa: str, probed: Result) -> str:
-    """Which questions a probe asked, and how, as its run's recipe or its settings say.
+    """The questions of a probe and how they were asked, by its own settings or the run's recipe.
 
-    A name does not tell two files apart: any folder may have its `questions.jsonl`, and one file
-    may have been changed. How many questions of each family there are and how often each family's
-    commonest answer is theirs follows from the questions alone, whichever model was asked.
+    A name does not distinguish two files: any folder may have a `questions.jsonl`, and a file may
+    have been changed. The number of questions in each family and the share of the family's most
+    common answer depend only on the questions, not on the model.
     """
     own = results.recipe_of(path).probe
     words = [f"{probed.figures.get('questions', 0):,} of {vqa}"]
     families = probed.figures.get("families")
-    # Those that ship are told by their names, with the seed below.
+    # For the shipped sets, the name and the seed below suffice.
     if vqa not in (sets.SCENES, easy.NAME) and families:
         told = {name: [one["questions"], one["majority"]] for name, one in families.items()}
         words.append(f"families of digest {digest(told)[:_DIGITS]}")
-    # A probe of `aegis run` has no settings of its own: it asks as the recipe says.
+    # A probe of `aegis run` has no settings of its own and uses those of the recipe.
     seed, ask = probed.settings.get("seed", own.seed), probed.settings.get("ask", own.ask)
     if seed != 0:
         words.append(f"seed {seed}")
@@ -81,9 +81,9 @@ def _questions(path: Path, vqa: str, probed: Result) -> str:
 
 
 def between(facts: Sequence[dict[str, Value]]) -> dict[str, list[Value]]:
-    """Each fact in which runs differ, with its value for every run.
+    """Each setting in which runs differ, with its value for every run.
 
-    A run of which one is not known differs from no other in it.
+    A run for which a setting is unknown does not count as different.
     """
     found = {}
     for name in facts[0] if facts else ():
@@ -94,12 +94,12 @@ def between(facts: Sequence[dict[str, Value]]) -> dict[str, list[Value]]:
 
 
 def same_validation(found: dict[str, list[Value]]) -> bool:
-    """Whether the runs' validation losses are of the same frames and actions."""
+    """Whether the runs' validation losses are on the same frames and actions."""
     return not found.keys() & _OF_VALIDATION
 
 
 def said(found: dict[str, list[Value]]) -> str:
-    """The differences in words; digests tell a reader nothing."""
+    """The differences in words, without digests, which mean nothing to a reader."""
     words = []
     for name, values in found.items():
         listed = "; ".join("-" if value is None else str(value) for value in values)

@@ -1,7 +1,7 @@
-"""`aegis report`: all that the folder of a run, a job or a study holds, as one document.
+"""`aegis report`: the contents of a run's, job's or study's folder as one document.
 
-A job is what `aegis run` made of a recipe with several methods. Nothing is measured here: every
-figure is one that a stage has written.
+A job is the result of `aegis run` on a recipe with several methods. Nothing is measured here: all
+figures were written by the stages.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _VIDEOS = (".mp4", ".gif", ".webm")
 
 @dataclass(frozen=True)
 class Video:
-    """A film in a run's folder: its path from the reported folder, and its size."""
+    """A video in a run's folder: its path relative to the reported folder, and its size."""
 
     name: str
     size_bytes: int
@@ -42,11 +42,11 @@ class Video:
 
 @dataclass(frozen=True)
 class AnchorUse:
-    """An anchor and what it was for.
+    """An anchor and its use.
 
     Attributes:
-        measured_on: in words; of a file whose content is not known here, which file it is.
-        read: whether the weights came about with it; else the drift alone is measured against it.
+        measured_on: a description of its data, or of the file if its content is not known here.
+        read: whether the weights depend on it; otherwise only the drift is measured against it.
     """
 
     measured_on: str
@@ -58,21 +58,20 @@ class RunDocument:
     """One run.
 
     Attributes:
-        label: a name that tells it from the others of a job; its method, and whether what that
-            trained was merged afterwards.
+        label: a name that distinguishes it from other runs of a job: its method, and whether the
+            trained policy was merged afterwards.
         recipe: every key with its value.
-        anchor: None where neither the training has read it nor a drift was measured against it.
-        facts: as `aegis inspect` tells them.
+        anchor: None if the training did not read one and no drift was measured against one.
+        facts: the facts that `aegis inspect` shows.
         metrics: the lines of metrics.jsonl.
-        layers, over_time, energy_shed_mean: the energy that the projection shed; empty where no
-            anchor gradient was taken.
-        train: the figures of train.json; empty where `aegis run` did not train it.
-        probes, rollouts, open_loops: what was measured of the last checkpoint, and with which
-            settings.
-        question_sets: that of each of the probes, as somebody named it.
-        gate: whether the drop is within `probe.max_drop` or `--max-drop`; None without one.
-        machine: on which it was trained; empty for a run of an earlier Aegis.
-        commands: which make the same again.
+        layers, over_time, energy_shed_mean: the energy that the projection shed; empty if no
+            anchor gradient was computed.
+        train: the figures of train.json; empty if `aegis run` did not train it.
+        probes, rollouts, open_loops: measurements of the last checkpoint, with their settings.
+        question_sets: the question set of each probe, as the user named it.
+        gate: whether the drop is within `probe.max_drop` or `--max-drop`; None without a limit.
+        machine: the machine that trained it; empty for a run of an earlier version.
+        commands: the commands that reproduce it.
     """
 
     kind: str
@@ -119,7 +118,7 @@ class JobDocument:
 
 @dataclass(frozen=True)
 class StudyDocument:
-    """A study as far as it is finished. `kind` is that of its recipe, such as `study`."""
+    """A study as far as it is finished. `kind` is the kind of its recipe, such as `study`."""
 
     kind: str
     path: str
@@ -153,13 +152,14 @@ Document = RunDocument | JobDocument | StudyDocument | StreamDocument
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> Document:
-    """The document of a folder; `on_event` (there as in every stage) is never called.
+    """The document of a folder; `on_event`, which every stage has, is never called.
 
     Raises:
-        AegisError: nothing there that `aegis train` or `aegis run` wrote, or a damaged file.
+        AegisError: the folder was not written by `aegis train` or `aegis run`, or a file is
+            damaged.
     """
     path = Path(path)
-    # A table first: a study that has only begun has cells alone, which `table.load` tells.
+    # A table first: a study that has just started has only cells, which `table.load` reports.
     if (path / table.NAME).is_file() or (path / CELLS).is_file():
         return _of_table(path)
     if recipes.is_stream_run(path):
@@ -186,7 +186,7 @@ def _of_table(path: Path) -> Document:
         again = commands.aegis("run", "RECIPE", "--out", path.parent)
         return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
     runs = [run_document(run) for run in table.runs(found)]
-    # Each method's recipe names all methods of the job, with every value that was set.
+    # Each method's recipe names all methods of the job, and has every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
     again = commands.aegis("run", recipe, "--out", "NEW_FOLDER")
     return JobDocument("job", str(path), found, runs, _videos(path), [again])
@@ -196,10 +196,10 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
     """The document of a run of one policy.
 
     Args:
-        videos: whether to list the films in its folder, as where it is reported alone.
+        videos: whether to list the videos in its folder, as in a report of a single run.
 
     Raises:
-        AegisError: no checkpoint yet, or a damaged file.
+        AegisError: there is no checkpoint yet, or a file is damaged.
     """
     recipe = recipes.load(path / "recipe.yaml")
     found = inspection.run(path)
@@ -235,18 +235,18 @@ def run_document(path: Path, videos: bool = False) -> RunDocument:
 
 
 def _jobs_report(path: Path) -> Path:
-    """What `aegis run` wrote of a run's training; no file where it has not trained it."""
+    """The report of `aegis run` on a run's training; the file exists only if it trained the run."""
     return folder.trained_in(path) / folder.JOBS_REPORT
 
 
 def _anchor(
     path: Path, recipe: recipes.Recipe, found: inspection.InspectReport
 ) -> AnchorUse | None:
-    """What is said of a run's anchor; its file may have been given to a training in vain."""
+    """A run's anchor and its use; None if a training was given one that nothing used."""
     read = recipe.reads_anchor(str(found.facts["method"]))
     if not read and not any(probed.figures.get("layers") for probed in found.probes):
         return None
-    if _jobs_report(path).is_file():  # by `aegis run`, which measures the recipe's own
+    if _jobs_report(path).is_file():  # `aegis run` measures the anchor of the recipe
         asked = f"questions of {recipe.anchor.vqa}"
         what = "robot frames" if recipe.anchor.source == "demos" else asked
         return AnchorUse(f"{_samples(path, recipe):,} {what}", read)
@@ -257,7 +257,7 @@ def _anchor(
 
 
 def _samples(path: Path, recipe: recipes.Recipe) -> int:
-    """How many the anchor of a job was measured on; a set may have fewer than the recipe asks."""
+    """The number of samples of a job's anchor; a set may have fewer than the recipe requests."""
     file = path.parent / "anchor.safetensors"
     header = artifacts.read_header(file) if file.is_file() else None
     found = None if header is None else header.meta.get("samples")
@@ -267,9 +267,10 @@ def _samples(path: Path, recipe: recipes.Recipe) -> int:
 def _commands(
     path: Path, recipe: recipes.Recipe, facts: Mapping[str, Any], has_anchor: bool
 ) -> list[str]:
-    """Training, merge, probe and rollout of a run; inputs lie beside it if `aegis run` made them.
+    """Commands for training, merge, probe and rollout of a run.
 
-    Without a simulated task, nothing can be rolled out.
+    The inputs are beside the run if `aegis run` made them. Without a simulated task there is no
+    rollout.
     """
     method, task, merge = str(facts["method"]), facts.get("task"), facts.get("merge")
     named = recipe.demos.path or _beside(path, "demos.safetensors")
@@ -284,7 +285,7 @@ def _commands(
     told = [commands.aegis("train", again, *inputs)]
     if merge is not None:
         trained, new = new, "MERGED_FOLDER"
-        if facts["steps"] != recipe.train.steps:  # it was merged before its training had ended
+        if facts["steps"] != recipe.train.steps:  # it was merged before the end of its training
             trained = f"{trained}/checkpoints/{facts['steps']:06d}"
         own = _merging(merge, recipe, demos, anchor)
         told.append(commands.aegis("merge", trained, *own, "--out", new))
@@ -293,7 +294,7 @@ def _commands(
         told.append(commands.aegis("probe", new, *counted, *asked))
     if task is not None:
         episodes = ("--episodes", recipe.rollout.episodes, *_seed(recipe.rollout.seed))
-        colors: list[tuple[str, ...]] = [()]  # once, where a task has none
+        colors: list[tuple[str, ...]] = [()]  # a single rollout if a task has no colours
         if sim.has_colors(task):
             colors = [("--colors", each) for each in recipe.rollout.colors]
         told += [commands.aegis("rollout", new, *episodes, *of_them) for of_them in colors]
@@ -303,7 +304,7 @@ def _commands(
 def _merging(
     merge: Mapping[str, Any], recipe: recipes.Recipe, demos: Sequence[str], anchor: str
 ) -> Iterator[object]:
-    """The options of a merge, of which an earlier Aegis has not kept what was read for it.
+    """The options of a merge; merges of earlier versions do not record what they read.
 
     Args:
         demos: the option with the run's demonstrations, once for each set.
@@ -322,7 +323,7 @@ def _merging(
     if "anchor" in merge:
         yield from ("--anchor", anchor)
     elif "vqa" in merge:
-        # Against the defaults of `aegis merge`; what is None here is always told.
+        # Compared with the defaults of `aegis merge`; options with None here are always given.
         for name, default in (("vqa", None), ("ask", "{}"), ("samples", None), ("temperature", 1)):
             if merge[name] != default:
                 yield from (f"--{name}", merge[name])
@@ -330,19 +331,19 @@ def _merging(
 
 
 def _seed(seed: int) -> tuple[object, ...]:
-    """The option of a seed that is not the default."""
+    """The option for a seed, if it is not the default."""
     return ("--seed", seed) if seed else ()
 
 
 def _beside(path: Path, name: str) -> str:
-    """An input of a run as `aegis run` lays it; a word to fill in where it is elsewhere."""
+    """An input of a run where `aegis run` puts it, or a placeholder if it is elsewhere."""
     found = folder.trained_in(path).parent / name
     return str(found) if found.is_file() else name.partition(".")[0].upper()
 
 
 def _videos(path: Path) -> list[Video]:
-    """The films in a folder, in those right below it, and in the merged runs in these."""
-    # No deeper: a run's checkpoints and a job's data hold thousands of files, and no film.
+    """The videos in a folder, in its direct subfolders, and in merged runs in these."""
+    # No deeper: a run's checkpoints and a job's data hold thousands of files, but no videos.
     listed = [*path.glob("*"), *path.glob("*/*"), *path.glob(f"*/{folder.MERGED}/*")]
     found = sorted(p for p in listed if p.suffix.lower() in _VIDEOS and p.is_file())
     return [Video(p.relative_to(path).as_posix(), p.stat().st_size) for p in found]
