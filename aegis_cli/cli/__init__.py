@@ -1,1 +1,1 @@
-"""The commands, and all that a user sees."""
+"""The commands, and everything that a user sees."""

@@ -1,4 +1,4 @@
-"""Warnings before a stage begins: it would run, and not measure what its user has in mind."""
+"""Warnings before a stage starts that it would run, but not do what its user expects."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from aegis_cli.recipes.study_cells import cell, places
 from aegis_cli.recipes.variants import SECTIONS
 
 _SCENES = "scenes"
-# Keys of a training that are about the backbone's learning alone.
+# Keys of a training that affect only how the backbone learns.
 _OF_BACKBONE = ("train.backbone_lr", "train.backbone_until", "train.optimizer", "train.momentum")
 _OF_QUESTIONS = ("vqa", "skip_bad", "ask", "questions", "batch_size")
 
 
 def of_questions(model: str, *names: str | None) -> None:
-    """Warn of a real VLM that is asked about drawn scenes, which tell little of what it knows.
+    """Warn if a real VLM is asked about drawn scenes, which show little of what it knows.
 
     Args:
         model: a backbone, or a run or policy that has one.
-        names: of the question sets.
+        names: the names of the question sets.
     """
     if launch.rank() == 0 and _SCENES in names and _is_of_the_hub(model):
         render.note(
@@ -46,14 +46,14 @@ def of_questions(model: str, *names: str | None) -> None:
 
 
 def of_training(recipe: Recipe, anchor: Path | None) -> None:
-    """Warn of what a training reads: its anchor, and questions that it trains on."""
+    """Warn about the questions of a training: those of its anchor and those that it trains on."""
     of_questions(recipe.backbone, _measured_on(anchor), _trained_on(recipe))
 
 
 def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
-    """Warn of what a recipe's anchors and probes ask; streams of images have none.
+    """Warn about the questions of a recipe's anchors and probes; image streams have none.
 
-    A recipe of one run is warned of its settings too, of which `overrides` were given.
+    For the recipe of a job it also warns about settings; `overrides` are those of the command line.
     """
     if isinstance(recipe, StreamStudyRecipe):
         return
@@ -62,12 +62,12 @@ def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
         of_questions(recipe.backbone, *_asked(recipe))
         return
     if isinstance(recipe, RobotStreamStudyRecipe):
-        # No variant may set the backbone or the probe, so that any cell stands for all.
+        # No variant may set the backbone or the probe, so any cell represents all.
         name, first = next(iter(recipe.variants.items()))
         asked = cell(recipe, name, recipe.tasks, recipe.seeds[0], first.values[0])
         of_questions(asked.backbone, asked.probe.only_set)
         return
-    # Here a variant may have an anchor of its own. Tasks and seeds ask the same.
+    # Here a variant may have its own anchor. All tasks and seeds have the same questions.
     place, seed = places(recipe)[0], recipe.seeds[0]
     for name, variant in recipe.variants.items():
         one = cell(recipe, name, place, seed, variant.values[0])
@@ -82,12 +82,12 @@ def of_settings(
     overrides: Sequence[str] = (),
     methods: Sequence[str] = (),
 ) -> None:
-    """Warn of settings that do not do what they seem to, beside the others.
+    """Warn about settings that, together with others, do not do what they seem to do.
 
     Args:
-        overrides: the KEY=VALUE that were given, which somebody has in mind. A file's keys may be
-            there for other methods.
-        methods: those that are trained; default: the recipe's `train.method`.
+        overrides: the KEY=VALUE of the command line, which are meant for this call. Keys in the
+            file may be there for other methods.
+        methods: the methods that are trained; by default the recipe's `train.method`.
     """
     if launch.rank() > 0:
         return
@@ -105,7 +105,7 @@ def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[
     train = recipe.train
     falls = not (isinstance(train, Train) and train.schedule == CONSTANT)
     if train.warmup > train.steps or (falls and train.warmup == train.steps):
-        share = 100 * train.steps / train.warmup  # the rise is linear
+        share = 100 * train.steps / train.warmup  # the warm-up is linear
         lost = ", and never fall" if falls else ""
         yield (
             f"train.warmup: {train.warmup} with train.steps: {train.steps}: the learning rates end "
@@ -114,11 +114,11 @@ def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[
 
 
 def _of_unread(overrides: Sequence[str], methods: Sequence[str]) -> Iterator[str]:
-    """Options of methods that are not trained, of a backbone that does not learn, and of others.
+    """Overrides without effect, such as options of other methods or of a frozen backbone.
 
-    What shares a training among processes has no effect in one.
+    Sharing a training among processes has no effect if there is only one.
     """
-    own = {method.replace("-", "_") for method in methods}  # the sections that they read
+    own = {method.replace("-", "_") for method in methods}  # the sections that these methods read
     named = " and ".join(methods)
     for override in overrides:
         dotted, _, value = map(str.strip, override.partition("="))
@@ -139,7 +139,7 @@ def _of_thresholds(chosen: Nullspace) -> Iterator[str]:
 
 
 def _of_unasked(chosen: Insulate) -> Iterator[str]:
-    """What says which questions are trained on, where none are."""
+    """Settings of the training questions although none are trained on."""
     own = [name for name in _OF_QUESTIONS if getattr(chosen, name) != getattr(Insulate(), name)]
     if chosen.vqa_weight == 0 and own:
         yield (
@@ -157,8 +157,8 @@ def _asked(recipe: Recipe) -> Iterator[str | None]:
 
 
 def _trained_on(recipe: Recipe) -> str | None:
-    """The questions of a method that trains on some."""
-    from aegis_cli import methods  # with it comes torch
+    """The question set of a method that trains on questions; None for other methods."""
+    from aegis_cli import methods  # imports torch
 
     own = options(recipe)
     trains_on_some = methods.get(recipe.train.method).trains_on_questions(own)
@@ -166,7 +166,7 @@ def _trained_on(recipe: Recipe) -> str | None:
 
 
 def _measured_on(anchor: Path | None) -> str | None:
-    """The questions that an anchor was measured on, where it is one and says so."""
+    """The question set that an anchor was measured on; None if the file is not an anchor."""
     if anchor is None:
         return None
     from aegis_cli.common import artifacts
@@ -174,17 +174,17 @@ def _measured_on(anchor: Path | None) -> str | None:
     try:
         return str(artifacts.read_header(anchor).meta.get("vqa"))
     except AegisError:
-        return None  # the stage says what is wrong with it
+        return None  # the stage will report the problem
 
 
 def _is_of_the_hub(model: str) -> bool:
-    """Whether a model, or a policy's own, has the layout of the hub."""
+    """Whether a model, or the backbone of a policy, has the layout of the hub."""
     from aegis_cli.models import backbones
     from aegis_cli.models.backbones import model_folder
 
     try:
         path = backbones.locate(model)
     except AegisError:
-        return False  # the stage says what is wrong with it
-    # A policy in LeRobot's layout is one file; the configuration of its backbone lies beside it.
+        return False  # the stage will report the problem
+    # A policy in LeRobot's layout is one file, with its backbone's configuration beside it.
     return path.is_dir() or model_folder.is_model(path.parent / "backbone")

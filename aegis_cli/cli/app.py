@@ -1,6 +1,6 @@
 """The `aegis` command. Each of its commands parses arguments, calls one stage and shows its report.
 
-stages.py says which stage that is, exits.py with which code a command ends.
+stages.py defines which stage that is, and exits.py the exit codes.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ def anchor(
     )
 
 
-# What means nothing where an anchor is measured on questions, and what it would need instead.
+# Options without a meaning for an anchor measured on questions -> what they would need.
 _OF_FRAMES = {
     "--camera": "demonstrations to choose a camera of",
     "--only": "demonstrations to choose episodes of",
@@ -336,7 +336,7 @@ _OF_QUESTIONS = {"--vqa", "--ask", "--skip-bad"}
 
 
 def _check_frames_or_questions(reads_frames: bool, chosen: set[str]) -> None:
-    """Raise AegisError for options of `anchor` that are not of what it is measured on."""
+    """Raise AegisError for options of `anchor` that do not apply to its source."""
     if reads_frames:
         unused = _OF_QUESTIONS & chosen
         if unused:
@@ -350,7 +350,7 @@ def _check_frames_or_questions(reads_frames: bool, chosen: set[str]) -> None:
 
 
 def _cameras(names: list[str] | None) -> str | tuple[str, ...] | None:
-    """Cameras as a recipe's `demos.camera` has them: none, one by its name, or several."""
+    """Cameras as in a recipe's `demos.camera`: none, one name, or several."""
     if not names:
         return None
     return names[0] if len(names) == 1 else tuple(names)
@@ -413,9 +413,9 @@ def train(
     run = recipe if recipe.is_dir() else None
     if run is not None:
         recipe, out, resume = resuming.recipe_of(run, out), run, not overwrite
-    # Last, so that --method also wins against a --set train.method.
+    # Last, so that --method also overrides --set train.method.
     chosen = [f"train.method={method}"] if method is not None else []
-    # Before a missing --out is told of: the recipe's path may be the one that is mistyped.
+    # Before a missing --out is reported, because the recipe's path may be mistyped.
     resolved = load_training(recipe, (overrides or []) + chosen)
     if out is None:
         fix = commands.aegis("train", recipe, "--out", "runs/NAME")
@@ -423,7 +423,7 @@ def train(
     if run is not None and isinstance(resolved, Recipe):
         demos, anchor = resuming.inputs_of(run, resolved, demos or [], anchor)
         resuming.check_here(run, resolved)
-    # Where the command is ended by a signal, exits.py asks what goes on with the run (GOES_ON).
+    # If a signal ends the command, exits.py asks for the command that resumes the run (GOES_ON).
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
@@ -449,8 +449,8 @@ def train(
     if not dry_run:
         ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, paths, anchor, as_they_are)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
-    # The gate is told inside the block and ends the process outside: one that ends with another
-    # code than 0 takes the others down, which may not have finished their writing.
+    # The gate's verdict is printed inside the block, but the process ends outside of it: an exit
+    # code other than 0 also ends the other processes, which may still be writing.
     with stages.joined(device):
         report = stage.run(
             resolved,
@@ -469,16 +469,16 @@ def train(
 
 
 def _kept_options(ctx: typer.Context, device: str | None, as_json: bool) -> list[str]:
-    """What a command that goes on with the run has of this one, word by word."""
-    # Not a device from AEGIS_DEVICE, which the next command finds there too.
+    """The options of this command that a command to resume the run repeats, as words."""
+    # Without a device from AEGIS_DEVICE, which the next command reads too.
     kept = ["--device", str(device)] if "--device" in given(ctx) else []
     return kept + (["--json"] if as_json else [])
 
 
 def _learned_from(recipe: Recipe, file: Path, demos: Sequence[Path]) -> tuple[Paths, Recipe]:
-    """The demonstrations of a training, and its recipe, which names these and no others.
+    """The demonstrations of a training, and its recipe, which names no others.
 
-    Several that are given stand in the recipe in any case: that tells what the run was trained on.
+    Several given sets are always written into the recipe, which records what the run trained on.
 
     Raises:
         AegisError: neither the command nor the recipe names any.
@@ -499,7 +499,7 @@ def _learned_from(recipe: Recipe, file: Path, demos: Sequence[Path]) -> tuple[Pa
 
 
 def _paths(named: str | tuple[str, ...]) -> Paths:
-    """One set of demonstrations or several, as a recipe names them."""
+    """One set of demonstrations or several, as named in a recipe."""
     if isinstance(named, str):
         return demonstrations_path(named)
     return tuple(map(demonstrations_path, named))
@@ -623,7 +623,7 @@ def merge(
         fix = f"did you mean --method {near}?" if near else "e.g. --method factors"
         raise AegisError(f"--method {method}", f"one of {', '.join(MERGES)}", fix)
     _check_sweep(strength, sweep, max_drop, gate, out, plot)
-    # A sweep is judged on questions whatever the method; a single merge only measures curvature.
+    # A sweep always needs questions to be judged; a single merge needs them only for curvature.
     asks_nothing = strength is not None and (method == "linear" or anchor is not None)
     if asks_nothing and vqa is not None:
         reason = "--method linear" if method == "linear" else "--anchor"
@@ -653,7 +653,7 @@ def merge(
         settings,
         out,
         strength,
-        numbers(sweep),  # none without --sweep: the stage takes the method's grid
+        numbers(sweep),  # empty without --sweep; the stage then uses the method's grid
         max_drop,
         gate=(gate or Gate.mean).value,
         device=device,
@@ -816,7 +816,7 @@ def _drop_against(
     max_drop: float | None,
     gate: Gate | None,
 ) -> str | None:
-    """What a probe's drop is measured against; None where no drop is asked for.
+    """The baseline of a probe's drop; None if no drop is requested.
 
     Raises:
         AegisError: a gate without a limit, or a limit with nothing to measure the drop against.
@@ -825,7 +825,7 @@ def _drop_against(
         expected = "a limit to hold the drop to: that, or probe.max_drop of the run's own recipe"
         fix = "add --max-drop POINTS, or leave --gate out"
         raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
-    # An anchor tells the drift of what was fine-tuned, beside that of the model it began from.
+    # With an anchor, the drift is shown beside that of the model before fine-tuning.
     if baseline is None and (max_drop is not None or anchor is not None):
         baseline = question_sets.baseline(target, anchor)
     if max_drop is not None and baseline is None:
@@ -835,7 +835,7 @@ def _drop_against(
 
 
 def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
-    """A probe's drop in words, by what of it the gate limits."""
+    """A probe's drop in words, by the figure that the gate limits."""
     if gate is not Gate.upper_end:
         return f"a drop of {_beyond(report.drop_points, max_drop)} points"
     may_be = _beyond(report.drop_interval[1], max_drop)
@@ -843,7 +843,7 @@ def _dropped(report: Any, gate: Gate, max_drop: float) -> str:
 
 
 def _beyond(points: float, max_drop: float) -> str:
-    """Points in two digits after the point, or in as many as show that they are past the limit."""
+    """Points with two decimals, or as many as show that they are past the limit."""
     decimals = deciding_decimals(points, f"<= {max_drop!r}", 2)
     return f"{points:.{decimals}f}"
 
@@ -1051,7 +1051,7 @@ def rollout(
     if guided and delay is None:
         expected = "a delay, in which the chunk goes on that the next one continues"
         raise AegisError("--guided without --delay", expected, "add --delay STEPS, such as 0")
-    from aegis_cli.deploy import load_acting  # with it comes torch
+    from aegis_cli.deploy import load_acting  # imports torch
 
     stages.ROLLOUT.run(
         run,
@@ -1059,7 +1059,7 @@ def rollout(
         episodes,
         colors.value,
         video,
-        load=load_acting,  # `deploy` may import `evaluation`, not the other way round
+        load=load_acting,  # passed in, since `evaluation` may not import `deploy`
         seed=seed,
         keep=True,
         ensemble=ensemble,
@@ -1121,7 +1121,7 @@ def evaluate(
         render.check_plot(plot)
         files.check_writable(plot)
     chosen = listed_episodes(episodes)
-    # Traces of some episodes are kept for a plot alone.
+    # Traces of some episodes are kept only for a plot.
     asked: list[Any] = [chosen, frames, seed, batch_size, plot is not None]
     options: dict[str, Any] = {"rename": renaming(rename), "device": device, "as_json": as_json}
     if is_robot_stream_run(run):
@@ -1135,7 +1135,7 @@ def evaluate(
 
 
 def _warn_of(report: Any) -> None:
-    """Say which episodes of an open-loop error may flatter the policy."""
+    """Warn of episodes on which the open-loop error may be too low."""
     if report.trained_on:
         listed = ", ".join(map(str, report.trained_on))
         render.note(f"trained on: {listed}; what is predicted there says nothing of new episodes")
@@ -1181,11 +1181,11 @@ def serve(
     from aegis_cli.serving import server
 
     def listening(report: Any) -> None:
-        """Show where the server listens, at once: whoever waits for it may read a pipe."""
+        """Show at once where the server listens, since a waiting program may read a pipe."""
         render.show(report, render.serving, as_json)
         sys.stdout.flush()
 
-    # Not as a `Stage`, which shows its report at its end: a server has one at its beginning.
+    # Not a `Stage`, which shows its report at its end: a server shows it at its start.
     with stages.computing_on(device):
         server.run(run, task, host, port, prompt, seed, precision, listening, ensemble, render.note)
 
@@ -1336,7 +1336,7 @@ def run(
     Example: aegis run recipes/igsp-compare.yaml
     """
     resolved = load_run(recipe, overrides or [])
-    one_run = isinstance(resolved, Recipe)  # else a study, of several seeds
+    one_run = isinstance(resolved, Recipe)  # otherwise a study of several seeds
     if one_run and workers > 1:
         fix = "leave --workers out: a recipe's methods are timed against each other"
         found = f"--workers {workers} with the recipe '{recipe}'"
@@ -1367,15 +1367,15 @@ def run(
 
 
 def _save_tables(resolved: Any, report: Any, stage: stages.Stage) -> None:
-    """Write what a job or study has found as text and as a page, a study's as a picture too."""
+    """Write the results of a job or study as text and a page, and a study's also as a plot."""
     render.save_table(report, stage.view)
     if isinstance(resolved, StudyRecipe):
         _save_frontier(report)
-    reporting.write_of(Path(report.out))  # last: the page is made of what lies there
+    reporting.write_of(Path(report.out))  # last, because the page is made from these files
 
 
 def _save_frontier(report: Any) -> None:
-    """Draw a study's frontier beside its table, or say why there is none."""
+    """Draw a study's frontier beside its table, or print why there is none."""
     if render.has_frontier(report):
         render.frontier_plot(report, Path(report.out) / "frontier.png")
     else:
@@ -1439,8 +1439,7 @@ def bench(
     Example: aegis bench --latency runs/x
     Example: aegis bench --shape smolvlm2-256m --methods aegis,kfac --batch-size 8
     """
-    # The defaults of --batch-size and --repeats differ with what is timed, so that they are
-    # decided here.
+    # The defaults of --batch-size and --repeats depend on what is timed, so they are set here.
     options = set(given(ctx))
     if latency is not None:
         unused = {"--backbone", "--batch-size", "--shape", "--methods", "--set"}
@@ -1458,7 +1457,7 @@ def bench(
             as_json=as_json,
         )
     else:
-        from aegis_cli.guard import Guard  # with it comes torch
+        from aegis_cli.guard import Guard  # imports torch
 
         stages.BENCH.run(
             backbone,
@@ -1473,7 +1472,7 @@ def bench(
 
 
 def _refuse_beside(option: str, options: set[str], unused: set[str]) -> None:
-    """Raise AegisError for options that mean nothing beside `option`."""
+    """Raise AegisError for options that have no meaning together with `option`."""
     if beside := sorted(unused & options):
         expected = "a run alone, whose policy is timed"
         if option == "--shape":
@@ -1503,7 +1502,7 @@ def recipes(
     Example: aegis recipes show quickstart
     Example: aegis recipes cp quickstart mine.yaml
     """
-    # `ls` takes no word, `show` one; arguments come in order, so that one too many is the last.
+    # `ls` takes no argument, `show` one; arguments are in order, so a surplus one is the last.
     unused = out if action is RecipeAction.show else name
     if action is not RecipeAction.cp and unused is not None:
         fix = f"aegis recipes cp {name} {out or ''}".rstrip()
@@ -1522,7 +1521,7 @@ def recipes(
     if out.exists():
         raise AegisError(f"'{out}' exists", "a new file", f"aegis recipes cp {name} OTHER.yaml")
     files.write_text(out, text)
-    if as_json:  # the note below is what a reader is told
+    if as_json:  # the note below is for people
         render.show(shipped.Copied(name, str(out)), render.facts, as_json)
     render.note(f"copied {name} to {out}")
 
@@ -1547,19 +1546,19 @@ def doctor(
 
 
 def _past(limit: str, gate: Gate) -> str:
-    """By how much something dropped that a gate does not let pass."""
+    """The message for a drop beyond the limit of a gate."""
     of_interval = ", by the upper end of the drop's interval" if gate is Gate.upper_end else ""
     return f"more than {limit} points{of_interval}"
 
 
 def _gate(failed: str | None) -> None:
-    """End with exit code 1 if a gate failed; `failed` says how, None that it passed."""
+    """End with exit code 1 if a gate failed; `failed` says how, and is None if it passed."""
     _say_gate(failed)
     _end_at_gate(failed)
 
 
 def _say_gate(failed: str | None) -> None:
-    """Say how a gate failed, if it did, in the process that speaks."""
+    """Print how a gate failed, if it did; only the first process prints."""
     if failed is not None and launch.rank() == 0:
         render.note(f"gate failed: {failed}")
 
@@ -1573,18 +1572,18 @@ def _end_at_gate(failed: str | None) -> None:
 def main() -> None:
     """The console script."""
     for name in ("stdout", "stderr"):
-        # One that was closed when the process began is None, to which nothing can be written.
+        # A stream that was closed at the start of the process is None and cannot be written.
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
         render.write_any_character(getattr(sys, name))
     render.name_errors(sys.stdout, render.STDOUT)
-    # A fault in a library, or in memory whose file was cut meanwhile, says where it happened. Other
-    # threads go on meanwhile, and to walk through their frames may be a fault of its own.
+    # Shows where a fault happened, in a library or in a memory-mapped file that was truncated.
+    # Without the other threads, which keep running: walking their frames could cause another fault.
     faulthandler.enable(all_threads=False)
     interrupts.leave_at_ctrl_c()
     try:
         app(prog_name="aegis")
-    except OSError as error:  # of a shell's completion, which begins no command
+    except OSError as error:  # from shell completion, which starts no command
         sys.exit(ended_by(error))
     finally:
         garbage.leave_at_end()

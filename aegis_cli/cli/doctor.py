@@ -1,4 +1,4 @@
-"""What this machine and this installation can do: `aegis doctor`."""
+"""`aegis doctor`: checks what this machine and this installation can do."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from aegis_cli.common.version import __version__
 DISTRIBUTION = "aegis-vla"
 OK, MISSING, FAILED = "ok", "missing", "failed"
 _LEAST_FREE_GB = 2.0  # a quickstart writes some hundred megabytes
-# A whole job in miniature: every stage once, for the method that needs the most of them.
+# A whole job in miniature: every stage once, for the method that needs the most stages.
 _SELF_TEST = (
     "methods=[aegis]",
     "demos.episodes=4",
     "anchor.samples=14",
     "train.steps=2",
-    "train.chunk=20",  # with as many executed: a rollout takes few predictions
+    "train.chunk=20",  # all 20 are executed, so a rollout needs few predictions
     "train.batch_size=4",
     "train.flow_samples=1",
     "train.warmup=1",
@@ -44,8 +44,8 @@ class Check:
     """One line of the report.
 
     Attributes:
-        state: "ok"; "missing" for an extra that is not installed; "failed" for what does not work.
-        fix: what to do about it; "" where nothing is to be done.
+        state: "ok", "missing" for an extra that is not installed, or "failed".
+        fix: what to do about it; "" if nothing.
     """
 
     name: str
@@ -56,21 +56,21 @@ class Check:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What was looked at, in the order of the table."""
+    """All checks, in the order of the table."""
 
     checks: list[Check]
 
     @property
     def failed(self) -> list[str]:
-        """Names of what does not work; a missing extra is no failure."""
+        """Names of failed checks; a missing extra is not a failure."""
         return [check.name for check in self.checks if check.state == FAILED]
 
 
 def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
-    """Look at the installation, the machine and the disk, and run a job in miniature.
+    """Check the installation, the machine and the disk, and run a job in miniature.
 
     Args:
-        self_test: with the job, which takes half a minute or more.
+        self_test: whether to run the job, which takes half a minute or more.
     """
     checks = [
         Check("aegis", OK, __version__),
@@ -82,7 +82,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
         *_extras(),
     ]
     if self_test:
-        # Without the extra there is nothing to try; the line above has said so.
+        # Without the extra there is nothing to try, as its own line says.
         if not any(_version(name) is None for name in _required("hf")):
             checks.append(_attempt("hugging face", _hugging_face, "pip install -U 'aegis-vla[hf]'"))
         checks.append(_attempt("self-test", lambda: _self_test(on_event), ""))
@@ -90,7 +90,7 @@ def run(self_test: bool = True, on_event: OnEvent = ignore) -> DoctorReport:
 
 
 def _attempt(name: str, look: Callable[[], str], fix: str) -> Check:
-    """What was found, or why it does not work; any failure is a finding here."""
+    """Run a check; any exception is a failed check here."""
     try:
         return Check(name, OK, look())
     except AegisError as error:
@@ -99,7 +99,7 @@ def _attempt(name: str, look: Callable[[], str], fix: str) -> Check:
         return Check(name, FAILED, f"{type(error).__name__}: {error}", fix)
 
 
-# --- what is installed ----------------------------------------------------------------------------
+# --- installation ---------------------------------------------------------------------------------
 
 
 def _packages() -> Iterator[Check]:
@@ -108,7 +108,7 @@ def _packages() -> Iterator[Check]:
         version = _version(name)
         if version is None:
             yield Check(name, FAILED, "not installed", f"pip install {name}")
-        elif name != "torch":  # it has a line of its own, with where it computes
+        elif name != "torch":  # torch has its own line, with the device
             yield Check(name, OK, version)
 
 
@@ -117,7 +117,7 @@ def _extras() -> Iterator[Check]:
     extras = importlib.metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
     for extra in extras:
         needed = _required(extra)
-        if extra in ("test", "docs", "lint") or not needed:  # for those who work on Aegis itself
+        if extra in ("test", "docs", "lint") or not needed:  # for developers of Aegis
             continue
         lacking = sorted(name for name in needed if _version(name) is None)
         if lacking:
@@ -129,7 +129,7 @@ def _extras() -> Iterator[Check]:
 
 
 def _required(extra: str | None) -> set[str]:
-    """Names of the packages that an extra brings; of None, those that are always needed."""
+    """Names of the packages of an extra; for None, those that are always needed."""
     found = set()
     for line in importlib.metadata.requires(DISTRIBUTION) or []:  # av>=15; extra == "lerobot"
         name = re.match(r"[A-Za-z0-9._-]+", line)
@@ -147,7 +147,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-# --- what the machine can do ----------------------------------------------------------------------
+# --- machine --------------------------------------------------------------------------------------
 
 
 def _torch() -> str:
@@ -181,7 +181,7 @@ def _disk(folder: Path) -> Check:
 def _hugging_face() -> str:
     """Let a small VLM of transformers' classes read a frame, learn from it, and answer.
 
-    Its releases change what a model's layers are called with.
+    Releases of transformers change the arguments of a model's layers.
     """
     import torch
 
@@ -200,7 +200,7 @@ def _hugging_face() -> str:
 
 
 def _self_test(on_event: OnEvent) -> str:
-    """Record, measure, train, probe and roll out, each as small as it can be."""
+    """Record, measure, train, probe and roll out, each as small as possible."""
     from aegis_cli import recipes
     from aegis_cli.recipes import shipped
     from aegis_cli.studies import pipeline

@@ -1,9 +1,9 @@
-"""How a command ends: errors become one message and an exit code, here and nowhere else.
+"""How a command ends. Only this module turns errors into a message and an exit code.
 
 Exit codes: 0 done, 1 a gate failed (`probe --max-drop`, `merge --max-drop`, `probe.max_drop` of
-`run` and `probe`, `train --dry-run` where memory or disk are too small, `doctor`), 2 a problem to
-act on, 3 a defect of Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads the
-output, 143 SIGTERM.
+`run` and `probe`, `train --dry-run` if memory or disk are too small, `doctor`), 2 a problem that
+the user can fix, 3 a defect of Aegis, with its traceback, 129 SIGHUP, 130 Ctrl-C, 141 nobody reads
+the output, 143 SIGTERM.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from aegis_cli.common.home import word_at_home
 from aegis_cli.recipes import Recipe
 from aegis_cli.recipes.decoding import below
 
-# What a command that goes on needs beside its own words; `run` skips what is up to date.
+# What is added to a command to resume it; `run` skips stages that are up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
-_KEEPS = {  # what others do not measure again, where the cache can be written
+_KEEPS = {  # what other commands do not measure again, if the cache can be written
     "probe": "answers so far are kept",
     "rollout": "groups of episodes are kept that were played to their end (of 64, or LIBERO's 10)",
 }
-# What pydantic calls a value of the wrong type, and what it is then.
+# pydantic's names for a value of the wrong type -> the words for the user.
 _NO_NUMBER = {
     "int_parsing": "no whole number",
     "int_from_float": "no whole number",
     "float_parsing": "no number",
 }
-GOES_ON = "aegis.goes_on"  # what finds the words by which a run goes on by itself, or None
+GOES_ON = "aegis.goes_on"  # key of a function that returns the words to resume a run, or None
 
 
 class Commands(TyperGroup):
-    """The commands, in the order of the pipeline, and what becomes of their errors."""
+    """The commands, in the order of the pipeline, and the handling of their errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         args = [word_at_home(word) for word in args]
         ctx.meta["aegis.args"] = list(
             args
-        )  # but for ~/, as they were typed; click takes its own list apart
+        )  # as typed, except for ~/; a copy, because click consumes its own list
         try:
             return super().parse_args(ctx, args)
-        except OSError as error:  # of --help, whose output may be a full disk
+        except OSError as error:  # from --help, whose output may go to a full disk
             raise typer.Exit(ended_by(error)) from None
         except Exception as error:
-            # A usage error of click's, or of the click that typer brings along.
+            # A usage error of click, or of the click that typer bundles.
             if hasattr(error, "show"):
                 raise typer.Exit(_misused(error)) from None
             raise
@@ -68,7 +68,7 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         found = super().resolve_command(ctx, args)
-        if not ctx.resilient_parsing:  # else a shell asks how a word goes on
+        if not ctx.resilient_parsing:  # set during shell completion
             _, command, rest = found
             _check_each_once(command, ctx, rest)
         return found
@@ -85,8 +85,8 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             _say(render.note, f"{_ended(number)}; {_what_now(ctx.meta)}")
-            raise typer.Exit(128 + number) from None  # as a shell says it of a signal
-        except (typer.Exit, typer.Abort):  # they have a code already, such as a failed gate's
+            raise typer.Exit(128 + number) from None  # a shell's exit code for a signal
+        except (typer.Exit, typer.Abort):  # these have an exit code, such as that of a failed gate
             raise
         except Exception as error:
             if hasattr(error, "show"):
@@ -94,26 +94,26 @@ class Commands(TyperGroup):
             if _is_out_of_memory(error):
                 _say(render.error, _too_large(error))
                 raise typer.Exit(2) from None
-            traceback.print_exc()  # Python's own exit code for it is that of a failed gate
+            traceback.print_exc()  # not re-raised: Python would exit with 1, the code of a gate
             raise typer.Exit(3) from None
 
 
 def _check_each_once(command: Any, ctx: Any, args: Sequence[str]) -> None:
-    """Raise AegisError for an option that is given twice and taken once.
+    """Raise AegisError if an option that takes a single value is given twice.
 
-    Click would take the last one and say nothing of the other.
+    Click would silently take the last one.
     """
     try:
         own = command.context_class(command, parent=ctx)
         _, _, order = command.make_parser(own).parse_args(list(args))
     except Exception as error:
-        if hasattr(error, "show"):  # a misused command line, which the command itself tells
+        if hasattr(error, "show"):  # a usage error, which the command itself will report
             return
         raise
     given = set[str]()
     for option in order:
         single = option.param_type_name == "option" and option.nargs == 1 and not option.multiple
-        if not single or getattr(option, "is_flag", False):  # a flag says the same twice
+        if not single or getattr(option, "is_flag", False):  # a flag twice means the same
             continue
         if option.name in given:
             name = max(option.opts, key=len)
@@ -122,9 +122,9 @@ def _check_each_once(command: Any, ctx: Any, args: Sequence[str]) -> None:
 
 
 def _misused(error: Any) -> int:
-    """Show click's own error, of a misused command line; the exit code.
+    """Show click's own error for a misused command line, and return the exit code.
 
-    Click would show it where nobody looks after a stderr that cannot be written.
+    Click itself would not handle a stderr that cannot be written.
     """
     _name_the_key(error)
     _name_the_value(error)
@@ -133,21 +133,22 @@ def _misused(error: Any) -> int:
 
 
 def _name_the_value(error: Any) -> None:
-    """Say of an option's value what it is: pydantic, by which typer reads it, leaves it out."""
+    """Add the value of an option to its error: pydantic, which typer uses, leaves it out."""
     problems = getattr(error.__cause__, "errors", None)
     if problems is None:
         return
     first = problems()[0]
-    if first["type"] == "value_error":  # typer's own words of a choice, which name the value
+    if first["type"] == "value_error":  # typer's own message for a choice, which has the value
         error.message = error.message.removeprefix("Value error, ")
     elif first["type"] in _NO_NUMBER:
         error.message = f"{first['input']!r} is {_NO_NUMBER[first['type']]}."
 
 
 def _name_the_key(error: Any) -> None:
-    """Tell how a key of recipes is set that was given as an option of its own.
+    """Suggest `--set` for a recipe key that was given as an option.
 
-    So other training programs take theirs, as in `--batch_size=8`, or by names of their own.
+    Other training programs take their settings like this, as in `--batch_size=8`, or under other
+    names.
     """
     option, context = getattr(error, "option_name", None), error.ctx
     if option is None or context is None:
@@ -162,7 +163,7 @@ def _name_the_key(error: Any) -> None:
 
 
 def _keys_for(name: str) -> Sequence[str]:
-    """The keys of a policy's recipe that an option of this name would set, here or elsewhere."""
+    """The keys of a policy's recipe for an option of this name, here or in other programs."""
     if name in {field.name for field in dataclasses.fields(Recipe)}:
         return (name,)
     last = name.rpartition(".")[2]
@@ -173,8 +174,8 @@ def _keys_for(name: str) -> Sequence[str]:
 
 
 def ended_by(error: OSError) -> int:
-    """Tell what the system would not do; the exit code."""
-    if error.errno == errno.EPIPE:  # as after `| head`: whoever read has what he wanted
+    """Report an error of the operating system, and return the exit code."""
+    if error.errno == errno.EPIPE:  # as with `| head`, where the reader has stopped reading
         _close_output()
         return 128 + signal.SIGPIPE
     _say(render.error, _too_large(error) if error.errno == errno.ENOMEM else _refused(error))
@@ -183,9 +184,9 @@ def ended_by(error: OSError) -> int:
 
 
 def _close_output() -> None:
-    """Let what cannot be written go nowhere: nobody reads it any more, or the disk is full.
+    """Discard output that cannot be written, as nobody reads it any more or the disk is full.
 
-    At its end Python would complain of what it cannot write, and change the exit code.
+    Otherwise Python would report it at exit and change the exit code.
     """
     for stream in (sys.__stdout__, sys.__stderr__):
         if stream is None:
@@ -194,41 +195,41 @@ def _close_output() -> None:
             try:
                 stream.flush()
             except OSError:
-                # The descriptor is exchanged, since the stream still holds what it could not write.
+                # Redirected, since the stream still holds the output that it could not write.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-# What is wrong with all processes the first one says, at once. When it ends, torchrun ends the
-# others, so that one that is still there after this time has a problem of its own. Who has only
-# lost another process leaves it still more time.
+# The first process reports problems of all processes at once. When it ends, torchrun ends the
+# others, so a process that still runs after this time has a problem of its own. A process that has
+# only lost another one waits longer.
 _OWN_S, _LOST_S = 10.0, 20.0
 
 
 def _say(show: Callable[[Any], None], what: Any) -> None:
-    """Tell the user, whose terminal may be gone; the exit code says it all the same."""
+    """Show a message to the user, whose terminal may be gone; the exit code remains."""
     if isinstance(what, PeerLost):
         time.sleep(_LOST_S)
     elif launch.rank() > 0:
-        if show is render.note:  # a signal reaches all, and the first one says so
+        if show is render.note:  # a signal reaches all processes, and the first one reports it
             return
         time.sleep(_OWN_S)
-    with contextlib.suppress(OSError, ValueError):  # a ValueError is of a file that was closed
+    with contextlib.suppress(OSError, ValueError):  # ValueError: the file is closed
         show(what)
         return
     _close_output()
 
 
-# How torch and the C library say on the CPU, in a RuntimeError, that memory is wanting; and how the
-# linker does, in an ImportError. It says more of a library that is not for this machine, or on a
-# disk from which nothing may be run.
+# Messages of torch and the C library (RuntimeError) and of the linker (ImportError) for too little
+# memory. The linker's message is longer for a library that is not for this machine, or on a disk
+# without permission to execute.
 _WANTING = ("DefaultCPUAllocator", "Cannot allocate memory", "std::bad_alloc", "new thread")
 _UNMAPPED = ("failed to map segment from shared object", "cannot allocate memory")
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Whether memory was wanting, a GPU's too.
+    """Whether there was too little memory, including that of a GPU.
 
-    torch's class for that is known by its name, for importing torch takes seconds.
+    torch's exception is recognized by its name, because importing torch takes seconds.
     """
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
@@ -247,11 +248,11 @@ def _too_large(error: Exception) -> AegisError:
 
 
 def _refused(error: OSError) -> AegisError:
-    """The error for what the system would not do, where no stage expected it.
+    """The AegisError for an error of the operating system that no stage expected.
 
-    Examples are a name too long, or a folder that may not be looked into.
+    Examples are a file name that is too long, or a folder without read permission.
     """
-    if error.filename == render.STDOUT:  # as `render.name_errors` has it
+    if error.filename == render.STDOUT:  # set by `render.name_errors`
         return AegisError(
             f"{render.STDOUT} cannot be written: {error.strerror}",
             "an output that takes what the command says",
@@ -263,14 +264,14 @@ def _refused(error: OSError) -> AegisError:
 
 
 def _ended(number: int) -> str:
-    """By what a command was ended."""
+    """How a command was ended, in words."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
 def _what_now(meta: Mapping[str, Any]) -> str:
-    """What a command has left that was ended, and how its work goes on, or begins again."""
+    """What an interrupted command has left, and the command to resume it or start again."""
     args = meta["aegis.args"]
-    if args[0] == "serve":  # Ctrl-C is its usual end
+    if args[0] == "serve":  # it usually ends by Ctrl-C
         return "the server is closed"
     flag = _WITH_RESUME.get(args[0])
     if flag is None or "--dry-run" in args:
@@ -281,7 +282,7 @@ def _what_now(meta: Mapping[str, Any]) -> str:
     alone = _alone(meta.get(GOES_ON))
     if alone is not None:
         return f"resume with: {_program()} {shlex.join(alone)}"
-    args = [word for word in args if word != "--overwrite"]  # which would begin anew once more
+    args = [word for word in args if word != "--overwrite"]  # which would start again
     command = f"{_program()} {shlex.join(args)}"
     if flag.strip() not in args:
         command += flag
@@ -289,17 +290,17 @@ def _what_now(meta: Mapping[str, Any]) -> str:
 
 
 def _alone(goes_on: Callable[[], list[str] | None] | None) -> list[str] | None:
-    """The words by which a run goes on by what its folder says; None where it does not say all."""
+    """The words to resume a run from its folder alone; None if the folder does not suffice."""
     if goes_on is None:
         return None
     try:
         return goes_on()
-    except AegisError:  # what lies in the folder is not this run; the same command will say so
+    except AegisError:  # the folder holds another run; the same command will report it
         return None
 
 
 def _program() -> str:
-    """How the command was started: alone, or as several processes of one or more machines."""
+    """How the command was started: alone, or as several processes on one or more machines."""
     if launch.world_size() == 1:
         return "aegis"
     here = launch.local_world_size()

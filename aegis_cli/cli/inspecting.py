@@ -1,4 +1,4 @@
-"""What `aegis inspect` shows of each thing that it is given."""
+"""`aegis inspect`: what it shows for each kind of path."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Recipe, describe, load, shipped, study_cells
 from aegis_cli.recipes.strict_yaml import dump
 
-# What `aegis run` leaves in a study's folder; the modules that write it need torch.
+# Files of `aegis run` in a study's folder; the modules that write them need torch.
 _TABLE, _CELLS = "table.json", "cells.json"
 _RECIPES = (".yaml", ".yml")
-_LISTED = 3  # files that a note names
+_LISTED = 3  # maximum number of files that a note names
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ def show(
     wide: bool = False,
     verify: bool = False,
 ) -> None:
-    """Tell by a path's files what it is, and show that.
+    """Find out from a path's files what it is, and show it.
 
     Args:
         tensors: list each tensor of a file.
         wide: let a table's lines be wider than the terminal.
-        verify: read every artifact there whole before, or decode every image of questions.
+        verify: first read every artifact completely, or decode every image of questions.
     """
-    # Before anything is shown: of a damaged file nothing else is told.
+    # First of all, because nothing else is shown for a damaged file.
     verified = _verified(path) if verify else None
     if path.suffix in _RECIPES and path.is_file():
         _recipe(path, plot, as_json)
-    elif path.name.endswith(_CELLS) and path.is_file():  # NAME.cells.json too, as those that ship
+    elif path.name.endswith(_CELLS) and path.is_file():  # also NAME.cells.json, as shipped
         _cells(path, plot, as_json, wide)
     elif (path / _TABLE).is_file() or (path / _CELLS).is_file():
         _table(path, plot, as_json, wide)
@@ -61,7 +61,7 @@ def show(
 
 @dataclass(frozen=True)
 class VerifiedReport:
-    """A folder that only holds what Aegis wrote: how many files agree with their digests."""
+    """A folder without a report of its own: how many of its files agree with their digests."""
 
     kind: str
     path: str
@@ -70,16 +70,16 @@ class VerifiedReport:
 
 
 def _verified(path: Path) -> VerifiedReport | None:
-    """Read the artifacts at a path whole, and say how many have a digest; None of questions.
+    """Read the artifacts at a path completely, and count those with a digest; None for questions.
 
-    What is found may be all that there is to say of a folder.
+    The result may be all that can be reported about a folder.
 
     Raises:
-        AegisError: one is damaged, or there is none.
+        AegisError: an artifact is damaged, or there is none.
     """
     from aegis_cli import inspection
 
-    if inspection.is_questions(path):  # whose images are decoded as they are counted
+    if inspection.is_questions(path):  # their images are decoded when they are counted
         return None
     found = inspection.verify(path)
     bare = [str(file) for file, has_digest in found.items() if not has_digest]
@@ -95,7 +95,7 @@ def _verified(path: Path) -> VerifiedReport | None:
 
 
 def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
-    """The recipe as YAML that can be read again."""
+    """Show the recipe as YAML that can be read again."""
     if plot is not None:
         found = f"--plot with the recipe '{path}'"
         raise AegisError(found, "a run, a study or a dataset", "leave out --plot")
@@ -108,7 +108,7 @@ def _recipe(path: Path, plot: Path | None, as_json: bool) -> None:
 
 
 def _cells(path: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
-    """The tables of a study's finished cells, by the recipe of the same name."""
+    """Show the tables of a study's finished cells, with the recipe of the same name."""
     from aegis_cli.studies import study
 
     resolved = study_cells.load(_recipe_of(path))
@@ -119,8 +119,8 @@ def _cells(path: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
 
 
 def _recipe_of(cells: Path) -> Path:
-    """The study's recipe: beside its cells, in the folder above them, or one that ships."""
-    if cells.name == _CELLS:  # a study's own, whose folder has its recipe and its table
+    """The study's recipe: beside its cells, in the parent folder, or a shipped one."""
+    if cells.name == _CELLS:  # in a study's own folder, which has its recipe and its table
         raise AegisError(
             f"'{cells}', which does not say of which study it is",
             "a study's folder, or NAME.cells.json with its recipe NAME.yaml beside it",
@@ -134,14 +134,14 @@ def _recipe_of(cells: Path) -> Path:
 
 
 def _table(folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
-    """The table of a run or study as far as it is finished."""
+    """Show the table of a job or study as far as it is finished."""
     from aegis_cli.studies import table
 
     _study(table.load(folder), folder, plot, as_json, wide)
 
 
 def _study(report: Any, folder: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
-    """A table of `aegis run`, and a study's frontier."""
+    """Show a table of `aegis run`, and draw a study's frontier."""
     from aegis_cli.studies.comparison import (
         RobotStreamStudyReport,
         StreamStudyReport,
@@ -173,14 +173,14 @@ def _anything(
     verify: bool,
     verified: VerifiedReport | None,
 ) -> None:
-    """An artifact, a run, a model or a dataset, or a folder whose files were verified."""
+    """Show an artifact, a run, a model or a dataset, or a folder whose files were verified."""
     from aegis_cli import inspection
 
     try:
         with render.progress() as on_event:
             report = inspection.run(path, on_event, images=verify)
     except inspection.UnknownFolder:
-        if verified is None or plot is not None:  # a folder of files has nothing to draw
+        if verified is None or plot is not None:  # for a folder of files there is no plot
             raise
         render.show(verified, render.facts, as_json)
         return
@@ -190,7 +190,7 @@ def _anything(
 
 
 def _view(report: Any, tensors: bool) -> Callable[[Any], RenderableType]:
-    """What shows a report of its kind."""
+    """The view for a report of this kind."""
     from aegis_cli import inspection
 
     if isinstance(report, inspection.StreamInspection):
@@ -201,7 +201,7 @@ def _view(report: Any, tensors: bool) -> Callable[[Any], RenderableType]:
 
 
 def _draw(report: Any, path: Path, plot: Path) -> None:
-    """A stream's routing, a dataset's frames, questions with their images, or a run's course."""
+    """Draw a stream's routing, a dataset's frames, questions with images, or a run's course."""
     from aegis_cli import inspection
 
     if isinstance(report, inspection.StreamInspection):
@@ -214,7 +214,7 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
         from aegis_cli.data.lerobot import dataset, download, summary
 
         home = path
-        if not path.exists():  # an id on the hub; the files of the frames shown are fetched alone
+        if not path.exists():  # an id on the hub; only the files of the shown frames are fetched
             found = dataset.load(download.meta(str(path)))
             shown = summary.on_sheet(found)
             home = download.fetch(str(path), found, found.info.cameras, shown)

@@ -1,4 +1,4 @@
-"""Arguments that several commands take, and what their values may be."""
+"""Arguments that several commands take, and their allowed values."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from aegis_cli.data.renaming import Renaming
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.keys import MADE, SEED, WITH_PLACE
 
-# Each of these is what an option may say. Typer makes a list of choices of an enumeration, and
-# checks it. A stage is given the value as text.
+# Each of these lists the choices of an option. Typer takes the choices from an enumeration and
+# checks them. A stage gets the value as text.
 
 
 class Format(StrEnum):
@@ -60,26 +60,26 @@ class Colors(StrEnum):
     all = "all"
 
 
-# --- what values may be ---------------------------------------------------------------------------
-# click calls these with the value that was given, or else with the option's default.
+# --- allowed values -------------------------------------------------------------------------------
+# click calls these with the given value, or with the option's default.
 
 
 def positive(param: typer.CallbackParam, value: int | None) -> int | None:
-    """A whole number, 1 or more; None where the option was not given."""
+    """A whole number, 1 or more; None if the option was not given."""
     if value is not None and value < 1:
         raise _refused(param, f"{value}", "a whole number, 1 or more", param.default or 9)
     return value
 
 
 def made(param: typer.CallbackParam, value: int | None) -> int | None:
-    """How many times Aegis is to do a thing; None where the option was not given."""
+    """How many items Aegis should make; None if the option was not given."""
     if value is not None and not MADE.accepts(value):
         raise _refused(param, f"{value}", f"a whole number {MADE.expected}", param.default or 9)
     return value
 
 
 def not_negative(param: typer.CallbackParam, value: float | None) -> float | None:
-    """A number, 0 or more; None where the option was not given."""
+    """A number, 0 or more; None if the option was not given."""
     if value is not None and not 0 <= value < math.inf:  # NaN fails both
         raise _refused(param, f"{value:g}", "a number, 0 or more", param.default or 0)
     return value
@@ -93,14 +93,14 @@ def above_zero(param: typer.CallbackParam, value: float) -> float:
 
 
 def seed_number(param: typer.CallbackParam, value: int | None) -> int | None:
-    """A seed that NumPy takes; None where the option was not given."""
+    """A seed that NumPy accepts; None if the option was not given."""
     if value is not None and not SEED.accepts(value):
         raise _refused(param, f"{value}", f"a whole number {SEED.expected}", param.default or 0)
     return value
 
 
 def below_one(param: typer.CallbackParam, value: float | None) -> float | None:
-    """A number, 0 or more and below 1; None where the option was not given."""
+    """A number, 0 or more and below 1; None if the option was not given."""
     if value is not None and not 0 <= value < 1:  # NaN fails both
         raise _refused(param, f"{value:g}", "a number, 0 or more and below 1", 0.25)
     return value
@@ -114,11 +114,11 @@ def share_or_one(param: typer.CallbackParam, value: float) -> float:
 
 
 def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
-    """Numbers, 0 or more, with commas between them; None where the option was not given."""
+    """Numbers, 0 or more, separated by commas; None if the option was not given."""
     if value is not None:
         try:
             fine = all(0 <= number < math.inf for number in numbers(value))
-        except ValueError:  # a word that is no number
+        except ValueError:  # a word that is not a number
             fine = False
         if not fine:
             raise _refused(param, value, "numbers, 0 or more, with commas between", "1,10,100")
@@ -126,7 +126,7 @@ def strengths(param: typer.CallbackParam, value: str | None) -> str | None:
 
 
 def with_place(param: typer.CallbackParam, value: str | None) -> str | None:
-    """A text with one {}; None where the option was not given."""
+    """A text with one {}; None if the option was not given."""
     if value is not None and not WITH_PLACE.accepts(value):
         example = "'{} Answer with a single word or phrase.'"
         raise _refused(param, f"'{value}'", WITH_PLACE.expected, example)
@@ -134,9 +134,9 @@ def with_place(param: typer.CallbackParam, value: str | None) -> str | None:
 
 
 def demonstrations_path(text: str) -> Path:
-    """A path or a hub id; `./a/b` has to be there, for as a Path it would look like an id."""
+    """A path or a hub id; `./a/b` must exist, because as a Path it would look like an id."""
     path = Path(text)
-    # pathlib drops the `./`, by which a user says that the hub is not meant.
+    # pathlib drops the `./`, with which a user excludes the hub.
     if hub.is_id(text) or not hub.is_id(str(path)):
         return path
     from aegis_cli.data import demonstrations
@@ -152,7 +152,7 @@ def port_number(param: typer.CallbackParam, value: int) -> int:
 
 
 def episode_numbers(param: typer.CallbackParam, value: str | None) -> str | None:
-    """Numbers from 0 and ranges of them, with commas between; None where it was not given."""
+    """Numbers from 0 and ranges, separated by commas; None if the option was not given."""
     if value is not None:
         try:
             fine = bool(listed_episodes(value))
@@ -169,13 +169,13 @@ def listed_episodes(listed: str | None) -> list[int] | None:
     """The numbers of a list such as `0,4,7-9`; None for None.
 
     Raises:
-        ValueError: something else, a range that runs backwards or one of a million numbers.
+        ValueError: anything else, a range that runs backwards, or one of a million numbers.
     """
     return None if listed is None else episodes.listed(listed)
 
 
 def renamed(param: typer.CallbackParam, value: list[str] | None) -> list[str] | None:
-    """Pairs NAME=NAME, each name given once; None where the option was not given."""
+    """Pairs NAME=NAME, each name once; None if the option was not given."""
     pairs = renaming(value)
     named = [old for old, _ in pairs]
     for written, (old, new) in zip(value or (), pairs, strict=True):
@@ -189,18 +189,18 @@ def renamed(param: typer.CallbackParam, value: list[str] | None) -> list[str] | 
 
 
 def renaming(pairs: list[str] | None) -> Renaming:
-    """Pairs OLD=NEW as the stages take them; whether they are any good, `renamed` says."""
+    """Pairs OLD=NEW as the stages take them; `renamed` has checked them."""
     parts = (pair.partition("=") for pair in pairs or ())
     return tuple((old.strip(), new.strip()) for old, _, new in parts)
 
 
 def names(listed: str | None) -> list[str]:
-    """The names of a list with commas; none of None."""
+    """The names in a list with commas; empty for None."""
     return [] if listed is None else [part.strip() for part in listed.split(",")]
 
 
 def numbers(listed: str | None) -> list[float]:
-    """The numbers of a list with commas; none of None."""
+    """The numbers in a list with commas; empty for None."""
     return [] if listed is None else [float(part) for part in listed.split(",")]
 
 
@@ -213,7 +213,7 @@ def given(ctx: typer.Context) -> list[str]:
     """The options on the command line, not those at their defaults."""
     found = []
     for param in ctx.command.params:
-        # By name: the source is of a class of click's, or of the click that typer brings along.
+        # Compared by name, since the enumeration is click's or that of the click typer bundles.
         source = getattr(ctx.get_parameter_source(param.name), "name", "")
         if param.param_type_name == "option" and source == "COMMANDLINE":
             found.append(param.opts[0])
@@ -221,11 +221,11 @@ def given(ctx: typer.Context) -> list[str]:
 
 
 def recipe_file(value: Path) -> Path:
-    """The file of a recipe that is given by its path, or by the name of one that ships."""
+    """The file of a recipe, given by its path or by the name of a shipped recipe."""
     return shipped.find(value)
 
 
-# --- what several commands take -------------------------------------------------------------------
+# --- shared options -------------------------------------------------------------------------------
 
 RecipeArg = Annotated[
     Path,
@@ -332,7 +332,7 @@ Device = Annotated[
     Option(
         "--device",
         metavar="DEVICE",
-        envvar="AEGIS_DEVICE",  # so that a device that is not there is refused before any work
+        envvar="AEGIS_DEVICE",  # read here, so that a missing device is refused before any work
         show_envvar=False,
         help="Where to compute: cpu, cuda, cuda:N or auto; default: AEGIS_DEVICE, else a GPU if "
         "there is one.",

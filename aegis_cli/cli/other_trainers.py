@@ -1,6 +1,6 @@
-"""Options of LeRobot's training and of transformers' Trainer, by the keys of recipes for the same.
+"""Options of LeRobot's training and of transformers' Trainer, with the equivalent recipe keys.
 
-docs/lerobot.md has them as a table, and what no key does.
+docs/lerobot.md has them as a table, with the options that no key replaces.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 _RATES = ("train.backbone_lr", "train.expert_lr")
 _WATCHED = ("rollout.while_training", "train.validate_every")
-# what an option is called there, without its dashes -> keys here
+# name of an option there, without its dashes -> keys here
 KEYS: Mapping[str, tuple[str, ...]] = {
-    # LeRobot's
+    # LeRobot
     "dataset.repo_id": ("demos.path",),
     "dataset.root": ("demos.path",),
     "dataset.episodes": ("demos.only",),
@@ -42,7 +42,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "env_eval_freq": _WATCHED,
     "eval_freq": _WATCHED,
     "eval.n_episodes": ("rollout.while_training",),
-    # the Trainer's
+    # the Trainer
     "per_device_train_batch_size": ("train.batch_size",),
     "gradient_accumulation_steps": ("train.accumulate",),
     "max_steps": ("train.steps",),
@@ -60,6 +60,6 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "report_to": ("train.track",),
     "bf16": ("train.precision",),
     "optim": ("train.optimizer", "train.states"),
-    # anybody's
+    # common names
     "lr": _RATES,
 }

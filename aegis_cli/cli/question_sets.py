@@ -1,4 +1,4 @@
-"""What a command asks a model, and how, where the command line does not say."""
+"""The questions that a command asks, and how, if the command line does not say."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def chosen(
     questions: int | None = None,
     seed: int | None = None,
 ) -> Probe:
-    """Which questions are asked, and how; a run's own recipe decides what is None here.
+    """The questions and how they are asked; a run's own recipe replaces arguments that are None.
 
     Args:
         model: a run, one of its checkpoints, or a backbone.
-        vqa: the question set; of a recipe that names several, the first is asked. The recipe's
-            limit of the drop is one of its own sets.
-        skip_bad: the recipe may ask for it too, of its own set.
+        vqa: the question set; the default is the recipe's first set. The recipe's limit on the drop
+            applies only to its own sets.
+        skip_bad: the recipe's setting also applies, but only to its own set.
     """
     named = _of_run(model, asks=vqa is None)
     own = named[0]
     of_recipe = vqa is None or vqa in [each.vqa for each in named]
     return dataclasses.replace(
         own,
-        # How much of other questions may be lost, the recipe does not say.
+        # The recipe sets no limit on the drop for other questions.
         max_drop=own.max_drop if of_recipe else None,
         vqa=own.vqa if vqa is None else vqa,
         ask=own.ask if ask is None else ask,
@@ -45,10 +45,10 @@ def chosen(
 
 
 def baseline(model: str, anchor: Path | None = None) -> str | None:
-    """What a drop of a run is measured against where nothing else is said.
+    """The default baseline for the drop of a run.
 
-    It is the pre-trained VLM that the run began from, if need be by way of other runs, or the one
-    of these that the anchor was measured on. None of a model without a run.
+    It is the pre-trained VLM from which the run started, possibly through other runs, or the one
+    among these models that the anchor was measured on. None for a model without a run.
     """
     from aegis_cli.common import artifacts
     from aegis_cli.evaluation import results
@@ -60,9 +60,9 @@ def baseline(model: str, anchor: Path | None = None) -> str | None:
     if anchor is not None:
         measured = artifacts.read_header(anchor, "anchor").fingerprint
         known = [number for number, origin in enumerate(origins) if origin.digest == measured]
-        # A drift is one from the model of the anchor, and so the drop is one from it, too.
+        # The drift is measured from the anchor's model, so the drop is too.
         origins = origins[: known[0] + 1] if known else origins
-    *between, began_from = [origin.name for origin in origins]  # the nearest first
+    *between, began_from = [origin.name for origin in origins]  # nearest first
     resuming.check_seen(run, [began_from], "probe")
     if launch.rank() == 0:
         by_way = f" by way of {', '.join(between)}" if between else ""
@@ -71,10 +71,10 @@ def baseline(model: str, anchor: Path | None = None) -> str | None:
 
 
 def _of_run(model: str, asks: bool) -> tuple[Probe, ...]:
-    """The `probe` of a run's recipe, of each set; the defaults for a model without a run.
+    """The `probe` of a run's recipe for each set; the defaults for a model without a run.
 
     Args:
-        asks: whether the first of these is what is asked.
+        asks: whether the first of these is used.
     """
     from aegis_cli.evaluation import results
 

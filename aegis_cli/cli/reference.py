@@ -1,8 +1,8 @@
-"""The two pages of docs/ that are written from the code: recipes.md and cli.md.
+"""Generates two pages of docs/ from the code: recipes.md and cli.md.
 
-`python -m aegis_cli.cli.reference docs` writes both; a test holds them to what is committed. They
-are made from the declarations of keys and options, never from formatted help, so that they depend
-on no terminal and no version of a library.
+`python -m aegis_cli.cli.reference docs` writes both; a test compares them with the committed pages.
+They are made from the declarations of keys and options, not from formatted help, so they do not
+depend on a terminal or on the version of a library.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def recipes_page() -> str:
         for name, kind in KINDS.items()
     ]
     lines += [*_table(("`kind`", "Commands", "What it does"), rows), "", _without_kind()]
-    described: dict[type, str] = {}  # section -> the heading under which it stands
+    described: dict[type, str] = {}  # section -> the heading of its description
     for name, kind in KINDS.items():
         lines += ["", f"## {name}", "", _said(kind.recipe), ""]
         lines += _keys(
@@ -81,7 +81,7 @@ def recipes_page() -> str:
         )
         for dotted, section in _sections(kind.recipe):
             lines += ["", f"### {name}: {dotted}", "", _said(section), ""]
-            if section in described:  # such as `probe`, which several kinds have
+            if section in described:  # such as `probe`, which occurs in several kinds
                 first = described[section]
                 lines.append(f"The keys are those of [{first}](#{_anchor(first)}).")
             else:
@@ -91,7 +91,7 @@ def recipes_page() -> str:
 
 
 def _without_kind() -> str:
-    """What a file is that does not say it."""
+    """The kind of a file that does not name one, in words."""
     cases = [f"`{name}` makes it `{name_of(kind)}`" for name, kind in TELLING.items()]
     return (
         "A file without the line `kind: ...` is told by the first of these keys that it has: "
@@ -101,7 +101,7 @@ def _without_kind() -> str:
 
 
 def _sections(recipe: type) -> Iterator[tuple[str, type]]:
-    """The sections of a recipe by name; of a mapping of sections, `variants.NAME`."""
+    """The sections of a recipe by name; `variants.NAME` for a mapping of sections."""
     for name, hint in get_type_hints(recipe).items():
         kind = base_type(hint)
         if dataclasses.is_dataclass(kind):
@@ -117,16 +117,16 @@ def _keys(section: type, lead: Sequence[tuple[str, ...]] = ()) -> list[str]:
     for field in dataclasses.fields(section):
         hint = hints[field.name]
         if dataclasses.is_dataclass(base_type(hint)) or is_retired(field):
-            continue  # a section has a heading of its own, and a retired key no effect
+            continue  # sections have their own headings, and retired keys have no effect
         takes = _takes(hint, field.metadata["check"])
         rows.append((f"`{field.name}`", takes, _default(field), field.metadata["doc"]))
     return _table(("Key", "Takes", "Default", "Meaning"), rows)
 
 
 def _takes(hint: Any, check: Check | None) -> str:
-    """A key's type and which values of it: `whole number, above 0, or null`."""
+    """A key's type and allowed values: `whole number, above 0, or null`."""
     words = _TYPES.get(hint) or _TYPES[base_type(hint)]
-    # That a text is not empty goes without saying, and so does that one of some words is a text.
+    # "not empty" is obvious for a text, and so is the type "text" for a choice of words.
     limits = [check.expected] if check and check not in (NOT_EMPTY, NOT_EMPTY_EACH) else []
     known = [] if words == "text" and check and check.choices else [words]
     return ", ".join(known + limits + (["or null"] if is_optional(hint) else []))
@@ -169,7 +169,7 @@ def _option(command: Any, param: Any) -> tuple[str, str, str]:
 
 
 def _spelled(command: Any, param: Any) -> str:
-    """An argument's word, or an option with what stands for its value: `--out FOLDER`."""
+    """An argument's word, or an option with a placeholder for its value: `--out FOLDER`."""
     if _is_argument(param):
         return param.metavar
     hint = base_type(get_type_hints(command.callback)[param.name])
@@ -184,15 +184,15 @@ def _is_argument(param: Any) -> bool:
 
 
 def _prose(command: Any) -> list[str]:
-    """A command's help as Markdown: what click would not wrap becomes a block of its own."""
+    """A command's help as Markdown: paragraphs that click does not wrap become separate blocks."""
     lines: list[str] = []
     for paragraph in inspect.cleandoc(command.help).split("\n\n"):
         head, *kept = paragraph.split("\n")
-        if head.strip() != "\b":  # click's mark of a paragraph that it does not wrap
+        if head.strip() != "\b":  # click's mark for a paragraph that it does not wrap
             lines += ["", " ".join([head, *(line.strip() for line in kept)])]
             continue
         notes = [" ".join(line.split()) for line in kept if _is_note(line)]
-        # `Example: aegis ...` without its first word; what goes on below it has none.
+        # `Example: aegis ...` without its first word; continuation lines have none.
         code = [line.partition(": ")[2] or line for line in kept if not _is_note(line)]
         lines += ["", *(notes if len(notes) == 1 else [f"- {note}" for note in notes])]
         if code:
@@ -201,7 +201,7 @@ def _prose(command: Any) -> list[str]:
 
 
 def _is_note(line: str) -> bool:
-    """Whether a line is text, not an example or what goes on below one."""
+    """Whether a line is text, not an example or its continuation."""
     return not line.startswith(("Example:", "Start with:", " "))
 
 
@@ -211,7 +211,7 @@ def _said(section: type) -> str:
 
 
 def _anchor(heading: str) -> str:
-    """What Markdown makes of a heading as the target of a link."""
+    """The link target that Markdown makes from a heading."""
     kept = "".join(c for c in heading.lower() if c.isalnum() or c in " -_")
     return kept.replace(" ", "-")
 
@@ -223,7 +223,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    """A text that neither ends its cell nor begins an element of HTML."""
+    """A text escaped so that it neither ends its cell nor starts an HTML element."""
     return text.replace("|", r"\|").replace("<", "&lt;")
 
 

@@ -1,4 +1,4 @@
-"""`aegis train RUN`: a run that goes on by what its own folder says, and the command for it."""
+"""`aegis train RUN`: resumes a run from its own folder, and finds the command for that."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ RECIPE = "recipe.yaml"
 
 
 def recipe_of(run: Path, out: Path | None) -> Path:
-    """The recipe that a run was begun with.
+    """The recipe that a run was started with.
 
     Raises:
-        AegisError: no run, or an `out` beside it, for a run goes on in its own folder.
+        AegisError: there is no run, or `out` is given, although a run resumes in its own folder.
     """
     if not (run / RECIPE).is_file():
         raise AegisError(
@@ -37,11 +37,11 @@ def recipe_of(run: Path, out: Path | None) -> Path:
 
 
 def _instead(folder: Path) -> str:
-    """What may have been meant by a folder that is no run."""
+    """A suggestion for a folder that is not a run."""
     from aegis_cli.training import checkpoint
 
     home = checkpoint.run_of(folder) if checkpoint.is_one(folder) else None
-    if home is not None:  # a policy that was exported has no run
+    if home is not None:  # an exported policy has no run
         return f"give the run of this checkpoint: {commands.aegis('train', home)}"
     inner = sorted(path.parent for path in folder.glob(f"*/{RECIPE}"))
     if inner:
@@ -55,18 +55,18 @@ def _instead(folder: Path) -> str:
 def inputs_of(
     run: Path, recipe: Recipe, demos: Sequence[Path], anchor: Path | None
 ) -> tuple[list[Path], Path | None]:
-    """The demonstrations and the anchor that a run goes on with: those given, else its own.
+    """The demonstrations and the anchor to resume a run with: those given, or its own.
 
-    Where a run has not written its demonstrations down, the recipe may name them: then none here.
+    If the run has not recorded its demonstrations but the recipe names them, the list is empty.
 
     Raises:
-        AegisError: they are not where they were, an earlier version has not written it down, or
+        AegisError: they are no longer where they were, an earlier version has not recorded them, or
             the run was merged.
     """
     from aegis_cli.training import checkpoint, inputs
 
     if checkpoint.begun(run):
-        checkpoint.kept_state(run)  # of a merged run there is none, which raises
+        checkpoint.kept_state(run)  # raises for a merged run, which has no state
     kept = inputs.of(run)
     if kept is None:  # a run of an earlier version
         if not demos and recipe.demos.path is None:
@@ -74,7 +74,7 @@ def inputs_of(
         return list(demos), anchor or _no_anchor(run)
     if not demos:
         demos = _all_there(run, kept.demos)
-    elif len(demos) != len(kept.demos):  # by its place in the list, one stands for one of these
+    elif len(demos) != len(kept.demos):  # they are matched by their position in the list
         raise AegisError(
             f"{len(demos)} of --demos for the run in '{run}', which began with {len(kept.demos)}",
             f"each of its sets, in their order: {', '.join(kept.demos)}",
@@ -87,14 +87,14 @@ def inputs_of(
 
 
 def check_here(run: Path, recipe: Recipe) -> None:
-    """Raise AegisError if the recipe's paths are seen from another folder, the run's first one."""
+    """Raise AegisError if the recipe's paths exist only relative to the folder of the start."""
     sets = recipe.probe.of_each_set() if recipe.probe.while_training else ()
     named = [recipe.backbone, recipe.expert.start, *(each.vqa for each in sets)]
     check_seen(run, [name for name in named if isinstance(name, str)], "train")
 
 
 def check_seen(run: Path, names: Iterable[str], command: str) -> None:
-    """Raise AegisError if one that a run's recipe names lies where the run was begun, not here."""
+    """Raise AegisError if one of these paths exists where the run was started, but not here."""
     from aegis_cli.training import inputs
 
     began = inputs.began_in(run)
@@ -109,10 +109,10 @@ def check_seen(run: Path, names: Iterable[str], command: str) -> None:
 
 
 def demonstrations_of(run: Path) -> Path:
-    """The demonstrations that a run learned from, for `aegis evaluate` that is given none.
+    """The demonstrations that a run learned from, for `aegis evaluate` without --demos.
 
     Raises:
-        AegisError: no policy; or they are not known, are no longer there, or are several sets.
+        AegisError: there is no policy, or its demonstrations are unknown, gone, or several sets.
     """
     from aegis_cli.evaluation import open_loop, results
     from aegis_cli.training import inputs
@@ -120,7 +120,7 @@ def demonstrations_of(run: Path) -> Path:
     home = results.run_of(run)
     kept = None if home is None else inputs.of(home)
     if kept is None:
-        open_loop.check_policy(run)  # first: a path that is no policy is the larger mistake
+        open_loop.check_policy(run)  # first, since a path without a policy is the larger mistake
         raise AegisError(
             f"no --demos for '{run}', which does not say where those of its training lie",
             "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",
@@ -137,10 +137,10 @@ def demonstrations_of(run: Path) -> Path:
 
 
 def _all_there(run: Path, places: Sequence[str]) -> list[Path]:
-    """The recorded sets of demonstrations, if something is there of each."""
+    """The recorded sets of demonstrations; raises AegisError if one of them is gone."""
     from aegis_cli.training.inputs import is_gone
 
-    # The command names all sets, for those that are given are all that the run goes on with.
+    # The command names all sets, since the run resumes with exactly those that are given.
     options = _options("PATH" if is_gone(place) else place for place in places)
     again = commands.aegis("train", run, *options)
     return [_there(run, place, "demonstrations", again) for place in places]
@@ -151,7 +151,7 @@ def _options(places: Iterable[str]) -> list[str]:
 
 
 def _there(run: Path, place: str, what: str, again: str) -> Path:
-    """A recorded place, if something is there; else `again` is the command that names another."""
+    """A recorded path; raises AegisError if it is gone, with `again` as the command to fix it."""
     from aegis_cli.training.inputs import is_gone
 
     if is_gone(place):
@@ -164,7 +164,7 @@ def _there(run: Path, place: str, what: str, again: str) -> Path:
 
 
 def _no_anchor(run: Path) -> None:
-    """Raise AegisError if a checkpoint says that the run has been given an anchor."""
+    """Raise AegisError if a checkpoint says that the run was given an anchor."""
     from aegis_cli.common import artifacts
     from aegis_cli.training import checkpoint
 
@@ -186,16 +186,16 @@ def _unknown(run: Path, what: str, option: str) -> AegisError:
 def command(
     recipe: Any, out: Path, demos: Paths | None, anchor: Path | None, options: Sequence[str]
 ) -> list[str] | None:
-    """The words that let a run go on; None where its folder does not say all that is needed.
+    """The words of the command to resume a run; None if its folder does not suffice.
 
-    That is so before it has begun, and where another run is there still.
+    That is the case before the run has started, or if another run is still there.
 
     Args:
-        recipe: by which the run is trained.
-        options: of the command that are no settings of the training.
+        recipe: the recipe of the run.
+        options: the command's options that are not settings of the training.
 
     Raises:
-        AegisError: something else lies in `out`.
+        AegisError: `out` holds something else.
     """
     from aegis_cli.training import folder, inputs, longer
 
@@ -204,6 +204,6 @@ def command(
     if isinstance(recipe, Recipe):
         if demos is None or inputs.of(out) != inputs.Inputs.given(demos, anchor):
             return None
-        # With more steps than the run was begun with, the recipe on the disk is not this one.
+        # If the run was extended, the recipe on disk is not this one.
         recipe = longer.plan(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None

@@ -1,7 +1,7 @@
 """Which stage does a command's work for each kind of recipe, and how its report is shown.
 
-A stage is named here and imported when it runs, so that `aegis --help` needs neither torch nor
-OpenGL.
+Stages are named here and imported only when they run, so that `aegis --help` needs neither torch
+nor OpenGL.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ from aegis_cli.recipes import (
 
 
 class Stage(NamedTuple):
-    """A module with a function `run`, and the view of what that returns.
+    """A module with a function `run`, and the view of its report.
 
     Attributes:
-        shared: whether processes that torchrun has started share its work; the first one shows it.
+        shared: whether processes started by torchrun share its work; the first one shows the
+            report.
     """
 
     name: str
@@ -43,7 +44,7 @@ class Stage(NamedTuple):
 
     @property
     def module(self) -> Any:
-        """The stage itself; it is imported here."""
+        """The stage's module, imported on first use."""
         name = f"aegis_cli.{self.name}"
         if name in sys.modules:
             return sys.modules[name]
@@ -61,48 +62,48 @@ class Stage(NamedTuple):
         """Run the stage with a progress display, show its report and return it.
 
         Args:
-            device: where it computes; None leaves that to what the machine has.
+            device: the device to compute on; None chooses by what the machine has.
             wide: whether a table's lines may be wider than the terminal.
 
         Raises:
-            AegisError: it is one of several processes, and the stage is for one, or there is no
-                such device.
+            AegisError: there are several processes but the stage is for one, or there is no such
+                device.
         """
         if not self.shared:
             launch.check_one()  # before the import, which takes seconds
         with computing_on(device):
-            if launch.rank() > 0:  # the first process alone speaks
+            if launch.rank() > 0:  # only the first process prints
                 return self.module.run(*args, on_event=ignore, **options)
-            with render.progress() as on_event:  # already while the stage is imported
+            with render.progress() as on_event:  # shown while the stage is imported, too
                 report = self.module.run(*args, on_event=on_event, **options)
-        render.show(report, self.view, as_json, wide)  # once no bar is drawn into it
+        render.show(report, self.view, as_json, wide)  # after the progress bar has ended
         return report
 
 
 def computing_on(device: str | None) -> AbstractContextManager[None]:
-    """A context in which stages compute on this device; None leaves the choice as it is."""
+    """A context in which stages compute on this device; None leaves the choice unchanged."""
     if device is None:
         return nullcontext()
-    from aegis_cli.common import devices  # with it comes torch
+    from aegis_cli.common import devices  # imports torch
 
     return devices.chosen(device)
 
 
 def joined(device: str | None) -> AbstractContextManager[None]:
-    """Let no process of a launcher leave the block before the first one has done its writing.
+    """Let no process of a launcher leave the block before the first one has finished writing.
 
-    A process that ends with another code than 0 ends all others, which torchrun sees to.
+    If a process ends with an exit code other than 0, torchrun ends all others.
     """
     if launch.world_size() == 1:
-        return nullcontext()  # what a context manager of our own would do, without torch
+        return nullcontext()  # the same as below for one process, but without torch
     return _joined(device)
 
 
 @contextmanager
 def _joined(device: str | None) -> Generator[None]:
-    from aegis_cli.common import ranks  # with it comes torch
+    from aegis_cli.common import ranks  # imports torch
 
-    # The device first: processes on GPUs meet in another way than those on CPUs.
+    # The device first, because processes on GPUs use another backend than those on CPUs.
     with computing_on(device), ranks.joined():
         yield
 
@@ -127,7 +128,7 @@ BENCH = Stage("evaluation.bench", render.bench)
 BENCH_SHAPES = Stage("evaluation.bench_shapes", render.bench_shape)
 LATENCY = Stage("serving.latency", render.facts)
 
-# What `train`, `pretrain` and `run` do with a recipe of each kind.
+# The stages of `train`, `pretrain` and `run` for each kind of recipe.
 TRAIN: dict[type, Stage] = {
     Recipe: Stage("training.train", render.trained, shared=True),
     StreamRecipe: Stage("continual.train", render.stream),
@@ -146,7 +147,7 @@ RUN: dict[type, Stage] = {
 
 
 def refuse_options(given: Sequence[str], stream: str) -> None:
-    """Raise AegisError where options are given that mean nothing for a stream."""
+    """Raise AegisError if options are given that have no meaning for a stream."""
     if given:
         names = ", ".join(given)
         found = f"{names} with the stream {stream}"

@@ -242,7 +242,7 @@ def _jobs_report(path: Path) -> Path:
 def _anchor(
     path: Path, recipe: recipes.Recipe, found: inspection.InspectReport
 ) -> AnchorUse | None:
-    """A run's anchor and its use; None if a training was given one that nothing used."""
+    """A run's anchor and its use; None if nothing used an anchor, even if one was given."""
     read = recipe.reads_anchor(str(found.facts["method"]))
     if not read and not any(probed.figures.get("layers") for probed in found.probes):
         return None

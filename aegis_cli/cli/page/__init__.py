@@ -1,4 +1,4 @@
-"""The HTML page of what `reporting` gathers: one file that loads nothing and runs nothing."""
+"""The HTML page of what `reporting` gathers: a single file that loads and runs nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page says at its end: videos, the commands that repeat it, the machine, the recipe."""
+"""The end of a page: videos, the commands to reproduce the results, the machine, the recipe."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from aegis_cli.cli.page.tables import table
 from aegis_cli.recipes.strict_yaml import dump
 
 _TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
-_EMBEDDED_BYTES = 8_000_000  # of a film; larger ones are linked
+_EMBEDDED_BYTES = 8_000_000  # of a video; larger ones are linked
 
 
 def videos(found: At, folder: Path, page: Path) -> Markup | None:
-    """The films of a folder, inside the page where they are small.
+    """The videos of a folder; small ones are embedded in the page.
 
     Args:
-        page: the folder that the page lies in, from which large films are linked.
+        page: the folder of the page; links to large videos are relative to it.
     """
     if not found:
         return None
@@ -40,7 +40,7 @@ def _film(video: At, folder: Path, page: Path) -> Markup:
     encoded = base64.b64encode((folder / name).read_bytes()).decode()
     source = f"data:{kind};base64,{encoded}"
     if kind.startswith("video"):
-        # Without `autoplay`: a page of many films would play all of them at once.
+        # Without `autoplay`, because a page with many videos would play all of them at once.
         film = element("video", src=source, controls="", muted="", loop="", playsinline="")
     else:
         film = element("img", src=source, alt=name, class_="film")
@@ -48,14 +48,14 @@ def _film(video: At, folder: Path, page: Path) -> Markup:
 
 
 def commands(page: At) -> Markup:
-    """What to type to get the same again."""
+    """The commands that reproduce the results."""
     lines = "\n".join(str(line) for line in page["commands"])
     return section("Repeat it", element("pre", element("code", lines)))
 
 
 def machine(runs: Sequence[At]) -> Markup:
-    """Where the runs were trained, and with which versions; a column for each machine."""
-    # A mapping cannot be a key, and its items as a text can.
+    """The machines and versions that trained the runs, with a column for each machine."""
+    # Keyed by text, because a mapping cannot be a key.
     found: dict[str, tuple[dict[str, Any], list[str]]] = {}
     for run in runs:
         about = run["machine"].value
@@ -73,6 +73,6 @@ def machine(runs: Sequence[At]) -> Markup:
 
 
 def recipe(run: At, title: str = "Recipe") -> Markup:
-    """Every key of the recipe with its value, folded away."""
+    """Every key of the recipe with its value, in a collapsed section."""
     listed = element("pre", element("code", dump(run["recipe"].value)))
     return section(title, element("details", element("summary", "Every key"), listed))

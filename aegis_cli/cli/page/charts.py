@@ -1,6 +1,6 @@
-"""Drawings as inline SVG: pure functions of their data, without a plotting library.
+"""Charts as inline SVG: pure functions of their data, without a plotting library.
 
-Colours are those of the page's style sheet, so that a drawing follows light and dark.
+Colours come from the page's style sheet, so charts adapt to light and dark mode.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 from aegis_cli.cli.page.html import Markup, element
 
-WIDTH, HEIGHT = 460, 260  # of a drawing, in its own units
+WIDTH, HEIGHT = 460, 260  # of a chart, in its own units
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 14, 40
-_TURNED, _DIGIT = 30, 7.5  # what a turned label takes at the left, and a digit of a tick's number
-_NAME_LETTER = 7.4  # width of a letter of a mark's name, whose font no drawing knows
+_TURNED, _DIGIT = 30, 7.5  # width of a rotated label at the left, and of a digit of a tick
+_NAME_LETTER = 7.4  # assumed width of a letter of a mark's name, since the font is unknown
 _ALL = 100  # percent
 COLORS = 8  # classes c0 to c7 of the style sheet
 Point = tuple[float, float]
@@ -25,9 +25,9 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Scale:
-    """How values become places from `start` to `end`, evenly or by their logarithm.
+    """Maps values to positions from `start` to `end`, linearly or by their logarithm.
 
-    `whole` values, as steps and layers are, have no ticks between them.
+    `whole` values, such as steps and layers, have no ticks between them.
     """
 
     low: float
@@ -39,25 +39,25 @@ class Scale:
 
     def __call__(self, value: float) -> float:
         low, high = self.low, self.high
-        at = min(max(value, low), high)  # what lies outside is drawn at the edge
+        at = min(max(value, low), high)  # values outside are drawn at the edge
         if self.log:
             low, high, at = math.log(low), math.log(high), math.log(at)
         share = (at - low) / (high - low)
-        # `start` may be the larger one, as of a vertical axis: y grows downwards in SVG.
+        # `start` may be larger than `end`, as for a vertical axis: y grows downwards in SVG.
         return self.start + (self.end - self.start) * share
 
     def ticks(self) -> list[float]:
         """Round values between the ends: powers of ten, or about five equal steps."""
         if self.log and self.high > 10 * self.low:
             first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
-            # Over one or two decades the powers alone would be one tick or two.
+            # Over one or two decades, powers of ten alone would give only one or two ticks.
             steps = (1, 2, 5) if last - first <= 2 else (1,)
             found = [s * 10.0**power for power in range(first, last + 1) for s in steps]
         else:
             step = round_step((self.high - self.low) / 5)
             if self.whole:
                 step = max(step, 1)
-            # With some slack, so that an end which is a multiple of the step keeps its tick.
+            # With some tolerance, so that an end that is a multiple of the step keeps its tick.
             first = math.ceil(self.low / step - 1e-9)
             count = math.floor(self.high / step + 1e-9) - first + 1
             found = [round((first + k) * step, 12) for k in range(count)]  # 0.3, not 0.30000000004
@@ -71,7 +71,7 @@ def round_step(least: float) -> float:
 
 
 def from_first_to_last(values: Sequence[float], start: float, end: float) -> Scale:
-    """A scale without room at its ends; a single value stands in its middle."""
+    """A scale without margins; a single value is in its middle."""
     low, high = min(values), max(values)
     if low == high:
         low, high = low - 1, high + 1
@@ -79,14 +79,14 @@ def from_first_to_last(values: Sequence[float], start: float, end: float) -> Sca
 
 
 def spanning(values: Sequence[float], start: float, end: float, log: bool = False) -> Scale:
-    """A scale that holds all values, with a little room; of one value, some around it."""
+    """A scale of all values with small margins, also around a single value."""
     low, high = min(values), max(values)
     if log:
         return Scale(low / 1.15, high * 1.15, start, end, log=True)
     if low == high:
         low, high = low - max(abs(low), 1) * 0.1, high + max(abs(high), 1) * 0.1
     room = 0.05 * (high - low)
-    # Of values that are never negative, the room below does not pretend that they might be.
+    # If no value is negative, the lower margin does not extend below 0.
     below = 0.0 if low >= 0 and low - room < 0 else low - room
     return Scale(below, high + room, start, end)
 
@@ -103,7 +103,7 @@ def label(value: float) -> str:
 
 
 def svg(*children: Markup, width: float = WIDTH, height: float = HEIGHT, name: str) -> Markup:
-    """A drawing that takes the width there is; `name` is read to those who do not see it."""
+    """A chart that fills the available width; screen readers read `name`."""
     return element(
         "svg",
         *children,
@@ -132,7 +132,7 @@ def rectangle(
 
 
 def color(number: int) -> str:
-    """The class of the n-th series; a negative number stands for those that share grey."""
+    """The class of the n-th series; negative numbers stand for series that share grey."""
     return "rest" if number < 0 else f"c{number % COLORS}"
 
 
@@ -142,7 +142,7 @@ def _axes(x: Scale, y: Scale, x_label: str, y_label: str) -> list[Markup]:
     drawn = []
     for value in y.ticks():
         drawn.append(line(x.start, y(value), x.end, y(value), "grid"))
-        # SVG places a text by its base line: some units lower it stands beside the grid line.
+        # SVG positions text by its baseline; a few units lower it is centred on the grid line.
         drawn.append(text(x.start - 6, y(value) + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
         drawn.append(text(x(value), bottom + 16, label(value), class_="tick"))
@@ -153,7 +153,7 @@ def _axes(x: Scale, y: Scale, x_label: str, y_label: str) -> list[Markup]:
 
 
 def _turned(y: Scale, label: str) -> Markup:
-    """The label of a vertical axis, which is read from below along the left edge."""
+    """The rotated label of a vertical axis along the left edge, read from bottom to top."""
     middle = (y.start + y.end) / 2
     look = {"transform": f"rotate(-90 12 {middle:.1f})", "class_": "label"}
     return text(12, middle, label, **look)
@@ -164,7 +164,7 @@ def _turned(y: Scale, label: str) -> Markup:
 
 @dataclass(frozen=True)
 class Series:
-    """A named line; `number` says its colour, `marks` whether its points have marks."""
+    """A named line; `number` selects its colour, `marks` whether its points have marks."""
 
     name: str
     points: Sequence[Point]
@@ -176,12 +176,12 @@ class Series:
 def lines(
     series: Sequence[Series], x_label: str, y_label: str, name: str, log: bool = False
 ) -> Markup:
-    """Lines over a common axis, of which the vertical one may be logarithmic."""
+    """Lines over common axes, of which the vertical one may be logarithmic."""
     drawn = [s for s in series if s.points]
     points = [point for s in drawn for point in s.points]
-    log = log and all(y > 0 for _, y in points)  # 0 has no place on such an axis
+    log = log and all(y > 0 for _, y in points)  # 0 cannot be drawn on a logarithmic axis
     y = spanning([value for _, value in points], HEIGHT - _BOTTOM, _TOP, log)
-    # Long numbers at the ticks push the axis to the right, off its own label.
+    # Long tick numbers push the axis to the right, away from its label.
     longest = max(len(label(value)) for value in y.ticks())
     left = max(_LEFT, _TURNED + _DIGIT * longest)
     x = from_first_to_last([value for value, _ in points], left, WIDTH - _RIGHT)
@@ -206,14 +206,14 @@ def _series(series: Series, x: Scale, y: Scale) -> Markup:
 
 
 def legend(names: Sequence[tuple[str, int]]) -> Markup:
-    """Names with their colours, as HTML, so that they wrap."""
+    """Names with their colours, as HTML so that they can wrap."""
     items = [element("li", element("i", class_=color(number)), said) for said, number in names]
     return element("ul", *items, class_="legend")
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A named mark with the intervals of both of its values, if they are known."""
+    """A named mark with the intervals of both its values, if they are known."""
 
     name: str
     x: float
@@ -233,24 +233,24 @@ def frontier(
     name: str,
     turned: bool = False,
 ) -> Markup:
-    """What was lost over what was won, better to the upper right.
+    """VQA points lost over success; the upper right is best.
 
-    Up is better: the vertical axis is turned around. Beyond one point it is logarithmic, since
-    those that keep most lie within a few points and the others lose dozens.
+    The vertical axis is inverted, so that up is better. Beyond one point it is logarithmic, since
+    the methods that keep most are within a few points of each other and the others lose dozens.
 
     Args:
-        turned: whether the other axis is turned around as well, since it is of errors.
+        turned: whether the horizontal axis is inverted as well, because it shows errors.
     """
     width, height, line_y = 760, 430, 46
     spots = [replace(spot, x_interval=_possible(spot)) for spot in spots]
     values = [value for s in spots for value in (s.y, *(s.y_interval or ()))]
-    lost = [symlog(value) for value in [*values, 0.0]]  # the line of no loss is always there
+    lost = [symlog(value) for value in [*values, 0.0]]  # the line of no loss is always shown
     across = [value for s in spots for value in (s.x, *(s.x_interval or ()))]
     room = max(0.02 if turned else 2.0, 0.06 * (max(across) - min(across)))
     left, right = _LEFT, width - 24
     start, end = (right, left) if turned else (left, right)
     x = Scale(max(min(across) - room, 0), max(across) + room, start, end)
-    y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)  # of values by `symlog`
+    y = Scale(min(lost) - 0.15, max(lost) + 0.15, 20, height - line_y)  # of `symlog` values
     drawn = []
     ticks = [t for t in (0, 0.5, 1, 2, 5, 10, 20, 50, 100) if y.low <= symlog(t) <= y.high]
     for value in ticks:
@@ -258,7 +258,7 @@ def frontier(
         drawn.append(line(left, at, right, at, "grid" if value else "zero"))
         drawn.append(text(left - 6, at + 4, label(value), "end", class_="tick"))
     for value in x.ticks():
-        if value <= max(*across, _ALL):  # the room at the right is beyond 100 %
+        if value <= max(*across, _ALL):  # the margin at the right is beyond 100 %
             drawn.append(text(x(value), y.end + 18, label(value), class_="tick"))
     drawn.append(line(left, y.end, right, y.end, "axis"))
     drawn.append(text((left + right) / 2, height - 8, x_label, class_="label"))
@@ -267,15 +267,15 @@ def frontier(
         bent = Series(curve.name, [(a, symlog(b)) for a, b in curve.points], curve.number)
         drawn.append(element("g", _series(bent, x, y), class_="tried"))
     drawn += [_spot(spot, x, y) for spot in spots]
-    # Small marks are too many to be named, but in their tooltips.
+    # There are too many small marks to label; they have names only in their tooltips.
     drawn += _names([s for s in spots if not s.small], x, y)
     return svg(*drawn, width=width, height=height, name=name)
 
 
 def _possible(spot: Spot) -> Point | None:
-    """The part of a success's interval up to 100 %, beyond which Student's t may reach.
+    """The interval of a success clipped at 100 %, which Student's t may exceed.
 
-    A return is a share of an expert's, which may be surpassed.
+    A return is a share of the expert's return and may exceed it.
     """
     if spot.x_interval is None or spot.x > _ALL:
         return spot.x_interval
@@ -284,9 +284,9 @@ def _possible(spot: Spot) -> Point | None:
 
 
 def symlog(value: float) -> float:
-    """To scale up to 1, from there on by the logarithm; negative values alike."""
+    """Linear up to 1, logarithmic beyond; symmetric for negative values."""
     size = abs(value)
-    bent = size if size <= 1 else 1 + math.log10(size) * 1.4  # both are 1 where size is 1
+    bent = size if size <= 1 else 1 + math.log10(size) * 1.4  # both are 1 at size 1
     return math.copysign(bent, value)
 
 
@@ -306,13 +306,13 @@ def _spot(spot: Spot, x: Scale, y: Scale) -> Markup:
 
 
 def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
-    """Each name beside its mark, moved until it covers no name, no mark and no interval."""
+    """Each name beside its mark, moved so that it covers no other name, mark or interval."""
     taken = [box for spot in spots for box in _drawn(spot, x, y)]
     drawn = []
-    first, last = sorted((x.start, x.end))  # an axis of errors is turned around
+    first, last = sorted((x.start, x.end))  # an axis of errors is inverted
     for spot in spots:
         at, down, wide = x(spot.x), y(symlog(spot.y)), _NAME_LETTER * len(spot.name)
-        # Places (left, middle) from the nearest on: to the right and the left, above and below.
+        # Places (left, middle), nearest first: to the right and the left, above and below.
         tries = []
         for shift in (0, -15, 15, -30, 30, -45, 45, -60, 60, -75, 75):
             tries.append((at + 11, down + shift))
@@ -327,7 +327,7 @@ def _names(spots: Sequence[Spot], x: Scale, y: Scale) -> list[Markup]:
 
 
 def _drawn(spot: Spot, x: Scale, y: Scale) -> list[tuple[float, float, float, float]]:
-    """What a mark takes, and each of its intervals: (left, top, right, bottom)."""
+    """The boxes (left, top, right, bottom) of a mark and of each of its intervals."""
     at, down = x(spot.x), y(symlog(spot.y))
     found = [(at - 7, down - 7, at + 7, down + 7)]
     if spot.x_interval is not None:
@@ -349,7 +349,7 @@ def _touch(a: Sequence[float], b: Sequence[float]) -> bool:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a heat map: its name, a value for each column, and what stands at its end."""
+    """A row of a heat map: its name, a value for each column, and a text at its end."""
 
     name: str
     values: Sequence[float | None]
@@ -361,7 +361,7 @@ class HeatMap:
     """A heat map over steps or tasks.
 
     Attributes:
-        columns: what a column's tooltip says.
+        columns: the columns' names in tooltips.
         edges: (column, label) of the ticks below.
         shade: value -> depth of the colour in [0, 1].
         say: value -> text of the tooltip.
@@ -380,7 +380,7 @@ class HeatMap:
 def heat(chart: HeatMap, name: str) -> Markup:
     """Rows of cells, the first on top; a cell without a value is left blank."""
     tall = 22 if chart.write else 15
-    # Names and means stand beside the cells, and take about 7 units a letter.
+    # Names and means are beside the cells and take about 7 units per letter.
     left = 16 + 7.0 * max(len(row.name) for row in chart.rows)
     end = 10 + 7.0 * max(len(row.end) for row in chart.rows)
     width = 760.0
@@ -395,11 +395,11 @@ def heat(chart: HeatMap, name: str) -> Markup:
             said = element("title", f"{row.name}, {chart.columns[column]}: {chart.say(value)}")
             depth = f"{min(max(chart.shade(value), 0), 1):.3f}"
             x = left + column * wide
-            gap = 1 if chart.write else 0  # thin columns without values are one surface
+            gap = 1 if chart.write else 0  # no gaps between thin columns without values
             cell = {"class_": "heat", "style": f"--depth:{depth}"}
             drawn.append(rectangle(x, y, wide - gap, tall - 1, said, **cell))
             if chart.write:
-                look = "cell deep" if float(depth) > 0.55 else "cell"  # light on a deep ground
+                look = "cell deep" if float(depth) > 0.55 else "cell"  # light text on deep colours
                 drawn.append(text(x + wide / 2, y + tall / 2 + 4, chart.say(value), class_=look))
         drawn.append(text(width - 2, y + tall / 2 + 4, row.end, "end", class_="tick"))
     below = 6 + len(chart.rows) * tall

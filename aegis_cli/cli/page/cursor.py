@@ -1,7 +1,7 @@
-"""Figures of a report's JSON, each shown together with the place that it came from.
+"""Figures of a report's JSON, each shown together with its path in the JSON.
 
-A page is a function of the same document that `--json` prints. A figure in it is a `data` element
-that holds the exact value and its path there, so that the two cannot differ unseen.
+A page is a function of the document that `--json` prints. A figure in it is a `data` element with
+the exact value and its path in the document, so any difference between the two can be found.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class At:
     path: str = ""
 
     def __getitem__(self, key: str | int) -> At:
-        """What lies inside; of a mapping without the key, and of nothing, nothing."""
+        """The value inside; nothing for a mapping without the key, or for nothing."""
         if self.value is None:
             return self
         inner = self.value.get(key) if isinstance(self.value, dict) else self.value[key]
-        # A pointer has "/" between its words. "~" goes first, which the other one brings in.
+        # "/" separates the parts of a pointer. "~" is escaped first, since escaping "/" adds it.
         word = str(key).replace("~", "~0").replace("/", "~1")
         return At(inner, f"{self.path}/{word}")
 
@@ -36,7 +36,7 @@ class At:
         return (self[key] for key in keys)
 
     def __bool__(self) -> bool:
-        """Whether there is something; the number 0 and False are."""
+        """Whether there is a value; 0 and False count as values."""
         return self.value is not None and self.value not in ([], {}, ())
 
     def __str__(self) -> str:
@@ -44,12 +44,12 @@ class At:
 
     @property
     def key(self) -> str:
-        """The last word of the path."""
+        """The last part of the path."""
         return self.path.rpartition("/")[2].replace("~1", "/").replace("~0", "~")
 
 
 def shown(at: At, write: Callable[[Any], str]) -> Markup:
-    """A figure as `write` shows it; a dash for none."""
+    """A figure formatted by `write`; a dash for None."""
     if at.value is None:
         return Markup("–")
     return element("data", write(at.value), value=repr(at.value), data_path=at.path)
@@ -65,7 +65,7 @@ def decimal(at: At, digits: int = 2) -> Markup:
 
 
 def plain(at: At) -> Markup:
-    """A number in four digits."""
+    """A number with four digits."""
     return shown(at, number)
 
 
@@ -74,7 +74,7 @@ def whole(at: At) -> Markup:
 
 
 def between(interval: At | tuple[At, At] | None, write: Callable[[At], Child]) -> Markup | None:
-    """The two ends of an interval, small; nothing for none."""
+    """The two ends of an interval in small type; None without an interval."""
     if not interval:
         return None
     low, high = write(interval[0]), write(interval[1])
@@ -82,9 +82,9 @@ def between(interval: At | tuple[At, At] | None, write: Callable[[At], Child]) -
 
 
 def farthest(*intervals: At) -> tuple[At, At] | None:
-    """The lowest lower end and the highest upper one of the intervals that are there.
+    """The lowest lower end and the highest upper end of the given intervals.
 
-    Each keeps its path, so that the page still says where it came from.
+    Each keeps its path, so that the page still shows its origin.
     """
     known = [interval for interval in intervals if interval]
     if not known:

@@ -1,4 +1,4 @@
-"""HTML out of elements, so that no text of a file can become markup."""
+"""Builds HTML from elements, so that text from files cannot become markup."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from aegis_cli.cli.render.output import visible
 
 
 class Markup(str):
-    """A text that is HTML already."""
+    """Text that is already HTML."""
 
     __slots__ = ()
 
 
 VOID = ("meta", "link", "img", "br", "source")  # elements without an end tag
-Child = Any  # Markup, text or a number, a list of such, or None for nothing
+Child = Any  # Markup, text or a number, a list of these, or None for nothing
 
 
 def element(tag: str, /, *children: Child, **attributes: Any) -> Markup:
-    """One element. Children that are no `Markup` are escaped, and so are the attributes.
+    """One element. Attributes are escaped, and so are children that are not `Markup`.
 
     Args:
-        attributes: `class_` stands for `class`, and `_` for `-`; None leaves one out.
+        attributes: `class_` stands for `class`, and `_` for `-`; None omits an attribute.
     """
     written = ""
     for key, value in attributes.items():
@@ -35,7 +35,7 @@ def element(tag: str, /, *children: Child, **attributes: Any) -> Markup:
 
 
 def join(*children: Child) -> Markup:
-    """Children one after the other, without an element around them."""
+    """The children in sequence, without an enclosing element."""
     return Markup("".join(map(_child, children)))
 
 
@@ -50,5 +50,5 @@ def _child(child: Child) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value as HTML, in which control characters have no place and some others a meaning."""
+    """A value as HTML, without control characters and with special characters escaped."""
     return escape(visible(str(value)))

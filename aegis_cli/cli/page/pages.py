@@ -1,4 +1,4 @@
-"""The HTML page of a run, a job, a study or a stream: one file that needs nothing else."""
+"""The HTML page of a run, a job, a study or a stream, in a self-contained file."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from aegis_cli.recipes.policy import CONSTANT, COSINE
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns
 
-# The page itself forbids what it never does, to load anything from elsewhere or to run a script: a
-# browser keeps to it whatever a file's metadata may have brought in.
+# The page forbids loading anything from elsewhere and running scripts. It never does so itself, but
+# this also holds for anything that a file's metadata may have brought in.
 _POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 
 
 def save(report: Any, path: Path) -> None:
-    """Write the page of what `reporting.gather` found."""
+    """Write the page of a document of `reporting.gather`."""
     files.write_text(path, page(report, path.parent))
 
 
 def page(report: Any, folder: Path) -> Markup:
-    """The page as a whole.
+    """The whole page.
 
     Args:
-        folder: where it is going to lie.
+        folder: the folder that it will be written to.
     """
     found = At(document(report))
     title, parts = _PAGES[report.kind](found, report, folder)
@@ -86,24 +86,24 @@ def _run(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
 
 
 def _task(run: At) -> str:
-    """What a run was trained on."""
+    """The demonstrations that a run was trained on, in words."""
     if given := _demonstrations(run["recipe"]):
         return f"the demonstrations in {given}"
     return f"demonstrations of {run['task']} ({run['recipe']['demos']['episodes']} episodes)"
 
 
 def _demonstrations(recipe: At) -> str:
-    """The sets of demonstrations that a recipe names; an empty text where it names none."""
+    """The sets of demonstrations that a recipe names; "" if it names none."""
     given = recipe["demos"]["path"]
     return " and ".join(map(str, given)) if isinstance(given.value, list) else str(given)
 
 
 def _anchor(runs: Sequence[At]) -> str | None:
-    """What the anchor was and whether a training read it; None without an anchor."""
+    """The anchor in words, and whether a training read it; None without an anchor."""
     used = [run["anchor"] for run in runs if run["anchor"]]
     if not used:
         return None
-    # One anchor serves all methods of a job, of which some may have read it.
+    # All methods of a job share one anchor, but some may not have read it.
     told = next((anchor for anchor in used if anchor["read"].value), used[0])
     if told["read"].value:
         return str(told["measured_on"])
@@ -111,7 +111,7 @@ def _anchor(runs: Sequence[At]) -> str | None:
 
 
 def _trained(run: At, anchor: str | None) -> Markup:
-    """What was trained on what, in a few words."""
+    """A short summary of the training and its data."""
     recipe, train = run["recipe"], run["recipe"]["train"]
     shown: list[tuple[str, Child]] = [
         ("Backbone", str(run["backbone"])),
@@ -129,7 +129,7 @@ def _trained(run: At, anchor: str | None) -> Markup:
 
 
 def _rates(train: At) -> str:
-    """The peak learning rates, how they rise to them, and how they go on."""
+    """The peak learning rates, with their warm-up and schedule."""
     shown = [f"{train['backbone_lr']} and {train['expert_lr']} of the expert"]
     if train["warmup"].value:
         shown.append(f"up over {train['warmup']} steps")
@@ -143,13 +143,13 @@ def _rates(train: At) -> str:
 
 
 def _precision(run: At) -> str:
-    """What matrix products were taken in, as far as the run says it of `auto`."""
+    """The precision of matrix products; for `auto` the actual one, if the run recorded it."""
     asked, taken = str(run["recipe"]["train"]["precision"]), run["machine"].value.get("precision")
     return asked if taken in (None, asked) else f"{taken} ({asked})"
 
 
 def _weights(recipe: At) -> list[tuple[str, str]]:
-    """A line on the shares of several sets, where they are not those of their frames."""
+    """A line with the weights of several sets, if the recipe sets any."""
     weights = recipe["demos"]["weights"]
     if not weights:
         return []
@@ -157,19 +157,19 @@ def _weights(recipe: At) -> list[tuple[str, str]]:
 
 
 def _steps(run: At) -> str:
-    """How many steps a run has taken, and of how many where some are left."""
+    """The number of steps taken, and the planned number if some are left."""
     facts = run["facts"].value
     return steps_taken(facts["steps"], facts["planned_steps"])
 
 
 def _merge(merge: At) -> list[Child]:
-    """How what was trained was moved back."""
+    """A description of the merge after the training."""
     how = f"{merge['method']}, strength {merge['strength']}, damping {merge['damping']}; "
     return [how, share(merge["kept"]), " % of the maps' displacement is left"]
 
 
 def _measured(found: Sequence[At]) -> list[Child]:
-    """The sections that a run and a job have in common."""
+    """The sections that runs and jobs have in common."""
     return [
         runs.successes(found),
         runs.open_loops(found),
@@ -205,8 +205,8 @@ def _job(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
 
 
 def _verdict(compared: At) -> Child:
-    """What the table says, in a sentence or two."""
-    if compared["verdict"].value:  # an empty text is something, too
+    """A summary of the table in a sentence or two."""
+    if compared["verdict"].value:  # `.value`, because "" counts as a value
         return compared["verdict"]
     rows = sorted(compared["rows"], key=lambda row: row["drop_points"].value)
     before = compared["baseline_accuracy"]
@@ -222,7 +222,7 @@ def _verdict(compared: At) -> Child:
 
 
 def _most_successful(rows: Sequence[At]) -> list[Child]:
-    """A sentence on who acts best; nothing where that is not known."""
+    """A sentence on the method that acts best; empty if that is not known."""
     name = _acting(rows)
     acting = [row for row in rows if row[name].value is not None]
     if not acting:
@@ -240,14 +240,14 @@ def _most_successful(rows: Sequence[At]) -> list[Child]:
 
 
 def _acting(rows: Sequence[At]) -> str:
-    """The figure of acting that the rows have."""
+    """The name of the figure for how well policies act in these rows."""
     figures = ("return_share", "success_seen", _OPEN)
     known = (name for name in figures if any(row[name].value is not None for row in rows))
     return next(known, "success_seen")
 
 
 def _has_colors(rows: Sequence[At]) -> bool:
-    """Whether any was rolled out on held-out colours, which MetaWorld's tasks do not have."""
+    """Whether any row has a rollout on held-out colours, which MetaWorld's tasks do not have."""
     return any(row["success_held_out"].value is not None for row in rows)
 
 
@@ -272,7 +272,7 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     gated = any(run["gate"].value is not None for run in own)
     header = ["Method", "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
     cells = []
-    for row, run in zip(rows, own, strict=True):  # the table's row of a method, and its run
+    for row, run in zip(rows, own, strict=True):  # a method's row in the table, and its run
         cell: list[Child] = [
             run["label"],
             share(row["accuracy"]),
@@ -285,7 +285,7 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
         cells.append(cell)
     explained = "Lost: percentage points of VQA accuracy, with the 95 % interval of one training."
     parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
-    # All methods are measured on the same frames, so that one figure is that of all.
+    # All methods are measured on the same frames, so one value holds for all.
     hold = next((row["hold_error"] for row in rows if row["hold_error"].value is not None), None)
     if hold is not None:
         parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
@@ -320,7 +320,7 @@ def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
         acted = row[name].value
         if acted is None:
             continue
-        # The table has no interval of a success, its run has; a return has none.
+        # The interval of a success is in the run, not in the table; a return has none.
         ends = runs.rollout(run, "seen")["interval"].value if name == "success_seen" else None
         wide = None if ends is None else (100 * ends[0], 100 * ends[1])
         across = acted if name == _OPEN else 100 * acted
@@ -370,7 +370,7 @@ def _robot_stream_study(found: At, report: Any, _: Path) -> tuple[str, list[Chil
 def _streams_compared(
     kind: str, found: At, on: str, results: RenderableType
 ) -> tuple[str, list[Child]]:
-    """The page of a study of learners, with the tables that the terminal shows."""
+    """The page of a study of learners, with the same tables as in the terminal."""
     compared = found["table"]
     title = str(compared["name"])
     lead = f"{compared['finished']} of {compared['cells']} runs are finished, "
@@ -397,12 +397,12 @@ def _stream(found: At, report: Any, _: Path) -> tuple[str, list[Child]]:
 
 
 def _matrix(stream: At) -> list[Markup]:
-    """What was reached on each task after each task, as a heat map and a table."""
-    rows = stream["oracle"] or stream["success"]  # of images, or of simulated robots
+    """The scores on each task after each task, as a heat map and a table."""
+    rows = stream["oracle"] or stream["success"]  # for images, or for simulated robots
     if rows:
         title = "What was reached on each task, after each task (%)"
         return _matrix_of(stream, rows, "accuracy matrix", title, share, 1.0)
-    rows = stream["errors"]  # of other robots
+    rows = stream["errors"]  # for other robots
     if not rows:
         return []
     title = "The open-loop error in each task, after each task"
@@ -421,8 +421,8 @@ def _matrix_of(
     """A matrix as a heat map and a table.
 
     Args:
-        name: of the map, for who cannot see it.
-        show: how the table has a value.
+        name: a description of the map for screen readers.
+        show: formats a value for the table.
         deepest: the value with the deepest colour.
     """
     errors = stream["errors"]

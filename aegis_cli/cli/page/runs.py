@@ -1,4 +1,4 @@
-"""What a page shows of one run, or of several runs side by side."""
+"""The parts of a page about one run, or about several runs side by side."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aegis_cli.cli.render import training_curves
 from aegis_cli.cli.render.layout import INSTRUCTIONS, is_number
 from aegis_cli.evaluation.results import Played, evaluated_on, told_apart
 
-_TICKS = 5  # below a heat map
+_TICKS = 5  # number of ticks below a heat map
 
 
 def section(title: str, *children: Child) -> Markup:
@@ -23,7 +23,7 @@ def section(title: str, *children: Child) -> Markup:
 
 
 def figure(chart: Markup, caption: Child = None, wide: bool = False) -> Markup:
-    """A drawing with what it says; a wide one scrolls sideways on a phone."""
+    """A chart with its caption; a wide one scrolls sideways on a phone."""
     said = None if caption is None else element("figcaption", caption)
     if wide:
         return element("figure", element("div", chart, class_="scroll"), said, class_="wide")
@@ -38,13 +38,13 @@ def note(*children: Child) -> Markup:
 
 
 def probe(run: At, having: str = "accuracy") -> At:
-    """The figures of the run's first probe that has some; nothing where none has."""
+    """The figures of the run's first probe that has the figure `having`; empty if none has it."""
     each = [result["figures"] for result in run["probes"]]
     return next((figures for figures in each if figures[having]), At(None))
 
 
 def rollout(run: At, colors: str) -> At:
-    """The run's figures in closed loop on some colours, or of a task without colours."""
+    """The run's closed-loop figures on these colours, or on a task without colours."""
     for result in run["rollouts"]:
         if result["figures"]["colors"].value in (colors, None):
             return result["figures"]
@@ -52,14 +52,14 @@ def rollout(run: At, colors: str) -> At:
 
 
 def at_a_glance(run: At) -> Markup:
-    """The figures that a run is judged by."""
+    """The most important figures of a run."""
     vqa = probe(run)
     shown: list[tuple[str, Child]] = []
     if vqa:
         accuracy = [share(vqa["accuracy"]), " %"]
         if vqa["baseline_accuracy"]:
             accuracy.append(element("small", "before: ", share(vqa["baseline_accuracy"]), " %"))
-        # The figures are those of one probe; of several sets it has to be said which one's.
+        # The figures are those of one probe. With several question sets, its set is named.
         several = len(set(run["question_sets"].value)) > 1
         asked = f" on {run['question_sets'][0]}" if several else ""
         shown.append((f"VQA accuracy{asked}", accuracy))
@@ -76,7 +76,7 @@ def at_a_glance(run: At) -> Markup:
 
 
 def _acted_apart(rollouts: At) -> Iterator[tuple[str, Child]]:
-    """Each rollout by its colours; several of the same ones also by what tells them apart."""
+    """Each rollout by its colours, and by other settings if several have the same colours."""
     each = [result["figures"] for result in rollouts]
     names = [_acted(played)[0] for played in each]
     for played, otherwise in zip(each, _otherwise(rollouts), strict=True):
@@ -88,12 +88,12 @@ def _acted_apart(rollouts: At) -> Iterator[tuple[str, Child]]:
 
 
 def _otherwise(rollouts: Iterable[At]) -> list[str]:
-    """How each rollout was played, where others were played otherwise."""
+    """The settings in which each rollout differs from the others."""
     return told_apart([Played(**result["played"].value) for result in rollouts])
 
 
 def _acted(played: At) -> tuple[str, Child]:
-    """The success of a rollout, or the return of a task that is measured by it."""
+    """The success of a rollout, or its return if the task is measured by it."""
     colors = f", {played['colors']} colours" if played["colors"] else ""
     if played["success"].value is None:
         ends = between(played["return_interval"], plain)
@@ -107,7 +107,7 @@ def successes(runs: Sequence[At]) -> Markup | None:
     each = [(run["label"], result) for run in runs for result in run["rollouts"]]
     if not each:
         return None
-    apart = _otherwise(result for _, result in each)  # all empty where all were played alike
+    apart = _otherwise(result for _, result in each)  # all empty if all have the same settings
     rows = []
     for (label, result), otherwise in zip(each, apart, strict=True):
         for row in (_success(label, result["figures"]), *_by_suite(label, result["figures"])):
@@ -130,7 +130,7 @@ def successes(runs: Sequence[At]) -> Markup | None:
 
 
 def _success(label: At, played: At) -> tuple[Child, ...]:
-    """A row of one rollout."""
+    """The row of a rollout."""
     distance = played["final_distance_m"]
     return (
         label,
@@ -144,7 +144,7 @@ def _success(label: At, played: At) -> tuple[Child, ...]:
 
 
 def _by_suite(label: At, played: At) -> Iterator[tuple[Child, ...]]:
-    """A row of each suite, where a rollout is of several: LIBERO's four are told apart."""
+    """A row for each suite if a rollout covers several, such as LIBERO's four."""
     for part in played["suites"]:
         success = with_interval(part["success"], part["interval"], share)
         yield label, f"{part.key}, of these", "–", whole(part["episodes"]), success, "–", "–"
@@ -180,7 +180,7 @@ def open_loops(runs: Sequence[At]) -> Markup | None:
 
 
 def _by_instruction(run: At, found: At) -> Markup | None:
-    """The worst instructions of an open-loop evaluation, where it has several."""
+    """The worst instructions of an open-loop evaluation, if it has several."""
     every = list(found["instructions"])
     if len(every) < 2:
         return None
@@ -200,7 +200,7 @@ def _by_instruction(run: At, found: At) -> Markup | None:
 
 
 def families(runs: Sequence[At]) -> Iterator[Markup]:
-    """VQA accuracy by family of questions: one table for each set of questions."""
+    """VQA accuracy by family of questions, with one table for each question set."""
     by_questions = _by_questions(runs)
     for (name, count, again), found in by_questions.items():
         asked, probes = list(found), list(found.values())
@@ -208,7 +208,7 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
         header = ["Family", "Questions", "Always the commonest %", "Before %"]
         header += asked
         rows = [_family(name, probes) for name in names]
-        if len(names) > 1:  # a single family is all there is
+        if len(names) > 1:  # for a single family, its row has all questions
             rows.append(_every_family(probes))
         title = "VQA by family of questions"
         if len(by_questions) > 1:
@@ -224,7 +224,7 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
 
 
 def _every_family(probes: Sequence[At]) -> list[Child]:
-    """A row: each run's accuracy over all questions."""
+    """The row with each run's accuracy over all questions."""
     first = probes[0]
     return [
         "all",
@@ -236,9 +236,9 @@ def _every_family(probes: Sequence[At]) -> list[Child]:
 
 
 def _by_questions(runs: Sequence[At]) -> dict[tuple[str, int, int], dict[str, At]]:
-    """The figures of the runs' probes by their labels, for each set and number of questions.
+    """The figures of the runs' probes by label, for each question set and number of questions.
 
-    What was asked several times of one run, as with other seeds, has a place for each time.
+    If a run was probed several times, as with other seeds, each time has a separate entry.
     """
     found: dict[tuple[str, int, int], dict[str, At]] = {}
     for run in runs:
@@ -253,9 +253,9 @@ def _by_questions(runs: Sequence[At]) -> dict[tuple[str, int, int], dict[str, At
 
 
 def _family(name: str, probes: Sequence[At]) -> list[Child]:
-    """A row: the family's figures in each run's probe."""
+    """The row with the family's figures in each run's probe."""
     own = [p["families"][name] for p in probes]
-    first = next(family for family in own if family)  # a question's facts are those of any probe
+    first = next(family for family in own if family)  # the questions are the same in any probe
     row: list[Child] = [name, whole(first["questions"]), share(first["majority"])]
     row.append(share(first["baseline_accuracy"]))
     for family in own:
@@ -265,7 +265,7 @@ def _family(name: str, probes: Sequence[At]) -> list[Child]:
         cell = with_interval(family["accuracy"], family["interval"], share)
         before = family["baseline_accuracy"].value
         kept = family["accuracy"].value / before if before else family["accuracy"].value
-        # What loses half of it is as pale as what loses all.
+        # A family that loses half is as pale as one that loses everything.
         row.append(shaded(cell, 2 * kept - 1))
     return row
 
@@ -306,7 +306,7 @@ def _wrong(example: At) -> Markup:
 
 
 def curves(runs: Sequence[At]) -> Markup | None:
-    """What metrics.jsonl logged, a chart for each figure that some run has."""
+    """The figures in metrics.jsonl, with a chart for each figure that some run has."""
     given = [run["recipe"]["probe"]["vqa"].value for run in runs]
     sets = max((names for names in given if isinstance(names, list)), key=len, default=[])
     drawn = []
@@ -318,7 +318,7 @@ def curves(runs: Sequence[At]) -> Markup | None:
         if any(s.points for s in series):
             chart = charts.lines(series, "step", curve.title, curve.title, curve.log)
             drawn.append(figure(chart))
-    if not drawn:  # a run that was interrupted before its first line
+    if not drawn:  # the run was interrupted before its first line
         return None
     names = [(str(run["label"]), number) for number, run in enumerate(runs)]
     legend = charts.legend(names) if len(runs) > 1 else None
@@ -330,7 +330,7 @@ def drift(runs: Sequence[At]) -> Markup | None:
     series, rows, names = [], [], []
     for number, run in enumerate(runs):
         layers = probe(run, "layers")["layers"]
-        if not layers:  # no probe of it was given an anchor
+        if not layers:  # none of its probes was given an anchor
             continue
         w2 = [layer["w2"] for layer in layers]
         points = [(k, at.value) for k, at in enumerate(w2) if is_number(at.value)]
@@ -361,18 +361,18 @@ def energy(runs: Sequence[At]) -> Iterator[Markup]:
             continue
         shares = [part for b in bins.value for part in b["layers"] if part > 0]
         most = max(shares, default=1.0)
-        # Four decades at most: beyond them the largest shares would all look alike.
+        # Four decades at most: with more, the largest shares would all look the same.
         least = max(min(shares, default=most / 10), most / 1e4)
         rows = []
         for k, layer in enumerate(layers.value):
-            over_time = [b["layers"][k] or None for b in bins.value]  # 0 has no logarithm: blank
+            over_time = [b["layers"][k] or None for b in bins.value]  # 0 has no logarithm
             rows.append(Row(layer["name"], over_time, f"{100 * layer['energy_shed']:.2g} %"))
         chart = HeatMap(
             rows=rows,
             columns=[f"steps {b['first_step']} to {b['last_step']}" for b in bins.value],
             edges=_edges(bins.value),
             x_label="training step",
-            # Bound now, for the next run has other ends.
+            # Bound now, because the next run has other limits.
             shade=lambda value, low=least, high=most: _log_share(value, low, high),
             say=lambda value: f"{100 * value:.3g} % shed",
         )
@@ -406,17 +406,17 @@ def _energy_table(layers: At) -> Markup:
 
 
 def _log_share(value: float, low: float, high: float) -> float:
-    """Where a value lies between two others, by its logarithm."""
+    """The position of a value between two others, on a logarithmic scale."""
     if high <= low:
         return 1.0
     return math.log(max(value, low) / low) / math.log(high / low)
 
 
 def _edges(bins: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
-    """About five ticks: a column's number, and the step that it begins with."""
+    """About five ticks: a column's number, and its first step."""
     every = max(1, round(len(bins) / _TICKS))
     found = [(float(k), str(bins[k]["first_step"])) for k in range(0, len(bins), every)]
-    # The end of the last column too, where the tick before it leaves room for its number.
+    # The end of the last column too, if the tick before it leaves room for its number.
     if len(bins) - found[-1][0] > every / 2:
         found.append((float(len(bins)), str(bins[-1]["last_step"])))
     return found

@@ -1,4 +1,4 @@
-"""What a page shows of a study of policies: its frontier, and a table for each task."""
+"""The parts of a page about a study of policies: its frontier, and a table for each task."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _DECLARED = columns(PolicyResult)
 _LOST, _SEEN, _RETURN = "drop_points", "success_seen", "return_share"
 _OPEN = "open_loop_error"
 _OPEN_LOOP = " ".join(f"{OPEN_LOOP[0].upper()}{OPEN_LOOP[1:]}.".split())
-_REST = -1  # the number of a series without a colour of its own
+_REST = -1  # number of a series without its own colour
 
 
 def frontier(compared: At, report: Any) -> Markup | None:
-    """Points of VQA accuracy lost over success: compared means, and the values tried before.
+    """Points of VQA accuracy lost over success, for compared means and for values in tuning.
 
-    As in the terminal's plot, at most six methods have a colour.
+    As in the plot of --plot, at most six methods have a colour.
     """
     number = {method: place for place, method in enumerate(coloured_methods(report))}
     chosen = chosen_task(report)
@@ -60,17 +60,17 @@ def frontier(compared: At, report: Any) -> Markup | None:
 
 
 def _means(compared: At, task: int, number: dict[str, int]) -> list[Spot]:
-    """The compared variants of one task, as far as it is known how they act."""
+    """The compared variants of one task that have a figure for how they act."""
     found = []
     for result in compared["tasks"][task]["results"]:
         acted = result[_SEEN] or result[_RETURN]  # a task has one of them
-        scale = 100.0 if acted else 1.0  # shares become percent, errors stay as they are
+        scale = 100.0 if acted else 1.0  # shares become percent, errors stay unchanged
         acted = acted or result[_OPEN]
         lost = result[_LOST]
         if not acted or not lost:
             continue
         own = number.get(str(result["method"]), _REST)
-        wide, tall = _span(acted, scale), _span(lost, 1)  # of percentage points already
+        wide, tall = _span(acted, scale), _span(lost, 1)  # `lost` is in percentage points
         x, y = scale * acted["mean"].value, lost["mean"].value
         found.append(Spot(str(result["variant"]), x, y, wide, tall, own))
     return found
@@ -82,7 +82,7 @@ def _span(estimate: At, scale: float) -> tuple[float, float] | None:
 
 
 def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Series]]:
-    """The values of knobs that did not diverge, and the lines that join a variant's."""
+    """The values of knobs that did not diverge, and a line through those of each variant."""
     spots, lines = [], {}
     for point in compared["tuning"]:
         success, error = point["success"].value, point[_OPEN].value
@@ -102,13 +102,13 @@ def _tried(compared: At, number: dict[str, int]) -> tuple[list[Spot], list[Serie
 
 
 def tasks(compared: At, report: Any) -> Iterator[Markup]:
-    """A table for each task: every declared figure that some variant has."""
+    """A table for each task, with every declared figure that some variant has."""
     for task, found in zip(compared["tasks"], report.tasks, strict=True):
         asked = f", asked {task['vqa']}" if task["vqa"] else ""
         fields = [name for name in _DECLARED if any(r[name] for r in task["results"])]
         barred = any(r["bar"] for r in task["results"])
         turned = any(row.knob is not None for row in found.results)
-        # A column that no variant has anything for is left out: a list times False is empty.
+        # Columns that no variant has a value for are left out: a list times False is empty.
         header = ["Variant", *["Knob"] * turned, *(_DECLARED[name].header for name in fields)]
         rows = []
         for result, own in zip(task["results"], found.results, strict=True):
@@ -122,14 +122,14 @@ def tasks(compared: At, report: Any) -> Iterator[Markup]:
                 "t, which may reach beyond 0 and 100 %, and the crossed bootstrap. ",
                 *_before(task),
             ),
-            table(header + ["Bar"] * barred, rows, left=1 + turned),  # the knob is a text too
+            table(header + ["Bar"] * barred, rows, left=1 + turned),  # the knob is text too
             note(_OPEN_LOOP) if any(r["open_loop_error"] for r in task["results"]) else None,
             _demands(task["results"]) if barred else None,
         )
 
 
 def passing(compared: At) -> str:
-    """A sentence on who passes the bar, where there is one."""
+    """A sentence on the variants that pass the bar, if there is one."""
     said = []
     for task in compared["tasks"]:
         barred = [result for result in task["results"] if result["bar"]]
@@ -149,7 +149,7 @@ def passing(compared: At) -> str:
 
 
 def _before(task: At) -> list[Child]:
-    """What the backbone knew."""
+    """The backbone's VQA accuracy before training."""
     if task["baseline_accuracy"].value is None:
         return []
     before, majority = share(task["baseline_accuracy"]), share(task["majority_accuracy"])
@@ -157,7 +157,7 @@ def _before(task: At) -> list[Child]:
 
 
 def _figure(found: At, name: str) -> Child:
-    """A mean over its interval, or a plain number, in the digits that are declared."""
+    """A mean with its interval below, or a plain number, with the declared digits."""
 
     def write(at: At) -> Markup:
         return shown(at, shown_as(_DECLARED[name]))
@@ -168,7 +168,7 @@ def _figure(found: At, name: str) -> Child:
 
 
 def _ends(estimate: At) -> tuple[At, At] | None:
-    """Both ends by Student's t and by the crossed bootstrap, as the terminal's tables judge."""
+    """Both ends over Student's t and the crossed bootstrap, as in the terminal's tables."""
     return farthest(estimate["interval"], estimate["crossed"])
 
 
@@ -194,10 +194,10 @@ def _demands(results: At) -> Markup:
 
 
 def _checked(check: At) -> Sequence[Child]:
-    """A demand's figure, its verdict, and below them the interval by whose end it is judged."""
+    """A demand's figure and verdict, with the interval whose end is judged below."""
     judged, value, digits = verdict(check["passed"].value), check["value"].value, 2
     demand = check["demand"].value
-    if check["interval"]:  # the upper end is judged where the demand is of a greatest value
+    if check["interval"]:  # for a demand with a largest value, the upper end is judged
         value = check["interval"].value[demand.startswith("<")]
     if value is not None:
         digits = deciding_decimals(value, demand, digits)

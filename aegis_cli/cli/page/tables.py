@@ -1,4 +1,4 @@
-"""Tables as HTML: of figures, and of the views that the terminal shows."""
+"""Tables as HTML, of figures and of the views that the terminal shows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def table(
     left: int = 1,
     caption: Child = None,
 ) -> Markup:
-    """A table that scrolls sideways where the page is narrow; `left` columns are texts."""
+    """A table that scrolls sideways if the page is narrow; the first `left` columns are text."""
     names = [
         element("th", name, scope="col", class_="text" if i < left else None)
         for i, name in enumerate(header)
@@ -33,7 +33,7 @@ def table(
 
 def _cells(row: Sequence[Child], left: int) -> Iterator[Markup]:
     for i, cell in enumerate(row):
-        if isinstance(cell, Markup) and cell.startswith("<td"):  # as `shaded` makes it
+        if isinstance(cell, Markup) and cell.startswith("<td"):  # made by `shaded`
             yield cell
         elif i == 0:
             yield element("th", cell, scope="row")
@@ -42,13 +42,13 @@ def _cells(row: Sequence[Child], left: int) -> Iterator[Markup]:
 
 
 def shaded(cell: Child, depth: float) -> Markup:
-    """A cell whose ground is the deeper, the nearer `depth` is to 1."""
+    """A cell with a background that is deeper the closer `depth` is to 1."""
     inside = min(max(depth, 0), 1)
     return element("td", cell, class_="shade", style=f"--depth:{inside:.3f}")
 
 
 def verdict(passed: bool | None, yes: str = "yes", no: str = "no") -> Child:
-    """Whether something is passed; a dash where nobody asked."""
+    """Whether something is passed; a dash for None."""
     if passed is None:
         return "–"
     return element("span", yes if passed else no, class_="yes" if passed else "no")
@@ -61,7 +61,7 @@ def pairs(values: Sequence[tuple[str, Child]], big: bool = False) -> Markup:
 
 
 def view(shown: RenderableType) -> Iterator[Markup]:
-    """The parts of what a terminal shows, a `Text`, a `Table`, or a `Group` of such."""
+    """The parts of a view of the terminal: a `Text`, a `Table`, or a `Group` of these."""
     for part in parts_of(shown):
         if isinstance(part, Table):
             yield _terminal_table(part)
@@ -73,7 +73,7 @@ def view(shown: RenderableType) -> Iterator[Markup]:
 def _terminal_table(shown: Table) -> Markup:
     header = [str(column.header) for column in shown.columns]
     left = sum(column.justify != "right" for column in shown.columns)  # texts come first
-    # rich keeps cells by column, HTML has them by row.
+    # rich stores cells by column, but HTML needs them by row.
     columns = [[str(cell) for cell in column.cells] for column in shown.columns]
     rows = [list(row) for row in zip(*columns, strict=True)]
     title = str(shown.title) if shown.title else None

@@ -1,4 +1,4 @@
-"""What a user sees: progress and messages on stderr, reports as tables or JSON on stdout, plots."""
+"""All output: progress and messages on stderr, reports as tables or JSON on stdout, plots."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The frontier plot: how much success each variant buys with how much of the VQA skill.
+"""The frontier plot: each variant's success and its loss of VQA accuracy.
 
-Where nothing can be rolled out, the open-loop error stands for success, with less of it to the
-right.
+If nothing can be rolled out, the open-loop error takes the place of success, with smaller errors to
+the right.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns
 
-# Okabe and Ito's colours, which the common kinds of colour blindness tell apart.
+# Okabe and Ito's colours, which people with common kinds of colour blindness can distinguish.
 _COLORS = ("#1a1a1a", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#e69f00")
 _REST = "#9a9a9a"
-_COLUMNS = columns(PolicyResult)  # what each figure is called, and its unit
+_COLUMNS = columns(PolicyResult)  # each figure's name and unit
 _LOST, _OPEN = "drop_points", "open_loop_error"
-_REFERENCES = ("naive", "aegis", "cotrain")  # methods that every other is held against
-_LINEAR = 1.0  # points; losses up to here are drawn to scale, larger ones on a log scale
+_REFERENCES = ("naive", "aegis", "cotrain")  # methods that all others are compared with
+_LINEAR = 1.0  # points; the scale is linear for losses up to here, logarithmic beyond
 _TICKS = (0, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
 def has_frontier(report: Any) -> bool:
     """Whether there is anything to draw.
 
-    There is nothing where every training diverged, or where nothing tells how well policies act.
+    There is nothing if every training diverged, or if nothing measures how well policies act.
     """
     return bool(_tried(report) or _compared(report))
 
 
 def frontier_plot(report: Any, path: Path) -> None:
-    """Points of VQA accuracy lost over success, better to the upper right.
+    """Plot points of VQA accuracy lost over success; the upper right is best.
 
     Stars are the compared means over seeds with their intervals, measured on probe questions and
-    evaluation episodes; thin lines with small circles are the values tried while tuning, of one
-    seed, on validation questions and episodes. At most six methods have a colour: those that
-    others are held against, and those no other beats in both; the rest is grey.
+    evaluation episodes. Thin lines with small circles are the values tried in tuning, with one
+    seed, on validation questions and episodes. At most six methods have a colour: first the
+    references, then those that no other method beats in both; the rest is grey.
 
     Raises:
         AegisError: nothing to draw, matplotlib missing, unknown suffix, or `path` cannot be
@@ -65,7 +65,7 @@ def _figure(report: Any) -> Any:
         _draw_compared(axis, result, colors[result.method])
     _scale(axis, report)
     _explain(drawn, axis, bool(tried), bool(compared))
-    drawn.draw_without_rendering()  # labels are placed in pixels, which only a layout knows
+    drawn.draw_without_rendering()  # labels are placed in pixels, which needs the layout
     place(axis, _labels(tried, compared, colors), _taken(tried, compared))
     return drawn
 
@@ -76,16 +76,16 @@ def _tried(report: Any) -> list[Any]:
 
 
 def _compared(report: Any) -> list[Any]:
-    """The compared variants of the task that was tuned, as far as it is known how they act.
+    """The compared variants of the tuned task that have a figure for how they act.
 
-    Without tuning they are those of the first task.
+    Without tuning, it is the first task.
     """
     chosen = chosen_task(report)
     return [] if chosen is None else [r for r in chosen.results if r.accuracy and _acts(r)]
 
 
 def chosen_task(report: Any) -> Any:
-    """The table that the frontier shows: the tuned task's, or else the first; None of none."""
+    """The table of the frontier: that of the tuned task, or the first one; None without tables."""
     return next(
         (t for t in report.tasks if t.task == report.tuning_task),
         report.tasks[0] if report.tasks else None,
@@ -93,7 +93,7 @@ def chosen_task(report: Any) -> Any:
 
 
 def shown_tasks(report: Any) -> str:
-    """The task of the means, and that of the values tried where it is another."""
+    """The task of the means, and the task of the tried values if it is another."""
     tried, means = report.tuning_task, chosen_task(report) if _compared(report) else None
     if means is None or (_tried(report) and means.task == tried):
         return f"task {tried}"
@@ -103,7 +103,7 @@ def shown_tasks(report: Any) -> str:
 
 
 def acting_axis(report: Any) -> str:
-    """What the frontier's axis of success says; of a task without held-out colours, no colours."""
+    """The label of the frontier's axis of success; without colours if the task has none."""
     if by_error(report):
         return str(_COLUMNS[_OPEN].axis)
     acting = next(map(_acting, _compared(report)), "success_seen")
@@ -111,7 +111,7 @@ def acting_axis(report: Any) -> str:
 
 
 def _has_colors(report: Any) -> bool:
-    """Whether the frontier's task has held-out colours, or else a return; MetaWorld's have none."""
+    """Whether the frontier's task has held-out colours or a return; MetaWorld's have neither."""
     task = chosen_task(report)
     known = task.results if task is not None else []
     acted = [found for found in known if found.success_seen is not None]
@@ -119,7 +119,7 @@ def _has_colors(report: Any) -> bool:
 
 
 def _acting(result: Any) -> str:
-    """Which figure says how well it acts: success on seen colours, a return, or an error."""
+    """The name of the figure for how well it acts: success on seen colours, a return, an error."""
     if result.return_share is not None:
         return "return_share"
     is_evaluated = result.success_seen is None and result.open_loop_error is not None
@@ -127,7 +127,7 @@ def _acting(result: Any) -> str:
 
 
 def by_error(report: Any) -> bool:
-    """Whether the frontier shows open-loop errors, since nothing was rolled out."""
+    """Whether the frontier shows open-loop errors, because nothing was rolled out."""
     compared = [_acting(result) == _OPEN for result in _compared(report)]
     return any(compared or [point.success is None for point in _tried(report)])
 
@@ -165,7 +165,7 @@ def _colors(tried: Sequence[Any], compared: Sequence[Any]) -> dict[str, str]:
 
 
 def coloured_methods(report: Any) -> list[str]:
-    """The methods with a colour of their own: references, those that none beats, then others."""
+    """The methods with their own colour: references, those that no other beats, then others."""
     return _named(_tried(report), _compared(report))
 
 
@@ -176,13 +176,13 @@ def _named(tried: Sequence[Any], compared: Sequence[Any]) -> list[str]:
     else:
         spots = [(p.method, *_tried_at(p)) for p in tried]
     if any(_acting(r) == _OPEN for r in compared) or any(p.success is None for p in tried):
-        spots = [(method, -error, lost) for method, error, lost in spots]  # less of it is better
+        spots = [(method, -error, lost) for method, error, lost in spots]  # lower error is better
     first = [method for method in _REFERENCES if method in methods]
     return list(dict.fromkeys([*first, *_unbeaten(spots), *methods]))[: len(_COLORS)]
 
 
 def _unbeaten(spots: Sequence[tuple[str, float, float]]) -> list[str]:
-    """Methods of which no other succeeds more often and loses less, the most successful first."""
+    """Methods that no other method beats in both success and loss, most successful first."""
     best = []
     for method, success, lost in spots:
         beaten = False
@@ -195,7 +195,7 @@ def _unbeaten(spots: Sequence[tuple[str, float, float]]) -> list[str]:
     return [method for _, method in sorted(best, reverse=True)]
 
 
-# --- what is drawn --------------------------------------------------------------------------------
+# --- drawing --------------------------------------------------------------------------------------
 
 
 def _draw_tried(axis: Any, points: Sequence[Any], color: str) -> None:
@@ -212,7 +212,7 @@ def _draw_tried(axis: Any, points: Sequence[Any], color: str) -> None:
 
 def _draw_compared(axis: Any, result: Any, color: str) -> None:
     success, lost = _compared_at(result)
-    front = 4 if color == _REST else 5  # grey lies behind what has a colour
+    front = 4 if color == _REST else 5  # grey is behind colours
     bars = {"xerr": _bars(_acts(result), _unit(result)), "yerr": _bars(result.drop_points, 1)}
     shade = 0.25 if color == _REST else 0.45
     look = {"ecolor": color, "elinewidth": 1.1, "alpha": shade, "fmt": "none"}
@@ -222,12 +222,12 @@ def _draw_compared(axis: Any, result: Any, color: str) -> None:
 
 
 def _unit(result: Any) -> float:
-    """What 1 of the figure of acting is on the axis: 100 % of a share."""
+    """The length of 1 on the axis of the figure: 100 for a share in percent."""
     return _COLUMNS[_acting(result)].shown(1.0)
 
 
 def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
-    """The lengths of an interval's two sides [2, 1], as matplotlib has error bars."""
+    """The lengths of an interval's two sides [2, 1], as matplotlib expects for error bars."""
     if estimate.ends is None:
         return None
     low, high = estimate.ends
@@ -235,20 +235,20 @@ def _bars(estimate: Any, unit: float) -> list[list[float]] | None:
 
 
 def _scale(axis: Any, report: Any) -> None:
-    """Up is better: the axis of what is lost is turned around.
+    """Set the axes; the axis of the loss is inverted, so that up is better.
 
-    Beyond a point it is a log scale, because the variants that keep most lie within a few points,
-    and the others lose dozens.
+    Beyond one point it is logarithmic, because the variants that keep most are within a few points
+    of each other and the others lose dozens.
     """
     tried, compared = _tried(report), _compared(report)
     spots = [*map(_tried_at, tried), *map(_compared_at, compared)]
     across, lost = [x for x, _ in spots], [y for _, y in spots]
     errs = by_error(report)
     margin = max(0.02 if errs else 2.0, 0.08 * (max(across) - min(across)))
-    if errs:  # the axis is turned around as well: less is better
+    if errs:  # this axis is inverted as well, since a lower error is better
         left, right = max(across) + margin, max(min(across) - margin, 0.0)
     else:
-        # A return may surpass the expert's; no success is below 0 % or above 100 %.
+        # A return may exceed the expert's, but a success is between 0 % and 100 %.
         left, right = max(min(across) - margin, -1.0), max(across) + margin
         if all(_acting(result) != "return_share" for result in compared):
             right = min(right, 101.0)
@@ -256,7 +256,7 @@ def _scale(axis: Any, report: Any) -> None:
     axis.set_yscale("symlog", linthresh=_LINEAR, linscale=0.7)
     axis.set_yticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
     axis.minorticks_off()
-    # After the ticks, which widen the axis to the last of them. The larger end is below.
+    # After the ticks, which extend the axis to the last of them. The larger end is at the bottom.
     axis.set_ylim(1.4 * max(max(lost), _LINEAR), min(min(lost), 0) - 0.2)
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
@@ -266,7 +266,7 @@ def _scale(axis: Any, report: Any) -> None:
 
 
 def _explain(drawn: Any, axis: Any, tuned: bool, compared: bool) -> None:
-    """What the marks mean, and the way that is better."""
+    """Explain the marks, and which direction is better."""
     from matplotlib.lines import Line2D
 
     def grey(label: str, marker: str, size: float, face: str | None = None) -> Line2D:
@@ -307,7 +307,7 @@ def _explain(drawn: Any, axis: Any, tuned: bool, compared: bool) -> None:
 
 
 def _labels(tried: Sequence[Any], compared: Sequence[Any], colors: dict[str, str]) -> list[Label]:
-    """Each variant's name at its mean, or else at its chosen value; the coloured ones' values."""
+    """Each variant's name at its mean or its chosen value, and the values of coloured ones."""
     placed = {r.variant: (_compared_at(r), r.method) for r in compared}
     for name, points in _curves(tried).items():
         named = next((p for p in points if p.chosen), points[-1])
@@ -322,12 +322,12 @@ def _labels(tried: Sequence[Any], compared: Sequence[Any], colors: dict[str, str
         if point.value is not None and color != _REST:
             text = value_text(point.value)
             labels.append(Label(*_tried_at(point), text, color, size=7, bold=False))
-    # The larger a label, the harder it is to place: those go first.
+    # Larger labels come first, because they are harder to place.
     return sorted(labels, key=lambda label: -label.size)
 
 
 def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, float]]:
-    """Where labels hide something: marks, intervals, and the lines between a variant's values."""
+    """Points that labels should not cover: marks, intervals, lines between a variant's values."""
     spots = [*map(_compared_at, compared), *map(_tried_at, tried)]
     for result in compared:
         success, lost = _compared_at(result)
@@ -348,7 +348,7 @@ def _taken(tried: Sequence[Any], compared: Sequence[Any]) -> list[tuple[float, f
 def _between(
     first: tuple[float, float], second: tuple[float, float], parts: int = 12
 ) -> list[tuple[float, float]]:
-    """Points of the line from one to the other, without its ends."""
+    """Points on the line from one to the other, without its ends."""
     (x0, y0), (x1, y1) = first, second
     shares = [k / parts for k in range(1, parts)]
     return [(x0 + share * (x1 - x0), y0 + share * (y1 - y0)) for share in shares]

@@ -1,4 +1,4 @@
-"""What `aegis inspect` shows of an artifact, a model, a dataset or a run; and several runs."""
+"""What `aegis inspect` shows of an artifact, model, dataset or run, and `aegis compare` of runs."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, perc
 from aegis_cli.cli.render.tables import pairs, watched
 from aegis_cli.data.episodes import as_text
 
-_ANSWER = 60  # letters of one that a table shows
+_ANSWER = 60  # characters of an answer in a table
 
 
 def inspect(report: Any, tensors: bool = False) -> RenderableType:
-    """The facts, then the tables that there are; tensors are listed where they are asked for."""
+    """The facts, then the available tables; tensors are listed on request."""
     told = dict(report.facts)
     measured_while_it_trained = watched(told)
     facts = {"kind": report.kind, "path": report.path, **_as_they_are_read(told)}
-    facts["energy_shed_mean"] = report.energy_shed_mean  # without a line where it is None
+    facts["energy_shed_mean"] = report.energy_shed_mean  # no line if it is None
     parts: list[RenderableType] = [pairs(facts), *measured_while_it_trained]
     if report.kind == "run":
         parts += _measured(report)
@@ -66,7 +66,7 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
 
 
 def questions(report: Any) -> RenderableType:
-    """What a set of questions holds: what can be used, what cannot, and which answers there are."""
+    """The contents of a question set: usable and bad questions, and the common answers."""
     given = report.answers_a_question
     facts = {
         "kind": report.kind,
@@ -110,14 +110,14 @@ def _from_to(least: int, most: int) -> str:
 
 
 def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """The facts with one line on a run's steps, of how many where some are left, and its merge."""
+    """The facts as shown: a run's steps with the planned number if some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
-    # An anchor's maps that share a spectrum are rows of its table, with the same figures.
+    # "shared" is left out because an anchor's maps with a shared spectrum are rows of its table.
     apart = ("planned_steps", "measured_before", "shared")
     left = {name: value for name, value in facts.items() if name not in apart}
     merged = facts.get("merge")
     if merged:
-        # A merge whose sweep measured no validation loss has none.
+        # A merge has no validation loss if its sweep measured none.
         left["merge"] = {k.replace("_", " "): v for k, v in merged.items() if v is not None}
     if planned is None or steps is None or steps >= planned:
         return left
@@ -125,13 +125,13 @@ def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _steps_taken(steps: int | None, planned: int | None) -> str:
-    from aegis_cli.inspection import steps_taken  # which loads safetensors, not for --help
+    from aegis_cli.inspection import steps_taken  # imports safetensors, which --help must not
 
     return steps_taken(steps, planned)
 
 
 def _measured(report: Any) -> list[RenderableType]:
-    """How well a run does, what was lost, and whether its gate is passed."""
+    """A run's rollouts, open-loop errors and probes, and whether its gate is passed."""
     parts: list[RenderableType] = []
     if report.rollouts:
         parts.append(_played(report.rollouts))
@@ -146,14 +146,14 @@ def _measured(report: Any) -> list[RenderableType]:
 
 
 def _not_measured(facts: Mapping[str, Any]) -> Text:
-    """Why a run has no figures, and how it gets some."""
+    """Why a run has no figures, and how to measure some."""
     into, before = facts.get("merged_into"), facts.get("measured_before")
     if into:
         return Text(f"not measured: its weights were merged, see aegis inspect {quote(into)}")
     does = "aegis probe, aegis rollout and aegis evaluate do that"
     if facts.get("task", "") is None:  # a robot that is not simulated
         does = "aegis probe and aegis evaluate do that"
-    if before:  # the run went on since
+    if before:  # the run has trained further since
         steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
         of = f"what is measured is of {steps}, and not of the last checkpoint"
         return Text(f"{of}: measure again ({does})\n")
@@ -217,7 +217,7 @@ def _known(probes: Sequence[Any], question_sets: Sequence[str]) -> Table:
 
 
 def _gate(probed: Any) -> str:
-    """A probe's verdict, and the limit that it was held to, as far as it says that itself."""
+    """A probe's verdict, and its limit if the probe recorded one."""
     verdict = _VERDICTS[probed.figures.get("passed")]
     limit = probed.settings.get("max_drop")
     if verdict == "-" or limit is None:
@@ -233,7 +233,7 @@ def _ends(interval: Sequence[float] | None, write: Callable[[float], str]) -> st
 def _spectra(what: str, sites: Sequence[Any]) -> Table:
     """Each map's directions, and how many of them hold 90, 99 and 99.9 % of the energy.
 
-    What is stored with another map, which reads the same tensor, is told by its name.
+    For a map that is stored with another map of the same input, the name of that map is shown.
     """
     header = ("Map", what, "Directions", "90 %", "99 %", "99.9 %", "Stored")
     rows = [(x.name, x.kind, str(x.size), *map(str, x.kept), _stored(x)) for x in sites]
@@ -242,7 +242,7 @@ def _spectra(what: str, sites: Sequence[Any]) -> Table:
 
 def _stored(site: Any) -> str:
     if site.same_as is not None:
-        # It stands right above: what both names begin with says nothing.
+        # That map is in a row above, so the common start of both names is omitted.
         own, other = site.name.split("."), site.same_as.split(".")
         pairwise = zip(own, other, strict=False)
         alike = sum(1 for _ in takewhile(lambda words: words[0] == words[1], pairwise))
@@ -251,17 +251,17 @@ def _stored(site: Any) -> str:
 
 
 def _features(features: Sequence[Any]) -> Table:
-    """A line a feature, or one for each of its numbers where the dataset has statistics."""
-    # Without medians: LeRobot merges those of episodes into the least, which is no median.
+    """A line per feature, or a line per component if the dataset has statistics."""
+    # Without medians: LeRobot merges the episodes' medians into their minimum.
     shown = ("min", "q01", "q99", "max", "mean", "std")
     rows = []
     for feature in features:
         kind = (feature.dtype, " x ".join(map(str, feature.shape)))
-        columns = [feature.statistics.get(name, ()) for name in shown]  # one number a component
+        columns = [feature.statistics.get(name, ()) for name in shown]  # a number per component
         count = max(1, *map(len, columns))
         parts = list(feature.components)
         if count == 1 and (feature.dtype in ("image", "video") or not any(parts)):
-            # Without statistics, nothing is told of a picture's colours or of nameless numbers.
+            # Without statistics, images and unnamed components get a single line.
             parts = []
         names = [f"{feature.name} {part}".rstrip() for part in parts]
         names += [feature.name] * (count - len(names))  # statistics of components without names
@@ -272,13 +272,13 @@ def _features(features: Sequence[Any]) -> Table:
 
 
 def _as_ranges(layers: Sequence[str]) -> str:
-    """Names `layers.{i}` as `train.freeze` takes them: `layers.0-11, layers.13`."""
+    """Names `layers.{i}` in the form of `train.freeze`: `layers.0-11, layers.13`."""
     numbers = sorted(int(name.rpartition(".")[2]) for name in layers)
     return ", ".join(f"layers.{one}" for one in as_text(numbers).split(","))
 
 
 def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
-    """The course of the energy in a few lines; a report has many more bins, for a plot."""
+    """The energy over time in a few lines; a report has many more bins for a plot."""
     size = max(1, math.ceil(len(bins) / rows))
     lines = []
     for i in range(0, len(bins), size):
@@ -289,7 +289,7 @@ def _over_time(bins: Sequence[Any], rows: int = 8) -> Table:
 
 
 def _mean_shed(bins: Sequence[Any]) -> float:
-    """The mean over the steps of some bins, of which one may have a step more than another."""
+    """The mean over the steps of some bins, whose numbers of steps may differ by one."""
     steps = [b.last_step - b.first_step + 1 for b in bins]
     return sum(b.energy_shed * n for b, n in zip(bins, steps, strict=True)) / sum(steps)
 
@@ -302,7 +302,7 @@ _OF_QUESTIONS = ("VQA %", "Drop (points)", "W2²")
 _OF_EPISODES = ("Success seen %", "Success held-out %", "Return % of highest")
 _OPEN_LOOP = "Open-loop error"
 _VALIDATION = "Validation loss"
-# The columns in which the best and the worst are marked: the figure, and whether more is better.
+# Columns with marks for the best and the worst: the figure, and whether more is better.
 _BETTER = {
     "VQA %": ("accuracy", True),
     "Drop (points)": ("drop_points", False),
@@ -335,7 +335,7 @@ def compared(report: Any) -> RenderableType:
 
 
 def _shown_columns(report: Any) -> dict[str, list[Cell]]:
-    """The cells of each column that some run has a figure for, marked where they compare."""
+    """The cells of each column that some run has a figure for, with marks if comparable."""
     apart = _not_compared(report)
     shown = dict[str, list[Cell]]()
     for name, write in _columns(report).items():
@@ -351,7 +351,7 @@ def _shown_columns(report: Any) -> dict[str, list[Cell]]:
 
 
 def _not_compared(report: Any) -> set[str]:
-    """The columns whose figures are of other questions, episodes or frames with each run."""
+    """The columns whose figures are on different questions, episodes or frames."""
     apart = set[str]()
     if len(report.question_sets) > 1 or not report.same_questions:
         apart |= {*_OF_QUESTIONS}
@@ -365,7 +365,7 @@ def _not_compared(report: Any) -> set[str]:
 
 
 def _columns(report: Any) -> dict[str, Callable[[Any], str]]:
-    """What each column says of a row."""
+    """The function that formats a row for each column."""
     several, elsewhere = len(report.question_sets) > 1, not report.same_open_loop
     return {
         "Steps": lambda r: _steps_taken(r.steps, r.planned_steps),

@@ -1,4 +1,4 @@
-"""Labels beside the marks of a plot, placed so that they hide as little as can be."""
+"""Labels beside the marks of a plot, placed so that they hide as little as possible."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 from aegis_cli.cli.render.plots import literal
 
-_REACHES = (7, 13, 20, 30, 42)  # pixels at 100 a inch from the mark to the nearest side of a label
+_REACHES = (7, 13, 20, 30, 42)  # pixels (at 100 dpi) from the mark to the label's nearest side
 _ANGLES = 16
-_LEADER = 18  # from this distance on, a thin line leads from the label to its mark
+_LEADER = 18  # from this distance on, a thin line connects the label and its mark
 
 
 class Label(NamedTuple):
@@ -25,7 +25,7 @@ class Label(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Left, lower, right and upper side in pixels."""
+    """The left, lower, right and upper side in pixels."""
 
     left: float
     low: float
@@ -33,25 +33,25 @@ class Box(NamedTuple):
     high: float
 
     def overlap(self, other: Box) -> float:
-        """Area in common."""
+        """The area of the intersection."""
         width = min(self.right, other.right) - max(self.left, other.left)
         height = min(self.high, other.high) - max(self.low, other.low)
         return max(0.0, width) * max(0.0, height)
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a point lies in it, or within 3 pixels."""
+        """Whether a point is inside, or at most 3 pixels away."""
         return self.left - 3 < x < self.right + 3 and self.low - 3 < y < self.high + 3
 
 
 def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float]]) -> None:
-    """Write each label near its mark, in the order given, where it costs least.
+    """Write each label near its mark, in the given order, at the place with the lowest cost.
 
-    A place costs for every label it overlaps, every point of `taken` (in the axis's data) it
-    covers, for leaving the axis, and for its distance.
+    A place costs for every label that it overlaps, for every point of `taken` (in data coordinates)
+    that it covers, for leaving the axes, and for its distance.
     """
     from matplotlib.patheffects import withStroke
 
-    # From here on in pixels, in which a label has its size; a log scale is bent in data.
+    # In pixels from here on, because labels have sizes in pixels and log scales are not linear.
     points = [tuple(axis.transData.transform(spot)) for spot in taken]
     frame, written = Box(*axis.bbox.extents), _written(axis)
     for label in labels:
@@ -66,7 +66,7 @@ def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float
             va="bottom",
             zorder=8,
         )
-        text.set_in_layout(False)  # else the layout would make room, and every place be another
+        text.set_in_layout(False)  # otherwise the layout would make room and move everything
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         extent = text.get_window_extent()
         mark = tuple(axis.transData.transform((label.x, label.y)))
@@ -81,7 +81,7 @@ def place(axis: Any, labels: Sequence[Label], taken: Sequence[tuple[float, float
 
 
 def _written(axis: Any) -> list[Box]:
-    """What stands on the axis already."""
+    """The boxes of text that is already on the axes."""
     return [Box(*text.get_window_extent().extents) for text in axis.texts]
 
 
@@ -90,7 +90,7 @@ def _places(mark: tuple[float, float], width: float, height: float) -> Iterator[
     for reach in _REACHES:
         for k in range(_ANGLES):
             angle = 2 * math.pi * k / _ANGLES
-            # The box's centre lies on an ellipse that grows with the box.
+            # The box's centre is on an ellipse that grows with the box.
             x = mark[0] + math.cos(angle) * (reach + width / 2) - width / 2
             y = mark[1] + math.sin(angle) * (reach + height / 2) - height / 2
             yield reach, Box(x, y, x + width, y + height)
@@ -103,12 +103,12 @@ def _cost(
     points: Sequence[tuple[float, float]],
     frame: Box,
 ) -> float:
-    """What a place costs; the distance in pixels is the unit of all the rest."""
+    """The cost of a place, in the unit of its distance in pixels."""
     area = (box.right - box.left) * (box.high - box.low)
     overlaps = [box.overlap(other) / area for other in written]
     covered = sum(box.holds(*point) for point in points)
     outside = 1 - box.overlap(frame) / area
-    # However little two labels overlap, a place a step farther away is better.
+    # Even for a small overlap, a place one step farther away is better.
     hidden = sum(60 * share + 15 for share in overlaps if share > 0)
     return hidden + 10 * covered + 200 * outside + reach
 

@@ -1,4 +1,4 @@
-"""What all tables have in common: their look, and figures as text."""
+"""The common look of all tables, and figures as text."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def is_number(value: object) -> bool:
 
 
 def acting(rows: Sequence[Any]) -> dict[str, str]:
-    """Header -> field of what rows say of closed loops.
+    """Header -> field of the closed-loop figures of these rows.
 
-    Rows are of coloured targets, or of a task measured by its return.
+    The rows are for coloured targets, or for a task measured by its return.
     """
     return _SUCCESSES if all(row.return_share is None for row in rows) else _RETURNS
 
 
 Cell = str | Text
-# Marks that an output without colours and in plain ASCII shows, too.
+# Marks that also work without colours and in plain ASCII.
 BEST, WORST = "*", "!"
 MARKS = f"{BEST} best of its column, {WORST} worst"
 _STYLES = {BEST: "bold", WORST: "dim"}
@@ -45,16 +45,17 @@ _STYLES = {BEST: "bold", WORST: "dim"}
 def marked(
     cells: Sequence[str], values: Sequence[float | None], more_is_better: bool | None
 ) -> list[Cell]:
-    """The cells of a column, the best ones and the worst ones marked.
+    """The cells of a column with marks for the best and the worst.
 
-    Values that look alike are alike. Nothing is marked where all are, and no worst of two.
+    Values with the same text count as equal. Nothing is marked if all are equal, and no worst if
+    there are only two different values.
 
     Args:
-        values: of the cells; None of one without a figure.
-        more_is_better: None for a column with no good end.
+        values: the values of the cells; None for a cell without a figure.
+        more_is_better: None for a column in which neither direction is better.
     """
     known = {value: cell for cell, value in zip(cells, values, strict=True) if value is not None}
-    apart = len(set(known.values()))  # texts, so that what differs in unseen digits is alike
+    apart = len(set(known.values()))  # texts, so that a difference in hidden digits does not count
     if more_is_better is None or apart < 2:
         return list(cells)
     worst, best = known[min(known)], known[max(known)]
@@ -71,7 +72,7 @@ def marked(
 
 
 def unmarked(cell: Text) -> tuple[str, str]:
-    """A cell's mark, which may be none, and its text without it."""
+    """A cell's mark ("" if it has none), and its text without the mark."""
     mark = next((m for m, style in _STYLES.items() if cell.style == style), "")
     return mark, cell.plain.removeprefix(mark)
 
@@ -79,12 +80,12 @@ def unmarked(cell: Text) -> tuple[str, str]:
 def plain_table(
     header: Sequence[str], rows: Iterable[Sequence[Cell]], left: int = 1, title: str | None = None
 ) -> Table:
-    """Plain and aligned: the first `left` columns to the left, figures to the right."""
+    """A plain table with the first `left` columns aligned left and figures aligned right."""
     table = WideTable(left, title)
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < left else "right", overflow="fold")
     for row in rows:
-        # As a `Text`: rich would take what stands in brackets in a string for markup.
+        # As a `Text`, because rich would read brackets in a string as markup.
         table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
@@ -94,12 +95,12 @@ def percent(value: float | None, digits: int = 1) -> str:
 
 
 def fixed(value: float | None, digits: int) -> str:
-    """A number with that many digits after its point; what rounds to 0 has no sign."""
+    """A number with `digits` decimals; a value that rounds to 0 has no sign."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
 def number(value: float | None, significant: int = 4) -> str:
-    """Four significant digits; a large number whole, as long as it can be read."""
+    """A number with four significant digits; large numbers are whole while still readable."""
     if value is None:
         return "-"
     # From 9999.5 on four digits round to 10000, which `g` would write as 1e+04.
@@ -108,10 +109,10 @@ def number(value: float | None, significant: int = 4) -> str:
 
 
 def parts_of(view: RenderableType) -> Iterator[Table | Text]:
-    """The tables and texts of what a terminal shows, in their order, out of all `Group`s.
+    """The tables and texts of a view in their order, without the `Group`s.
 
     Raises:
-        TypeError: something else, which neither Markdown nor a page has a form for.
+        TypeError: the view has a part of another kind, which Markdown and pages cannot show.
     """
     match view:
         case Group():
@@ -124,16 +125,16 @@ def parts_of(view: RenderableType) -> Iterator[Table | Text]:
 
 
 def paragraphs(text: Text) -> list[str]:
-    """The lines of a text that are not blank; an indented line goes on with the one before."""
+    """The lines of a text that are not blank; an indented line continues the previous one."""
     lines = text.plain.replace("\n  ", " ").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
 
 def spread(estimate: Any, show: Callable[[float], str]) -> str:
-    """`mean ±half`: the distance of the farther end; the mean alone of a single run."""
+    """`mean ±half`, with the distance to the farther end; only the mean for a single run."""
     if estimate is None:
         return "-"
     if estimate.half is None:
         return show(estimate.mean)
-    half = show(estimate.half).removeprefix("+")  # of differences `show` writes the sign
+    half = show(estimate.half).removeprefix("+")  # `show` adds a sign to differences
     return f"{show(estimate.mean)} ±{half}"

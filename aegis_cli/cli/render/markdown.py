@@ -1,6 +1,6 @@
 """A report as Markdown, to be pasted into a README or a model card.
 
-It holds the terminal's titles, tables and notes.
+It has the same titles, tables and notes as the terminal.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ def save_table(report: Any, view: Callable[[Any], RenderableType]) -> None:
 
 
 def markdown(view: RenderableType) -> str:
-    """The view's parts, a blank line between them.
+    """The view's parts, separated by blank lines.
 
     Args:
-        view: a `Text`, a `Table`, or a `Group` of such.
+        view: a `Text`, a `Table`, or a `Group` of these.
     """
     return "\n\n".join(_blocks(view)) + "\n"
 
@@ -45,14 +45,14 @@ def _blocks(view: RenderableType) -> Iterator[str]:
 def _table(table: Table) -> str:
     header = [str(column.header) for column in table.columns]
     rules = ["---:" if column.justify == "right" else "---" for column in table.columns]
-    # rich keeps cells by column, Markdown has them by row.
+    # rich stores cells by column, but Markdown needs them by row.
     columns = [[_cell(cell) for cell in column.cells] for column in table.columns]
     rows = zip(*columns, strict=True)
     return "\n".join(map(_row, (header, rules, *rows)))
 
 
 def _cell(cell: RenderableType) -> str:
-    """The cell's text; the best of a column is bold, and the worst as the others."""
+    """The cell's text; the best of a column is bold, and the worst looks like the others."""
     if not isinstance(cell, Text):
         return str(cell)
     mark, text = unmarked(cell)
@@ -60,5 +60,5 @@ def _cell(cell: RenderableType) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    escaped = [cell.replace("|", r"\|") for cell in cells]  # which would end its cell
+    escaped = [cell.replace("|", r"\|") for cell in cells]  # a | would end the cell
     return f"| {' | '.join(escaped)} |"

@@ -1,4 +1,4 @@
-"""A merge as a table, and its sweep as a plot: what the policy pays for which answers."""
+"""A merge as a table, and its sweep as a plot of the trade-off between task and answers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLOR, _CHOSEN = "#0072b2", "#d55e00"
 
 
 def merge(report: Any) -> RenderableType:
-    """What was written, and the sweep's points."""
+    """The written merge, and the points of the sweep."""
     kept = None if report.kept is None else f"{percent(report.kept)} % of the displacement"
     facts = {
         "method": report.method,
@@ -39,7 +39,7 @@ def merge(report: Any) -> RenderableType:
 
 
 def _points(report: Any) -> Any:
-    """A line per strength, without a column that has no figure."""
+    """A line per strength, without columns that have no figures."""
     shown = {
         "Strength": lambda p: number(p.strength),
         "Kept %": lambda p: percent(p.kept),
@@ -57,9 +57,9 @@ def _points(report: Any) -> Any:
 
 
 def _next(report: Any) -> str:
-    """What to do with the finding: a strength that was chosen has to be judged on other data."""
+    """The next step: a chosen strength must be judged on other data."""
     if report.out is not None:
-        asked = []  # what is not the default of `aegis probe`
+        asked = []  # options that differ from the defaults of `aegis probe`
         if report.vqa not in (None, "scenes"):
             asked += ["--vqa", report.vqa]
         if report.ask not in (None, "{}"):
@@ -72,9 +72,9 @@ def _next(report: Any) -> str:
 
 
 def merge_plot(report: Any, path: Path) -> None:
-    """Draw a sweep: what is lost of the questions' answers against what is left of the task.
+    """Draw a sweep: the drop on the questions against the performance on the task.
 
-    Without a figure of the task, the kept share of the displacement stands for it.
+    Without a figure of the task, the kept share of the displacement takes its place.
 
     Raises:
         AegisError: `path` cannot be written.
@@ -100,7 +100,7 @@ def _frontier(report: Any) -> Any:
     axis.axhline(0, color="0.3", linestyle="--", linewidth=1)
     if report.max_drop is not None:
         axis.axhline(report.max_drop, color=_CHOSEN, linestyle=":", linewidth=1)
-    axis.invert_yaxis()  # what is lost: up is better
+    axis.invert_yaxis()  # so that up is better
     axis.set(xlabel=name, ylabel="VQA accuracy lost (points)")
     axis.set_title(f"Merge by '{report.method}', per strength, on validation data", loc="left")
     axis.grid(alpha=0.25)
@@ -109,7 +109,7 @@ def _frontier(report: Any) -> Any:
 
 
 def _task_axis(point: Any) -> tuple[str, float, str]:
-    """The field that says how well the task is done, its unit, and what the axis is called."""
+    """The field for the performance on the task, its unit, and the label of the axis."""
     if point.validation_loss is not None:
         return "validation_loss", 1.0, "validation loss of the policy"
     if point.task_accuracy is not None:

@@ -1,4 +1,4 @@
-"""Open-loop errors as tables, and predicted against recorded actions as a plot."""
+"""Open-loop errors as tables, and a plot of predicted against recorded actions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aegis_cli.cli.render.plots import figure, literal, save_figure
 from aegis_cli.cli.render.tables import pairs
 
 _RECORDED, _PREDICTED = "0.25", "#0072b2"
-_TITLE_CHARACTERS = 44  # of a line of the title, for each episode beside another
+_TITLE_CHARACTERS = 44  # per line of the title, for each of the episodes side by side
 _ROWS = 16  # of the table by steps ahead
 _WIDEST = 100  # characters of an instruction
 _SPLITS = {
@@ -28,7 +28,7 @@ _SPLITS = {
 
 
 def open_loop(report: Any) -> RenderableType:
-    """The error over all, by dimension, by steps ahead and by instruction."""
+    """The error over everything, by dimension, by steps ahead and by instruction."""
     error = fixed(report.relative_error, 3)
     if report.relative_interval is not None:
         low, high = (fixed(end, 3) for end in report.relative_interval)
@@ -38,7 +38,7 @@ def open_loop(report: Any) -> RenderableType:
     facts = {"task": report.task} if hasattr(report, "task") else {}
     facts |= {
         "data": report.data,
-        # A lone number would be read as how many there are.
+        # "episodes" with a single number would read as a count.
         "episodes" if len(report.episodes) > 1 else "episode": report.episodes,
         "chosen": _SPLITS[report.split],
         "frames": report.frames,
@@ -77,10 +77,10 @@ def _by_dimension(report: Any) -> Table:
 
 
 def _by_step(report: Any) -> Table:
-    """At most `_ROWS` steps, spread evenly, with the first and the last."""
+    """At most `_ROWS` evenly spread steps, including the first and the last."""
     count = len(report.horizon)
     rows = min(count, _ROWS)
-    # From 0 to the last one; a horizon of one step has no distance to divide.
+    # From 0 to the last step; `max` avoids a division by 0 for a horizon of one step.
     picked = sorted({round(i * (count - 1) / max(1, rows - 1)) for i in range(rows)})
     shown = {"Steps ahead": lambda step: str(step.step)}
     if report.fps is not None:
@@ -95,7 +95,7 @@ def _by_step(report: Any) -> Table:
 
 
 def _by_instruction(report: Any) -> Iterator[RenderableType]:
-    """The worst instructions, where there are several."""
+    """The worst instructions, if there are several."""
     every = report.instructions
     if len(every) < 2:
         return
@@ -116,7 +116,7 @@ def _by_instruction(report: Any) -> Iterator[RenderableType]:
 
 
 def _short(instruction: str) -> str:
-    """An instruction as a table shows it; a long one would push the errors out of sight."""
+    """An instruction shortened for a table, so that it does not push the errors out of sight."""
     said = " ".join(instruction.split())  # on one line
     if len(said) > _WIDEST:
         said = f"{said[: _WIDEST - 1]}…"
@@ -155,9 +155,9 @@ def _drawn(report: Any) -> Any:
 
 
 def _draw_trace(axis: Any, trace: Any, dimension: int) -> None:
-    """One dimension along one episode; each chunk is a line of its own, from a dot on."""
+    """One dimension along one episode; each chunk is a separate line that starts with a dot."""
     axis.plot(trace.recorded[:, dimension], color=_RECORDED, linewidth=1.2)
-    predicted = trace.predicted[:, dimension]  # [T], as `recorded`, of actions chunk after chunk
+    predicted = trace.predicted[:, dimension]  # [T], like `recorded`, one chunk after the other
     for first in range(0, len(predicted), trace.replan):
         frames = range(first, min(first + trace.replan, len(predicted)))
         axis.plot(frames, predicted[frames.start : frames.stop], color=_PREDICTED, linewidth=1.2)

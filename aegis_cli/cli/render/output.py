@@ -20,12 +20,12 @@ from rich.text import Text
 
 from aegis_cli.common.errors import AegisError
 
-_WIDE = 200  # columns where nothing sets a width, so that piped tables never wrap
+_WIDE = 200  # columns if nothing sets a width, so that piped tables never wrap
 _UNLIMITED = 10_000
 STDOUT = "standard output"
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 _TRAILING_BLANKS = re.compile(r"(?:[ ]|\x1b\[[0-9;]*m)+$", re.MULTILINE)  # and changes of style
-# What stands for characters of ours in an output whose encoding has not got them.
+# Replacements for our characters in an output whose encoding does not have them.
 _PLAIN = {"²": "^2", "±": "+-", "→": "->", "≥": ">=", "≤": "<=", "…": "...", "–": "-", "·": "-"}
 
 
@@ -35,7 +35,7 @@ def error(problem: AegisError) -> None:
     for label, style in (("found", "bold red"), ("expected", "bold"), ("fix", "bold green")):
         text = visible(getattr(problem, label))
         between = "" if text.startswith("\n") else " "  # several problems are a list below
-        # Not wrapped, so that a command in it can be copied, and a line is found by grep.
+        # Not wrapped, so that commands in it can be copied and grep finds lines.
         to.print(Text.assemble((f"{label}:", style), between, text), soft_wrap=True)
 
 
@@ -50,7 +50,7 @@ def show(
     """The report on stdout, as a table or as one JSON document (NaN and infinity become null).
 
     Args:
-        wide: give each table one line a row, however narrow the terminal is.
+        wide: write each row of a table on a single line, even on a narrow terminal.
     """
     if as_json:
         text(json.dumps(document(report), indent=2, allow_nan=False) + "\n")
@@ -58,22 +58,23 @@ def show(
         to = console(sys.stdout)
         if wide:
             to.width = _UNLIMITED
-        # Not printed right away: rich fills the last column of a table with blanks.
+        # Not printed directly, because rich pads the last column of a table with blanks.
         with to.capture() as printed:
             to.print(table(_visible_in(report)))
         text(_without_trailing_blanks(printed.get()))
 
 
 def _without_trailing_blanks(text: str) -> str:
-    """Lines that end with what can be seen; changes of style stay, blanks between them go."""
+    """The lines without trailing blanks; changes of style stay."""
     return _TRAILING_BLANKS.sub(lambda end: "".join(_STYLE.findall(end[0])), text)
 
 
 def visible(text: str) -> str:
-    """A text whose control characters are written out, but for line ends and tabs.
+    """A text with control characters written out, except line ends and tabs.
 
-    A file's metadata could else move the terminal's cursor, or set its title. Nor can a byte of a
-    file's name that is no text, which Python has as half of a surrogate pair, be written in UTF-8.
+    Otherwise a file's metadata could move the terminal's cursor or set its title. Undecodable bytes
+    of a file name, which Python represents as lone surrogates, are written out too, because they
+    cannot be encoded in UTF-8.
     """
     return "".join(_escaped(char) if _is_unwritable(char) else char for char in text)
 
@@ -87,8 +88,8 @@ def _escaped(char: str) -> str:
 
 
 def _visible_in(value: Any) -> Any:
-    """A report whose texts are all `visible`."""
-    # What has nothing to change is given back itself, for a report may hold large arrays.
+    """A report with all its texts made `visible`."""
+    # Unchanged values are returned without a copy, because a report may hold large arrays.
     if isinstance(value, str):
         shown = visible(value)
         return value if shown == value else shown
@@ -103,32 +104,32 @@ def _visible_in(value: Any) -> Any:
     if isinstance(value, Mapping):
         items = {_visible_in(name): _visible_in(inner) for name, inner in value.items()}
         return value if items == value else items
-    if type(value) in (list, tuple):  # not a named tuple, which takes its items one by one
+    if type(value) in (list, tuple):  # not a named tuple, whose constructor takes single items
         parts = type(value)(_visible_in(inner) for inner in value)
         return value if parts == value else parts
     return value
 
 
 def text(lines: str) -> None:
-    """Lines on stdout just as they are, for another program too: never wrapped.
+    """Lines on stdout unchanged and never wrapped, also for other programs.
 
-    They are written at once, so that a full disk is found while the exit code can tell it.
+    They are flushed at once, so that a full disk is noticed while the exit code can still show it.
     """
     sys.stdout.write(lines)
     sys.stdout.flush()
 
 
 def console(file: TextIO) -> Console:
-    """A console on `file`: as wide as the terminal or as COLUMNS says, else very wide."""
-    # Else rich takes 80 columns for a pipe, and what reads it would find its lines broken.
+    """A console on `file`: as wide as the terminal or COLUMNS, otherwise very wide."""
+    # By default rich uses 80 columns for a pipe, which would break lines for other programs.
     told = file.isatty() or os.environ.get("COLUMNS", "").isdigit()
     return Terminal(file=file, width=None if told else _WIDE, highlight=False)
 
 
 def write_any_character(stream: TextIO) -> None:
-    """Let a stream replace characters that its encoding has not got, where it would raise."""
+    """Let a stream replace characters that its encoding does not have, instead of raising."""
     codecs.register_error("aegis.plain", _plainly)
-    if isinstance(stream, io.TextIOWrapper):  # else a test has put something in its place
+    if isinstance(stream, io.TextIOWrapper):  # otherwise a test has replaced it
         stream.reconfigure(errors="aegis.plain")
 
 
@@ -140,9 +141,9 @@ def _plainly(error: UnicodeError) -> tuple[str, int]:
 
 
 def name_errors(stream: TextIO, name: str) -> None:
-    """Let the errors of writing to a stream name it: the system has no path of it to tell.
+    """Add the stream's name to errors of writing to it, since the system knows no path for it.
 
-    To do so again changes nothing, so that one process may run many commands.
+    A second call changes nothing, so one process may run many commands.
     """
     for method in ("write", "flush"):
         call = getattr(stream, method)
@@ -152,7 +153,7 @@ def name_errors(stream: TextIO, name: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Naming:
-    """A call whose errors name the stream that it is of."""
+    """A method of a stream whose errors name the stream."""
 
     call: Callable[..., Any]
     name: str
@@ -166,9 +167,9 @@ class _Naming:
 
 
 class Terminal(Console):
-    """A console that leaves a reader who has gone to whoever decides on exit codes.
+    """A console that re-raises a broken pipe, so that exits.py decides on the exit code.
 
-    Rich's own would exit with 1, the code of a failed gate.
+    Rich's own console would exit with 1, the code of a failed gate.
     """
 
     def on_broken_pipe(self) -> None:
@@ -176,17 +177,17 @@ class Terminal(Console):
 
 
 def document(report: Any) -> dict[str, Any]:
-    """What `--json` prints of a report, as plain values."""
+    """The plain values that `--json` prints for a report."""
     return _plain(_values(report))
 
 
 def _values(report: Any) -> dict[str, Any]:
-    """The report's fields, or what it says itself: it may add the older names of some."""
+    """The report's fields, or its own `to_json`, which may add older names of some fields."""
     return report.to_json() if hasattr(report, "to_json") else dataclasses.asdict(report)
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON can have it, which knows no path, no infinity and no NaN."""
+    """A value that JSON can represent: without paths, infinity and NaN."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

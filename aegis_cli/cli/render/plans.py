@@ -1,4 +1,4 @@
-"""What `aegis run --dry-run` has found: the stages that would run, and what trainings need."""
+"""The output of `aegis run --dry-run`: the stages that would run, and the trainings' needs."""
 
 from __future__ import annotations
 
@@ -58,5 +58,5 @@ def _of_study(report: Any) -> Iterator[RenderableType]:
 
 
 def _state(one: Any) -> str:
-    """Whether a stage or cell would be skipped, else why it would not."""
+    """Whether a stage or cell would be skipped, or why it would run."""
     return "up to date" if one.due is None else f"would run: {one.due}"

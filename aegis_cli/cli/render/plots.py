@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 _DECADES = 4  # of the log scale of the energy
-_PANELS, _CELL = 5, 0.29  # of the routing: tasks a line; inches of a cell's width
-_TITLED = 6.8  # width in inches that the routing's title and legend need
+_PANELS, _CELL = 5, 0.29  # of the routing: tasks per line; width of a cell in inches
+_TITLED = 6.8  # width in inches of the routing's title and legend
 _WRITTEN = {"fontsize": 6.5, "ha": "center", "va": "center"}
 _PATCH = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 _IMPOSSIBLE, _NOTHING, _PRUNED = "#b8b8b8", "#ededed", "#c81e2d"
@@ -41,20 +41,20 @@ def energy_plot(report: Any, path: Path) -> None:
 
 
 def save_figure(draw: Callable[[], Any], path: Path) -> None:
-    """What `draw` draws, into a file whose suffix says how.
+    """Save the figure of `draw` to a file, in the format of its suffix.
 
     Raises:
         AegisError: matplotlib missing, unknown suffix, or `path` cannot be written.
     """
     check_plot(path)
-    # Drawn in memory, for matplotlib would leave half a file where it fails.
+    # Drawn in memory, because matplotlib would leave a partial file if it fails.
     image = io.BytesIO()
     draw().savefig(image, format=path.suffix.lower()[1:], dpi=150)
     write_atomically(path, lambda file: file.write(image.getvalue()))
 
 
 def check_plot(path: Path) -> None:
-    """Raise AegisError for a file whose suffix names no picture."""
+    """Raise AegisError for a file whose suffix is not an image format."""
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise AegisError(
             f"--plot {path}",
@@ -64,36 +64,36 @@ def check_plot(path: Path) -> None:
 
 
 def literal(text: str) -> str:
-    """A name or a path as it is: matplotlib takes what lies between two $ for maths."""
+    """A name or a path with $ escaped: matplotlib reads text between two $ as maths."""
     return text.replace("$", r"\$")
 
 
 def figure(**options: Any) -> Any:
-    """An empty figure of matplotlib's Agg canvas: no pyplot, no display, no global state."""
+    """An empty figure with matplotlib's Agg canvas: no pyplot, no display, no global state."""
     from matplotlib.figure import Figure
 
     return Figure(**options)
 
 
 def _energy(report: Any) -> Any:
-    """A heat map of layers and steps above the course of all layers, which share their steps."""
+    """A heat map of layers and steps above the curve of all layers, with a common step axis."""
     from matplotlib.ticker import LogFormatter
 
     count, bins = len(report.layers), report.over_time
-    # Sizes in inches: the heat map grows with its rows, and its row of the grid with it.
+    # Sizes in inches; the heat map and its row of the grid grow with the number of layers.
     drawn = figure(figsize=(9.5, 3.6 + 0.24 * count), layout="constrained")
     top, below = drawn.subplots(2, 1, sharex=True, height_ratios=(max(1.0, 0.15 * count), 0.8))
     edges = [b.first_step - 0.5 for b in bins] + [bins[-1].last_step + 0.5]  # [bins + 1]
     drawn.suptitle(_finding(report), x=0.01, ha="left", fontsize=12, fontweight="bold")
     heat, least = _energy_of_layers(top, report, edges)
     bar = drawn.colorbar(heat, ax=top, label="energy shed (%)", pad=0.01, format="%g")
-    bar.ax.yaxis.set_minor_formatter(LogFormatter())  # of scales within a decade
+    bar.ax.yaxis.set_minor_formatter(LogFormatter())  # for scales within a decade
     _energy_of_all(below, report, edges, least)
     return drawn
 
 
 def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[Any, float]:
-    """The heat map, a row per layer, and the least percentage that its scale tells apart."""
+    """The heat map with a row per layer, and the smallest percentage on its scale."""
     import numpy as np
     from matplotlib.colors import LogNorm
 
@@ -101,7 +101,7 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
     by_bin = np.array([bin.layers for bin in report.over_time])  # [bins, layers]
     shares = 100 * by_bin.T  # percent [layers, bins]
     least, most = _decades(shares)
-    # What sheds nothing has no place on a log scale, and is the background's grey.
+    # Layers that shed nothing cannot be drawn on a log scale and show the background's grey.
     axes.set_facecolor(_NOTHING)
     heat = axes.pcolormesh(
         edges,
@@ -112,8 +112,8 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
     )
     rows, size = [i + 0.5 for i in range(len(names))], 9 if len(names) <= 24 else 6
     axes.set_yticks(rows, names, fontsize=size)
-    axes.invert_yaxis()  # the first layer on top, as the data flows
-    means = axes.secondary_yaxis("right")  # it has no scale of its own, and shows texts
+    axes.invert_yaxis()  # the first layer on top, in the order of the data flow
+    means = axes.secondary_yaxis("right")  # only for texts
     means.set_yticks(rows, [_percent(x.energy_shed) for x in report.layers], fontsize=size)
     means.tick_params(length=0)
     title = f"{literal(report.path)}; on the right each group's mean; grey: nothing shed"
@@ -122,12 +122,12 @@ def _energy_of_layers(axes: Any, report: Any, edges: Sequence[float]) -> tuple[A
 
 
 def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float) -> None:
-    """The course of the energy shed by all layers together, with its mean as a dashed line."""
+    """The energy shed by all layers together over time, with its mean as a dashed line."""
     import numpy as np
     from matplotlib.ticker import LogFormatter, MaxNLocator
 
     course = 100 * np.array([b.energy_shed for b in report.over_time])
-    # Nothing shed would have no place on a log scale, and stands at its lower end.
+    # Zero cannot be drawn on a log scale and is drawn at its lower end.
     axes.stairs(np.maximum(course, least), edges, color="tab:blue", baseline=None)
     axes.set_yscale("log")
     if report.energy_shed_mean:
@@ -150,18 +150,18 @@ def _energy_of_all(axes: Any, report: Any, edges: Sequence[float], least: float)
 
 
 def _decades(shares: np.ndarray) -> tuple[float, float]:
-    """The log scale's ends, in percent: at most `_DECADES` below the largest share."""
+    """The ends of the log scale in percent: at most `_DECADES` decades below the largest share."""
 
     positive = shares[shares > 0]
     if not positive.size:
         return 0.1, 1.0
     most = float(positive.max())
     least = max(float(positive.min()), most / 10**_DECADES)
-    return min(least, most / 10), most  # one decade at least, where all shares are alike
+    return min(least, most / 10), most  # at least one decade, even if all shares are equal
 
 
 def _finding(report: Any) -> str:
-    """What the plot shows, in a sentence."""
+    """The finding of the plot in a sentence."""
     mean = report.energy_shed_mean
     if not mean:
         return "The projection sheds nothing: no gradient ever conflicts with the anchor's"
@@ -175,19 +175,19 @@ def _finding(report: Any) -> str:
 
 
 def _percent(share: float) -> str:
-    """Two digits, whatever its size."""
+    """A percentage with two significant digits."""
     digits = f"{100 * share:#.2g}".removesuffix(".")
     return f"{digits if share else 0} %"
 
 
 def routing_plot(inspection: Any, path: Path) -> None:
-    """Draw each task's routing mass on the experts that each task brought, for each map.
+    """Draw each task's routing mass on the experts that each task added, for each map.
 
     The image is a heat map in a PNG, PDF or SVG.
 
     There is one panel per task, with values in percent. Grey: the experts' task had not come yet.
-    Pale: the router uses none of that task's experts. A cross with a number: so many of the task's
-    own candidates were pruned.
+    Pale: the router uses none of that task's experts. A cross with a number: this many of the
+    task's own candidates were pruned.
 
     Raises:
         AegisError: no routers in the run, matplotlib missing, unknown suffix, or `path` cannot be
@@ -225,7 +225,7 @@ def _routing(report: Any, path: str) -> Any:
         axes.set_visible(False)
     panels[0].set_yticks([i + 0.5 for i in range(len(sites))], sites)
     panels[0].set_xticks([i + 0.5 for i in range(count)], range(1, count + 1))
-    panels[0].invert_yaxis()  # of all panels, which share it
+    panels[0].invert_yaxis()  # for all panels, which share it
     title = "Routing mass (%) after each task; a column holds the experts that one task brought"
     drawn.suptitle(f"{title}\n{literal(path)}", x=0.01, ha="left", fontsize=11)
     drawn.colorbar(heats[-1], ax=panels, label="routing mass (%)", pad=0.01, aspect=40)
@@ -237,7 +237,7 @@ def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any
     """One task's panel, with a row per map and a column per earlier or later task."""
     import numpy as np
 
-    # Percent [maps, owners]; masked: no expert. With zeros there, for matplotlib scales them too.
+    # Percent [maps, owners]; masked: no expert. Filled with 0, as matplotlib scales masked values.
     mass = np.ma.array(np.zeros((len(sites), count)), mask=True)
     for row, site in enumerate(sites):
         pruned = 0 if site is None else len(site.pruned)
@@ -245,19 +245,19 @@ def _task_routing(axes: Any, task: int, sites: Sequence[Any], count: int) -> Any
             share = _from_owner(site, owner, count)
             if share is not None:
                 mass[row, owner] = 100 * share
-                # Where candidates were pruned, their mark needs the upper right corner.
+                # If candidates were pruned, their mark needs the upper right corner.
                 x, y = (0.4, 0.62) if pruned and owner == task else (0.5, 0.5)
                 look = {**_WRITTEN, "color": "black" if share > 0.6 else "white"}
                 axes.text(owner + x, row + y, f"{100 * share:.0f}", **look)
         if pruned:
             look = {**_WRITTEN, "color": _PRUNED, "fontweight": "bold"}
-            if np.ma.getmaskarray(mass)[row, task]:  # nothing is left of them
+            if np.ma.getmaskarray(mass)[row, task]:  # none of the new experts is left
                 axes.text(task + 0.5, row + 0.5, f"×{pruned}", **look)
             else:
                 look |= {"fontsize": 4.5, "bbox": _PATCH}
                 axes.text(task + 0.82, row + 0.2, f"×{pruned}", **look)
     axes.set_facecolor(_NOTHING)
-    # Where the last column stands for experts that belong to nobody, it is never empty.
+    # If the last column stands for experts without an owner, it is never empty.
     later = [owner for owner in range(task + 1, count) if mass[:, owner].count() == 0]
     for owner in later:
         axes.axvspan(owner, owner + 1, color=_IMPOSSIBLE, linewidth=0)
@@ -277,7 +277,7 @@ def _explain_routing(drawn: Any) -> None:
 
 
 def _from_owner(site: Any, owner: int, count: int) -> float | None:
-    """Mass on the experts of one task; those that belong to nobody count as the last one's.
+    """Mass on the experts of one task; experts without an owner count as the last task's.
 
     It is None without a router, or without such an expert.
     """
@@ -285,6 +285,6 @@ def _from_owner(site: Any, owner: int, count: int) -> float | None:
         return None
     masses = []
     for mass, of in zip(site.mass, site.owners, strict=True):
-        if min(of, count - 1) == owner:  # of nobody: a number past the last task's
+        if min(of, count - 1) == owner:  # no owner is a number past the last task's
             masses.append(mass)
     return sum(masses) if masses else None

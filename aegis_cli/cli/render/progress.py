@@ -1,4 +1,4 @@
-"""Progress on stderr: live bars on a terminal, now and then a plain line anywhere else."""
+"""Progress on stderr: live bars on a terminal, occasional plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from aegis_cli.common.events import Event, OnEvent, Progress, Warned
 EVERY_S = 10.0  # a line at least this often,
 EVERY_SHARE = 0.1  # or after this share of the work,
 LEAST_S = 1.0  # but no more than one a second
-_RATED_S = 1.0  # what is finished sooner has no rate worth telling
-_WINDOW_S = 30.0  # the rate is that of the last seconds: warm-up and compilation fade from it
+_RATED_S = 1.0  # no rate is shown for a stage that finishes sooner
+_WINDOW_S = 30.0  # the rate covers only the last seconds, to forget warm-up and compilation
 
 Clock = Callable[[], float]
 
@@ -33,7 +33,7 @@ def progress(clock: Clock = time.monotonic) -> Generator[OnEvent]:
     if not sys.stderr.isatty() or console.is_dumb_terminal:
         yield Lines(sys.stderr, clock)
         return
-    # `markup=False`: a figure or a stage's name in brackets is no style.
+    # `markup=False`, because brackets in a figure or a stage's name are not styles.
     figures = TextColumn(
         "{task.fields[figures]}",
         markup=False,
@@ -50,34 +50,34 @@ def progress(clock: Clock = time.monotonic) -> Generator[OnEvent]:
 
 
 class Pace:
-    """Units per second over the last `_WINDOW_S` seconds, and what that leaves."""
+    """Units per second over the last `_WINDOW_S` seconds, and the remaining time."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock, self.start_s = clock, clock()
         self.points: deque[tuple[float, int]] = deque()
-        self.first = 0  # units that were done before the first of these points
+        self.first = 0  # units done before the first of these points
 
     def update(self, done: int) -> None:
-        """Note how many units are done now."""
+        """Record how many units are done now."""
         now_s = self.clock()
         if not self.points:
-            self.first = done  # above 0 where a stage resumes
+            self.first = done  # above 0 if a stage resumes
         self.points.append((now_s, done))
-        # By the second point, so that those left span the window, and there are two at least.
+        # By the second point, so that at least two points are left and they span the window.
         while len(self.points) > 2 and now_s - self.points[1][0] >= _WINDOW_S:
             self.points.popleft()
 
     @property
     def rate(self) -> float | None:
-        """Units per second; None before two points in time."""
+        """Units per second; None with fewer than two points in time."""
         (t0, n0), (t1, n1) = self.points[0], self.points[-1]
         return (n1 - n0) / (t1 - t0) if t1 > t0 and n1 > n0 else None
 
     def figures(self, event: Progress) -> str:
         """`250/1,500 steps (17 %), 3.2 steps/s, 6m31s left, loss 0.41`.
 
-        The rate of what is finished is that of the whole stage, if it took long enough for one
-        and is more than a single unit.
+        For a finished stage, it is the rate of the whole stage, if that took long enough and has
+        more than one unit.
         """
         parts = [f"{event.done:,}/{event.total:,} {event.unit} ({100 * _share(event):.0f} %)"]
         elapsed_s = self.clock() - self.start_s
@@ -93,7 +93,7 @@ class Pace:
 
 
 class Lines:
-    """Plain lines: at a stage's start and end, and in between as the constants above say."""
+    """Plain lines: at a stage's start and end, and in between by the constants above."""
 
     def __init__(self, file: TextIO, clock: Clock) -> None:
         self.file, self.clock = file, clock
@@ -109,7 +109,7 @@ class Lines:
         if begins:
             self.pace[event.stage] = Pace(self.clock)
         pace = self.pace[event.stage]
-        pace.update(event.done)  # with every event, also those that no line tells
+        pace.update(event.done)  # with every event, including those without a line
         waited_s = self.clock() - shown_s
         share = _share(event) - (_share(last) if last else 0.0)  # since the last line
         if (
@@ -119,18 +119,18 @@ class Lines:
             or (share >= EVERY_SHARE and waited_s >= LEAST_S)
         ):
             self.shown[event.stage] = (self.clock(), event)
-            # At once, as whoever follows a log wants it.
+            # Flushed at once for readers who follow a log.
             print(f"{event.stage}: {pace.figures(event)}", file=self.file, flush=True)
 
 
 class Live:
-    """One rich bar a stage at work.
+    """One rich progress bar per running stage.
 
-    What is finished becomes a line above, since a terminal has room for few bars. While no stage is
-    at work, as where a model is loaded or a file is written, one bar without an end says so.
+    A finished stage becomes a line above, since a terminal has room for few bars. While no stage is
+    running, as when a model is loaded or a file is written, an indeterminate bar is shown.
 
     Args:
-        names: the column of the stages' names, which keeps them whole where the terminal is narrow.
+        names: the column of the stages' names, which keeps them whole on a narrow terminal.
     """
 
     def __init__(self, bars: Bars, names: Column, clock: Clock) -> None:
@@ -160,13 +160,13 @@ class Live:
         self._fill()
 
     def end(self) -> None:
-        """Leave no bar on the terminal that says that something goes on."""
+        """Leave no bar on the terminal that looks like something is still running."""
         if self.between is not None:
             self.bars.remove_task(self.between)
             self.between = None
 
     def _fill(self) -> None:
-        """Show the bar without an end if there is no other, and only then."""
+        """Show the indeterminate bar if there is no other bar, and only then."""
         if self.current:
             self.end()
         elif self.between is None:
@@ -178,7 +178,7 @@ def _warning(event: Warned) -> str:
 
 
 def _restarts(last: Progress, event: Progress) -> bool:
-    """Whether a stage of this name begins once more, as with each method of a job."""
+    """Whether a stage of this name starts again, as with each method of a job."""
     return event.done < last.done or last.done >= last.total
 
 

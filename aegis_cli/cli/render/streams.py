@@ -1,7 +1,7 @@
 """A stream as tables: its matrix with the figures, parameters, and the routing per map.
 
-The matrix of images holds accuracies; that of robots holds successes, or open-loop errors,
-beside what the backbone knows.
+The matrix has accuracies for images; for robots it has successes or open-loop errors, beside the
+backbone's VQA figures.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def stream_inspect(inspection: Any) -> RenderableType:
 
 
 def _matrix(report: Any) -> list[RenderableType]:
-    """The tables of what was measured."""
+    """The tables of the measurements."""
     views = {"accuracy": _accuracy, "success": _success, "errors": _errors}
     return views[report.score](report)
 
@@ -54,7 +54,7 @@ def _matrix(report: Any) -> list[RenderableType]:
 def _accuracy(report: Any) -> list[RenderableType]:
     """The accuracies with the task told and inferred, and their figures."""
     parts: list[RenderableType] = [_rows("Accuracy %, task told", report.oracle, report.tasks)]
-    if report.inferred != report.oracle:  # alike where one set of weights serves all tasks
+    if report.inferred != report.oracle:  # equal if one set of weights serves all tasks
         parts.append(_rows("Accuracy %, task inferred", report.inferred, report.tasks))
     lines = [
         (name, percent(s.transfer), percent(s.average), percent(s.last), percent(s.forgetting, 2))
@@ -66,7 +66,7 @@ def _accuracy(report: Any) -> list[RenderableType]:
 
 
 def _success(report: Any) -> list[RenderableType]:
-    """The successes beside what the backbone knows."""
+    """The successes beside the backbone's VQA figures."""
     s = report.scores
     figures = [(percent(s.average), percent(s.last), percent(s.forgetting, 2))]
     return [
@@ -76,7 +76,7 @@ def _success(report: Any) -> list[RenderableType]:
 
 
 def _errors(report: Any) -> list[RenderableType]:
-    """The open-loop errors, with those of holding the position, beside what the backbone knows."""
+    """The open-loop errors and those of holding the position, beside the VQA figures."""
     header, rows = _beside_vqa(report, "Open-loop error", report.errors, _error)
     if any(ends is not None for ends in report.error_intervals[-1]):
         shown = ("-" if ends is None else _between(ends) for ends in report.error_intervals[-1])
@@ -108,13 +108,13 @@ def _beside_vqa(
     matrix: Sequence[Sequence[float]],
     show: Callable[[float], str],
 ) -> tuple[Sequence[str], list[list[str]]]:
-    """The header and the rows of a triangle beside what the backbone knows.
+    """The header and the rows of a triangular matrix beside the backbone's VQA figures.
 
-    Tasks that have not come are '-'.
+    Tasks that have not come yet are '-'.
     """
     header = (title, *report.tasks, "VQA %", "Drop (points)", "Cross-entropy (nats)")
     rows = []
-    # VQA is measured before the first task too, when nothing has been learned yet.
+    # VQA is also measured before the first task.
     measured = zip(("", *report.tasks), ((), *matrix), report.vqa, strict=True)
     for after, found, known in measured:
         line = [f"after {after}" if after else "before", *map(show, found)]
@@ -129,7 +129,7 @@ def _beside_vqa(
 
 
 def _published(report: Any) -> list[RenderableType]:
-    """What papers print for the same stream of images, beside this run's own line above."""
+    """Published figures for the same image stream, to compare with this run's line above."""
     if report.kind != "stream-run" or not report.published:
         return []
     rows = [
@@ -149,7 +149,7 @@ def _rows(title: str, rows: Sequence[Sequence[float]], tasks: Sequence[str]) -> 
 
 
 def parameters(report: Any) -> Table:
-    """A line per task: what learned and what was added."""
+    """A line per task: the parameters that learned and the numbers added."""
     header = (
         "Task",
         "Phase 1 (steps)",
@@ -200,7 +200,7 @@ def routing(report: Any) -> Table:
     rows = []
     for task, record in enumerate(report.records):
         for s in record.sites:
-            # Places in the router's lists; `owners` has the number of the task that brought each.
+            # Positions in the router's lists; `owners` has the number of the task that added each.
             old = [i for i, owner in enumerate(s.owners) if owner < task]
             new = [i for i, owner in enumerate(s.owners) if owner >= task]
             row = [record.task, s.site]
@@ -213,7 +213,7 @@ def routing(report: Any) -> Table:
 
 
 def _sums(report: Any) -> str:
-    """What a run stores and how much of it learned, in one sentence."""
+    """How many numbers a run stores and how many of them learned, in a sentence."""
     first, after, mean = report.trained_phase1, report.trained, report.trained_mean
     phases = "" if first is None else f"{first:,.0f} in phase 1, {after:,.0f} after it, "
     return (
@@ -223,9 +223,9 @@ def _sums(report: Any) -> str:
 
 
 def _stored(report: Any) -> str:
-    """How many numbers a run keeps.
+    """How many numbers a run stores.
 
-    A learner that trains the model itself keeps one of its own, and nothing beside it.
+    A learner that trains the model itself stores its own model, and nothing beside it.
     """
     model = report.model_name
     whose = f" beside the bare {model}"

@@ -1,6 +1,6 @@
-"""A study's tables: what each variant keeps and does, what it costs, and who passes the bar.
+"""A study's tables: each variant's VQA, success and costs, and who passes the bar.
 
-Columns are those that the results declare: `studies/metrics.py`.
+The columns are those that the results declare; see `studies/metrics.py`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from aegis_cli.studies.tuning import (
 
 
 def study(report: Any) -> RenderableType:
-    """Everything a study of policies found; with five seeds, each table fits 120 columns."""
+    """All results of a study of policies; with five seeds, each table fits into 120 columns."""
     parts: list[RenderableType] = []
     if not report.tasks:
         parts += [Text(f"{report.name}: tuning", "bold"), _tried(report.tuning)]
@@ -46,7 +46,7 @@ def study(report: Any) -> RenderableType:
             f"{fixed(task.baseline_cross_entropy, 3)} nats"
         )
         majority = f"always the commonest answer: {percent(task.majority_accuracy)} %"
-        asked = f", asked {task.vqa}" if task.vqa else ""  # of a probe of several sets
+        asked = f", asked {task.vqa}" if task.vqa else ""  # if there are several question sets
         fields = (*_KEPT, *_acting(task.results))
         parts += [
             Text(f"{report.name}: {task.task}{asked}", "bold"),
@@ -61,7 +61,7 @@ def study(report: Any) -> RenderableType:
 
 
 def stream_study(report: Any) -> RenderableType:
-    """Everything a study of streams found."""
+    """All results of a study of streams."""
     parts: list[RenderableType] = [Text(f"{report.name}: {', '.join(report.streams)}", "bold")]
     if report.tuning:
         parts += _stream_tuning(report)
@@ -83,7 +83,7 @@ def stream_study(report: Any) -> RenderableType:
 
 
 def robot_stream_study(report: Any) -> RenderableType:
-    """Everything a study of a stream of robot tasks found."""
+    """All results of a study of a stream of robot tasks."""
     parts: list[RenderableType] = [Text(f"{report.name}: {', '.join(report.tasks)}", "bold")]
     if report.tuning:
         parts += _robot_tuning(report)
@@ -97,7 +97,7 @@ def robot_stream_study(report: Any) -> RenderableType:
 
 
 def _acting(results: Sequence[Any]) -> tuple[str, ...]:
-    """The fields that say how well policies act: in closed loop, or by their open-loop error."""
+    """The fields for how well policies act: in closed loop, or by their open-loop error."""
     closed = tuple(acting(results).values())
     acted = any(getattr(r, field) is not None for r in results for field in closed)
     opened = [field for field in _OPENED if any(getattr(r, field) is not None for r in results)]
@@ -116,7 +116,7 @@ OPEN_LOOP = (
 _KEPT = ("drop_points", "cross_entropy")
 _OPENED = ("open_loop_error", "hold_error")
 _GAINS = ("seen_gain_points", "held_out_gain_points")
-_EVALUATED = ("open_loop_difference", "open_loop_over_still")  # where nothing was rolled out
+_EVALUATED = ("open_loop_difference", "open_loop_over_still")  # if nothing was rolled out
 _COSTS = ("validation_loss", "w2", "energy_shed", "step_time", "peak_memory")
 _TRAINED = ("trained_phase1", "trained", "trained_mean")
 _STORED = (
@@ -138,7 +138,7 @@ _KNOWN = (
     "reuse",
     "minutes",
 )
-_MEANS_ALONE = {"inference_parameters"}  # a count that hardly varies
+_MEANS_ALONE = {"inference_parameters"}  # shown without an interval, since it hardly varies
 
 
 def _table(
@@ -151,14 +151,14 @@ def _table(
     """A line per variant and a column per field.
 
     Args:
-        fields: of a result, or of its `part`; by default all that are declared.
+        fields: fields of a result, or of its `part`; by default all declared fields.
         knob: whether each variant's knob is shown.
     """
     shown = results if part is None else [getattr(r, part) for r in results]
     declared = columns(type(shown[0]))
     fields = tuple(fields or declared)
     named = [(r.variant, knob_text(r)) if knob else (r.variant,) for r in results]
-    drawn = [_column(shown, field) for field in fields]  # by column, since marks compare these
+    drawn = [_column(shown, field) for field in fields]  # by column, since marks compare columns
     by_variant = zip(*drawn, strict=True)
     rows = [(*name, *cells) for name, cells in zip(named, by_variant, strict=True)]
     names = ("Variant", "Knob") if knob else ("Variant",)
@@ -167,14 +167,14 @@ def _table(
 
 
 def _column(results: Sequence[Any], field: str) -> list[Cell]:
-    """A field of each result, the best and the worst mean marked."""
+    """A field of each result, with marks for the best and the worst mean."""
     found = [getattr(result, field) for result in results]
     values = [x if x is None or isinstance(x, float) else x.mean for x in found]
     cells = [_figure(result, field) for result in results]
     declared = columns(type(results[0]))[field]
     show = shown_as(declared)
     by_mean = marked([show(value) for value in values], values, declared.more_is_better)
-    # Means that look alike share a mark, whatever their intervals.
+    # Means with the same text share a mark, even with different intervals.
     shown: list[Cell] = []
     for mean, cell in zip(by_mean, cells, strict=True):
         if isinstance(mean, Text):
@@ -186,7 +186,7 @@ def _column(results: Sequence[Any], field: str) -> list[Cell]:
 
 
 def _figure(result: Any, field: str) -> str:
-    """A figure as it is declared to be shown: a mean with its interval, or a plain number."""
+    """A figure in its declared form: a mean with its interval, or a plain number."""
     show = shown_as(columns(type(result))[field])
     found = getattr(result, field)
     if found is None or isinstance(found, float):
@@ -197,7 +197,7 @@ def _figure(result: Any, field: str) -> str:
 def shown_as(column: Column) -> Callable[[float | None], str]:
     """How a column shows a value: in its unit, with its digits and its sign.
 
-    What rounds to 0 has none, for it may be a little less than 0.
+    A value that rounds to 0 has no sign, because it may be slightly below 0.
     """
 
     def show(value: float | None) -> str:
@@ -205,7 +205,7 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
         if column.decimals is None:
             return number(value, column.significant)
         text = fixed(value, column.decimals)
-        is_more = value is not None and value > 0 and float(text) > 0  # also once it is rounded
+        is_more = value is not None and value > 0 and float(text) > 0  # also after rounding
         return f"+{text}" if column.signed and is_more else text
 
     return show
@@ -215,7 +215,7 @@ def shown_as(column: Column) -> Callable[[float | None], str]:
 
 
 def _tried(points: Sequence[Any]) -> Table:
-    """The knobs' values so far, while nothing has been compared yet."""
+    """The knobs' values so far, before anything has been compared."""
     by_error = any(point.open_loop_error is not None for point in points)
     rows = []
     for point in points:
@@ -227,9 +227,9 @@ def _tried(points: Sequence[Any]) -> Table:
 
 
 def _references(results: Sequence[Any]) -> list[RenderableType]:
-    """What each variant is compared with, and the difference of their drops.
+    """The reference of each variant, and the difference of their drops.
 
-    Nothing where naive is what all of them are.
+    It is empty if all variants are compared with naive.
     """
     if not any(r.against for r in results):
         return []
@@ -241,9 +241,9 @@ def _references(results: Sequence[Any]) -> list[RenderableType]:
 
 
 def _decimals_of_step_time(result: Any) -> int:
-    """Two, or as many as the bar's verdict hangs on."""
+    """Two decimals, or as many as are needed to show the bar's verdict."""
     checks = result.bar.checks if result.bar else ()
-    # The bar's check of the step time is told by its value, for names are words for a reader.
+    # The check of the step time is found by its value, because check names are for readers.
     judged = [c for c in checks if c.value is not None and c.value == result.step_time]
     return max([2, *(deciding_decimals(c.value, c.demand, 2) for c in judged)])
 
@@ -251,7 +251,7 @@ def _decimals_of_step_time(result: Any) -> int:
 def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
     """One line per variant: its differences by seed, and its verdict.
 
-    Returns have differences alone.
+    For returns there are only differences.
     """
     others = [r for r in results if r.variant != "naive" or r.against]
     if any(r.return_gain_points for r in results):
@@ -276,9 +276,9 @@ def _against_naive(results: Sequence[Any]) -> list[RenderableType]:
             fixed(r.step_time, _decimals_of_step_time(r)),
             "",
         )
-        # Without a bar, another naive has no VQA data either; the rest are ceilings.
+        # Without a bar, a variant is either another naive, without VQA data, or a ceiling.
         verdicts = [""] * 4 + ["yes" if r.method == "naive" else "no"]
-        if r.bar:  # whose demands come in the order of these columns
+        if r.bar:  # its demands are in the order of these columns
             verdicts = [verdict_text(check.passed) for check in r.bar.checks]
         checked = []
         for figure, verdict in zip(figures, verdicts, strict=True):
@@ -351,7 +351,7 @@ def _knobs(
     """The values that were tried on validation data, and how one of them was chosen.
 
     Args:
-        shown: header -> what is told of a value.
+        shown: header -> a function that formats a value's figure.
     """
     rows = []
     for point in points:
@@ -363,7 +363,7 @@ def _knobs(
 
 
 def _rule(rule: Rule, place: str, within: float) -> str:
-    """How knobs were chosen, in lines as long as the tables' other notes."""
+    """How knobs were chosen, in lines of the same length as other notes."""
     return textwrap.fill(f"knobs {rule.explain(place, within)}", 100, subsequent_indent="  ")
 
 
@@ -382,7 +382,7 @@ def _bars(results: Sequence[Any]) -> Table:
     """A line per demand, a column per variant."""
     barred = [r for r in results if r.bar]
     rows = []
-    for i, check in enumerate(barred[0].bar.checks):  # the same demands of every variant
+    for i, check in enumerate(barred[0].bar.checks):  # all variants have the same demands
         rows.append((check.name, *(_checked(r.bar.checks[i]) for r in barred)))
     rows.append(("all", *(verdict_text(r.bar.passed) for r in barred)))
     return plain_table(("Demand", *(r.variant for r in barred)), rows, title="Bar")
@@ -395,11 +395,11 @@ def _checked(check: Any) -> str:
 
 
 def _judged(check: Any) -> str:
-    """A value in three digits, or in as many as its verdict hangs on."""
+    """A value with three digits, or as many as are needed to show its verdict."""
     shown = f"{check.value:.3g}"
-    if check.interval is not None:  # judged by an end, which is another figure
+    if check.interval is not None:  # judged by an end of the interval, not by this value
         return shown
-    decimals = len(shown.partition(".")[2]) if "e" not in shown else 2  # 1e+06 has none to count
+    decimals = len(shown.partition(".")[2]) if "e" not in shown else 2  # 1e+06 has no decimals
     needed = deciding_decimals(check.value, check.demand, decimals)
     return shown if needed == decimals else fixed(check.value, needed)
 
@@ -455,7 +455,7 @@ def _robot_tuning(report: Any) -> list[RenderableType]:
 
 
 def _matrix(result: Any, tasks: Sequence[str]) -> Table:
-    """A line per task that was learned: the success on all so far, and what VQA has lost."""
+    """A line per learned task: the success on all tasks so far, and the VQA points lost."""
     rows = []
     for after in result.after:
         shown = [spread(found, percent) for found in after.success]
@@ -482,10 +482,10 @@ def _robot_notes(report: Any) -> list[str]:
 
 
 def knob_text(result: Any) -> str:
-    """The key's last word and its value, of each knob: `energy 0.999`."""
+    """The last word of each knob's key with its value: `energy 0.999`."""
     if result.knob is None:
         return "-"
-    knobs = result.knob.split(", ")  # as `Variant.knob` joins them; no key has a comma
+    knobs = result.knob.split(", ")  # joined like this by `Variant.knob`; no key has a comma
     values = result.value if len(knobs) > 1 else [result.value]
     named = zip(knobs, values, strict=True)
     return ", ".join(f"{knob.rpartition('.')[2]} {value_text(value)}" for knob, value in named)

@@ -30,7 +30,7 @@ _OPEN_LOOP_INSTEAD = (
     "held-out episodes over their variance in training: 1 is that of always the mean action. It is "
     "no success, and does not tell it. aegis inspect of a run has its interval"
 )
-# Fields that hold a share in [0, 1], shown in percent; `_is_share` knows some more by their names.
+# Fields with a share in [0, 1], shown in percent; `_is_share` finds some more by their names.
 _SHARES = {
     "accuracy",
     "success",
@@ -46,20 +46,20 @@ _SHARES = {
 
 
 def facts(report: Any) -> Table:
-    """Every plain value of a report, one a line; what is an empty list has none."""
+    """Every plain value of a report, one per line; an empty list has no line."""
     values = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
     return pairs({name: value for name, value in values.items() if value != ()})
 
 
 def trained(report: Any) -> RenderableType:
-    """How a training ended, and what it measured of its weights where it was asked to."""
+    """The end of a training, and the requested measurements of its weights."""
     values = dataclasses.asdict(report)
     shown = watched(values)
     return Group(pairs(values), *shown)
 
 
 def watched(found: dict[str, Any]) -> list[Table]:
-    """Take what a training measured of its last weights out of its figures, as tables."""
+    """Move a training's measurements of its last weights from its figures into tables."""
     asked = validation_vqa(found.pop("validation_vqa", {}))
     acted = validation_rollout(found.pop("validation_rollout", {}))
     predicted = validation_actions(found.pop("validation_actions", {}))
@@ -67,7 +67,7 @@ def watched(found: dict[str, Any]) -> list[Table]:
 
 
 def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
-    """A table of the answers to validation questions, a line per set; none where none was asked."""
+    """A table of the answers to validation questions, a line per set; none without questions."""
     rows = []
     for name, own in found.items():
         ends = " to ".join(fixed(end, 2) for end in own["drop_interval"])
@@ -78,7 +78,7 @@ def validation_vqa(found: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def validation_rollout(found: Mapping[str, Any]) -> Iterator[Table]:
-    """A table of how the policy acted in validation episodes; none where it did not act."""
+    """A table of how the policy acted in validation episodes; none without episodes."""
     shown = {
         "success": ("success %", "interval", percent),
         "mean_return": ("mean return", "return_interval", number),
@@ -92,7 +92,7 @@ def validation_rollout(found: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def validation_actions(found: Mapping[str, Any]) -> Iterator[Table]:
-    """A table of how far predicted actions were from held-out ones; none where none were."""
+    """A table of the errors of predicted actions on held-out ones; none without predictions."""
     if found:
         ends, hold = found["relative_interval"], found["hold_error"]
         between = "-" if ends is None else " to ".join(map(number, ends))
@@ -102,8 +102,8 @@ def validation_actions(found: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def serving(report: Any) -> RenderableType:
-    """Where a policy is served, and what a client has to send."""
-    said = report.metadata  # what the server sends to each client first
+    """Where a policy is served, and what a client must send."""
+    said = report.metadata  # sent to each client on connection
     images = dict.fromkeys(said["images"], "[H, W, 3] uint8, RGB")
     prompt = "text" if said["default_prompt"] is None else f"text, or '{said['default_prompt']}'"
     sent = {**images, said["state"]: f"[{said['positions']}]", said["prompt"]: prompt}
@@ -121,7 +121,7 @@ def probe(report: Any) -> RenderableType:
 
 
 def _drifts(layers: Sequence[Any]) -> Table:
-    """W2^2 by layer, beside the baseline's own where one was measured."""
+    """W2^2 by layer, beside that of the baseline if it was measured."""
     if layers[0].baseline_w2 is None:
         return plain_table(("Layer", "W2²"), [(str(x.layer), number(x.w2)) for x in layers])
     rows = [(str(x.layer), number(x.w2), number(x.baseline_w2)) for x in layers]
@@ -146,7 +146,7 @@ def scores(report: Any) -> RenderableType:
 
 
 def doctor(report: Any) -> RenderableType:
-    """A line per check, and below what to do about those that are not well."""
+    """A line per check, followed by what to do about those that are not ok."""
     rows = [(check.name, check.state, check.found) for check in report.checks]
     fixes = [f"{check.name}: {check.fix}" for check in report.checks if check.fix]
     parts: list[RenderableType] = [plain_table(("Check", "State", "Found"), rows, left=3)]
@@ -207,8 +207,8 @@ def _worst_first(parts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _by_part(what: str, parts: dict[str, Any]) -> Table:
-    """A line per part of the episodes: all the figures of its entry."""
-    first = next(iter(parts.values()))  # all are of one class
+    """A line per part of the episodes, with all figures of its entry."""
+    first = next(iter(parts.values()))  # all are of the same class
     names = [field.name for field in dataclasses.fields(first)]
     header = [(_label(name) + _unit(name, 0.0)).capitalize() for name in names]
     rows = []
@@ -225,10 +225,10 @@ def dual(report: Any) -> RenderableType:
 
 
 class _Column(NamedTuple):
-    """A column of the table of methods: a field of its rows, and how that is written.
+    """A column of the table of methods: a field of its rows, and its format.
 
     Attributes:
-        more_is_better: None where neither end is good.
+        more_is_better: None if neither direction is better.
     """
 
     name: str
@@ -238,7 +238,7 @@ class _Column(NamedTuple):
 
 
 def pipeline(report: Any) -> RenderableType:
-    """A line per method; what no method has, such as a success, has no column."""
+    """A line per method; figures that no method has, such as a success, have no column."""
     acts = acting(report.rows)
     columns = [
         _Column("VQA %", "accuracy", percent, True),
@@ -262,10 +262,10 @@ def pipeline(report: Any) -> RenderableType:
 
 
 def _pipeline_notes(report: Any, acts: Mapping[str, str]) -> Iterator[str]:
-    """What stands below the table of methods, a line each."""
+    """The notes below the table of methods, one per line."""
     before = f"before fine-tuning: VQA {percent(report.baseline_accuracy)} %"
     yield f"{before}; always the commonest answer: {percent(report.majority_accuracy)} %"
-    if len(report.rows) > 1:  # a single method is neither best nor worst
+    if len(report.rows) > 1:  # there is no best or worst of a single method
         yield MARKS
     if report.verdict:
         yield report.verdict
@@ -280,9 +280,9 @@ def _pipeline_notes(report: Any, acts: Mapping[str, str]) -> Iterator[str]:
 
 
 def _held_still(rows: Sequence[Any]) -> str | None:
-    """What a robot that holds its position has, beside the open-loop errors of these methods.
+    """The open-loop error of a robot that holds its position, to compare with these methods.
 
-    None where that was not measured. All methods are measured on the same frames.
+    None if it was not measured. All methods are measured on the same frames.
     """
     hold = next((row.hold_error for row in rows if row.hold_error is not None), None)
     if hold is None:
@@ -301,7 +301,7 @@ def _acted(rows: Sequence[Any], acts: Mapping[str, str]) -> bool:
 
 
 def _merged(merge: Mapping[str, Any]) -> str:
-    """What was done to each policy between its training and its measuring."""
+    """The merge of each policy between its training and its measurements."""
     how = f"merged by {merge['method']}, strength {merge['strength']:g}, after the training"
     return f"{how}: the policies are those in METHOD/merged"
 
@@ -312,10 +312,10 @@ def _marked_column(rows: Sequence[Any], column: _Column) -> list[Cell]:
 
 
 def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
-    """What the methods kept of each further set of questions."""
+    """The methods' figures on each further question set."""
     header = ("Method", "VQA %", "Drop (points)", "Cross-entropy (nats)", "W2²", "Before %")
     tables: list[RenderableType] = []
-    for name in rows[0].others:  # all methods were asked the same
+    for name in rows[0].others:  # all methods were asked the same sets
         shown = []
         for row in rows:
             kept = row.others[name]
@@ -328,7 +328,7 @@ def _other_sets(rows: Sequence[Any]) -> list[RenderableType]:
 
 
 def bench(report: Any) -> RenderableType:
-    """A line per method, and below what an anchor's pass and the guard cost."""
+    """A line per method, followed by the costs of an anchor's pass and of the guard."""
     rows = [
         (name, fixed(ratio, 2), fixed(report.peak_memory[name], 2))
         for name, ratio in report.step_time.items()
@@ -347,7 +347,7 @@ def bench(report: Any) -> RenderableType:
 
 
 def bench_shape(report: Any) -> RenderableType:
-    """A line per method and per part of an anchor, and below what they were measured with."""
+    """A line per method and per part of an anchor, followed by how they were measured."""
 
     def row(name: str, cost: Any) -> tuple[str, ...]:
         if cost.step_s is None:
@@ -359,7 +359,7 @@ def bench_shape(report: Any) -> RenderableType:
             percent(cost.own_share),
             fixed(cost.peak_gb, 2),
             fixed(cost.peak_memory, 2),
-            percent(cost.mfu),  # None where the device's peak is not known
+            percent(cost.mfu),  # None if the device's peak is unknown
         )
 
     header = ("Method", "s/step", "x naive", "Own %", "Peak GB", "x naive", "MFU %")
@@ -393,7 +393,7 @@ def _families(families: dict[str, Any]) -> Table:
 
 
 def pairs(values: dict[str, Any]) -> Table:
-    """A line per value: its name, then the value with its unit. What is None has no line."""
+    """A line per value: its name, then the value with its unit. None has no line."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
@@ -403,17 +403,17 @@ def pairs(values: dict[str, Any]) -> Table:
     return table
 
 
-_NO_SCALARS = ("families", "layers", "asked")  # of a probe's report
+_NO_SCALARS = ("families", "layers", "asked")  # fields of a probe's report
 
 
 def _scalars(report: Any) -> dict[str, Any]:
-    """The fields that a report has a line of; the others have tables."""
+    """The fields of a report that are shown on a line; the others have tables."""
     names = [field.name for field in dataclasses.fields(report) if field.name not in _NO_SCALARS]
     return {name: getattr(report, name) for name in names}
 
 
-# How a field's name ends, and the unit that stands behind its value. What begins with "_" is left
-# out of the label.
+# Suffix of a field's name -> unit after its value. Suffixes that start with "_" are left out of the
+# label.
 _UNITS = {
     "_s": " s",
     "_ms": " ms",
@@ -447,10 +447,10 @@ def _is_share(name: str) -> bool:
 
 
 def _cell(value: Any, name: str = "") -> str:
-    """A value as a table shows it, without the unit that its name stands for."""
+    """A value in a table, without the unit of its name."""
     if value is None:
         return "-"
-    if isinstance(value, bool):  # before `int`, of which it is one
+    if isinstance(value, bool):  # before `int`, because a bool is an int
         return "yes" if value else "no"
     if name in _SHARE_INTERVALS:
         return " to ".join(percent(v) for v in value)
@@ -462,17 +462,17 @@ def _cell(value: Any, name: str = "") -> str:
         return _list([_one_of(v) for v in value]) or "-"
     if isinstance(value, float):
         return percent(value) if _is_share(name) else number(value)
-    # A seed is no count, and is typed again as it stands.
+    # A seed is not a count, and users copy it, so it has no commas.
     return f"{value:,}" if isinstance(value, int) and name != "seed" else str(value)
 
 
 def _one_of(value: Any) -> str:
-    """A value of a list; one that is a list itself is a size, as of a picture."""
+    """An item of a list; an item that is itself a list is a size, such as that of an image."""
     return " x ".join(map(_cell, value)) if isinstance(value, (tuple, list)) else _cell(value)
 
 
 def _within(value: Any) -> str:
-    """A value of a value; several stand in brackets, under their names as they are read."""
+    """A nested value; several are in brackets, with readable names."""
     if not isinstance(value, dict):
         return _cell(value)
     return f"({', '.join(f'{_label(k)} {_cell(v)}' for k, v in value.items())})"

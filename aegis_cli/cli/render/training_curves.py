@@ -1,4 +1,4 @@
-"""The course of a training, as `metrics.jsonl` has it: which figures, and a plot of one run."""
+"""The curves of a training from `metrics.jsonl`: which figures, and a plot of one run."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from aegis_cli.cli.render.layout import is_number
 from aegis_cli.cli.render.plots import figure, literal, save_figure
 from aegis_cli.common.errors import AegisError
 
-_VQA_DROP = "vqa_drop_points"  # of the first question set; the number of another one follows
+_VQA_DROP = "vqa_drop_points"  # of the first question set; for others, their number follows
 _DROP_ENDS = ("vqa_drop_low", "vqa_drop_high")
-_COLUMNS = 2  # panels beside one another
+_COLUMNS = 2  # panels side by side
 
 
 class Curve(NamedTuple):
-    """A figure of a line of metrics.
+    """A figure in the lines of metrics.
 
     Attributes:
         name: its field.
         log: whether its axis is logarithmic.
-        scale: a factor to show it by.
+        scale: a factor that is applied before it is shown.
         ends: fields of the ends of its 95 % interval.
     """
 
@@ -55,14 +55,14 @@ _CURVES = (
 
 
 def curves(sets: Sequence[str]) -> Iterator[Curve]:
-    """What a training may have logged, with a VQA drop for each set of questions it was asked."""
+    """The figures that a training may have logged, with a VQA drop for each question set."""
     for curve in _CURVES:
         if curve.name != _VQA_DROP or len(sets) < 2:
             yield curve
             continue
         for number, name in enumerate(sets, start=1):
             end = "" if number == 1 else f"_{number}"
-            short = name.rpartition("/")[2]  # of a path
+            short = name.rpartition("/")[2]  # the last part of a path
             low, high = _DROP_ENDS
             yield Curve(
                 f"{_VQA_DROP}{end}",
@@ -74,7 +74,7 @@ def curves(sets: Sequence[str]) -> Iterator[Curve]:
 def points(
     lines: Sequence[Mapping[str, Any]], name: str, scale: float
 ) -> list[tuple[float, float]]:
-    """(step, value) of the lines that have the figure: not every line has every one."""
+    """(step, value) of the lines that have the figure; not every line has every figure."""
     return [(line["step"], scale * line[name]) for line in lines if is_number(line.get(name))]
 
 
@@ -86,7 +86,7 @@ def curves_plot(
     Figures of validations have their 95 % intervals as bars.
 
     Args:
-        lines: of its `metrics.jsonl`.
+        lines: the lines of its `metrics.jsonl`.
         sets: the question sets that it was asked.
 
     Raises:
@@ -120,7 +120,7 @@ def _draw_curve(axes: Any, lines: Sequence[Mapping[str, Any]], curve: Curve) -> 
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     steps, values = zip(*points(lines, curve.name, curve.scale), strict=True)
-    # Where lines are few, each of them shows.
+    # With few lines, each one has a mark.
     axes.plot(steps, values, color="tab:blue", marker="o" if len(steps) <= 40 else None, ms=3)
     if curve.ends is not None:
         low, high = curve.ends
@@ -132,7 +132,7 @@ def _draw_curve(axes: Any, lines: Sequence[Mapping[str, Any]], curve: Curve) -> 
             color="tab:blue",
             alpha=0.4,
         )
-    # Within a factor of two a logarithm looks even, and has no ticks.
+    # Within a factor of two, a logarithmic axis looks linear and has no ticks.
     if curve.log and 0 < 2 * min(values) < max(values):
         axes.set_yscale("log")
         axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))

@@ -12,16 +12,16 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Column, Table
 from rich.text import TextType
 
-_BESIDE = 2  # columns of space that each column of the table takes beside its text
+_BESIDE = 2  # columns of space that each column of the table takes in addition to its text
 
 
 class WideTable(Table):
-    """Where it does not fit, it goes on below with its next columns, as data frames do.
+    """A table that continues below with its next columns if it does not fit, like a data frame.
 
-    No word and no figure is broken but one wider than the terminal.
+    Words and figures are not broken unless they are wider than the terminal.
 
     Args:
-        left: columns that name a line, with which each part begins.
+        left: number of columns that name a line; each part starts with them.
     """
 
     def __init__(self, left: int, title: TextType | None = None) -> None:
@@ -43,16 +43,16 @@ class WideTable(Table):
         for i, columns in enumerate(self._parts(free)):
             part = WideTable(self.left, None if i else self.title)
             part.rows, part.columns = self.rows, columns
-            # As a plain table, for its own way to be shown would split it once more.
+            # As a plain table, because its own rendering would split it again.
             yield from Table.__rich_console__(part, console, options)
 
     def _parts(self, free: int) -> Iterator[list[Column]]:
-        """The columns of each part: those that name a line, and as many others as fit."""
+        """The columns of each part: those that name a line, and as many other columns as fit."""
         names, rest = self.columns[: self.left], self.columns[self.left :]
         while True:
             fitting = len(rest)
             while fitting > 1 and _least(names + rest[:fitting]) > free:
-                fitting -= 1  # down to one, which is shown even where it does not fit
+                fitting -= 1  # down to one, which is shown even if it does not fit
             yield _folded(names + rest[:fitting], free)
             rest = rest[fitting:]
             if not rest:
@@ -60,12 +60,12 @@ class WideTable(Table):
 
 
 def _least(columns: Sequence[Column]) -> int:
-    """The width below which some word would be broken."""
+    """The smallest width at which no word is broken."""
     return sum(_longest_word(c) + _BESIDE for c in columns)
 
 
 def _folded(columns: Sequence[Column], free: int) -> list[Column]:
-    """Each as wide as its longest word; what is left goes to cells, then headers, left to right."""
+    """Each as wide as its longest word; free space goes to cells, then headers, left to right."""
     widths, spare = list(map(_longest_word, columns)), max(0, free - _least(columns))
     for wanted in (_longest_cell, _longest_line):
         for i, column in enumerate(columns):
@@ -73,15 +73,15 @@ def _folded(columns: Sequence[Column], free: int) -> list[Column]:
             widths[i], spare = widths[i] + more, spare - more
     folded = []
     for i, (column, width) in enumerate(zip(columns, widths, strict=True)):
-        # Folded here, at the very places by which `_longest_word` counts.
+        # Folded here, at the same places that `_longest_word` assumes.
         header = "\n".join(textwrap.wrap(str(column.header), width or 1))
-        # Copies, since the columns of names stand in every part; rich counts them from 0.
+        # Copies, since the columns of names are in every part; rich numbers columns from 0.
         folded.append(replace(column, header=header, max_width=width, _index=i))
     return folded
 
 
 def _longest_word(column: Column) -> int:
-    """Letters of the longest word; headers may break after a hyphen, as `textwrap` does it."""
+    """Length of the longest word; headers may break after a hyphen, as in `textwrap`."""
     words = re.split(r"\s|(?<=-)", str(column.header))
     for cell in column.cells:
         words += str(cell).split()
