@@ -174,7 +174,7 @@ def build(recipe: StreamRecipe, out: Path, on_event: OnEvent = ignore) -> ImageS
     found = tasks(recipe, model.image_size, on_event)
     if recipe.split == VALIDATION:  # settings must be chosen without the test parts
         found = on_validation(found)
-    fingerprint = model.fingerprint()  # of the bare encoder, before anything stands beside its maps
+    fingerprint = model.fingerprint()  # of the bare encoder, before experts are added
     model.requires_grad_(False)
     for task in found:  # a name that cannot be read is refused before anything is written
         _check_words(model, task, recipe.path)
@@ -274,7 +274,7 @@ def image_set(recipe: StreamRecipe) -> str:
 
 
 def _contents(recipe: StreamRecipe, root: Path) -> dict[str, dict[str, Any]]:
-    """What each task's folder is loaded from."""
+    """The files of each task's folder, by task."""
     return {name: folders.contents(root / name) for name in _folder_names(recipe)}
 
 

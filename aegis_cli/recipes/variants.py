@@ -14,7 +14,7 @@ from aegis_cli.recipes.streams import UNREAD_RATES
 from aegis_cli.recipes.strict_yaml import Problem, line_of, put
 
 V = TypeVar("V", bound=Variant)
-# A key that no variant may set -> the study's own key for it; None where it is in 'shared'.
+# A key that no variant may set -> the study's own key for it; None if it belongs in 'shared'.
 Places = Mapping[str, str | None]
 
 

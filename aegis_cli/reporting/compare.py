@@ -244,7 +244,7 @@ def _by_episodes(path: Path, found: InspectReport) -> dict[Any, results.Result]:
     """The run's open-loop evaluations, by the values that must be equal for a comparison."""
     by_episodes = {}
     for one in found.open_loops:
-        told = [str(one.figures[name]) for name in _FRAMES]  # as texts, since lists are no keys
+        told = [str(one.figures[name]) for name in _FRAMES]  # as text: lists cannot be keys
         by_episodes[results.evaluated_data(path, one), *told] = one
     return by_episodes
 

@@ -612,7 +612,7 @@ class PolicyRunner:
         )
 
     def _trained(self, label: str, recipe: Recipe) -> dict[str, Any]:
-        """Train and merge; return the training's report with the measured policy's loss."""
+        """Train and merge; return the training report with the final policy's validation loss."""
         self.train(label, recipe)
         run_folder.renew_recipe(self.folder / label, recipe)
         report = files.load_json(self.folder / label / run_folder.JOBS_REPORT)

@@ -266,7 +266,7 @@ _COLUMNS = (
 
 
 def _comparison(found: At, own: Sequence[At]) -> Markup:
-    """The table of all methods, and what each lost over what it won."""
+    """The table of all methods, and a chart of each method's loss over its success."""
     rows = list(found["table"]["rows"])
     shown = [c for c in _COLUMNS if any(row[c[0]].value is not None for row in rows)]
     gated = any(run["gate"].value is not None for run in own)

@@ -34,7 +34,7 @@ def note(*children: Child) -> Markup:
     return element("p", *children, class_="note")
 
 
-# --- how well, and what was lost ------------------------------------------------------------------
+# --- figures --------------------------------------------------------------------------------------
 
 
 def probe(run: At, having: str = "accuracy") -> At:

@@ -161,7 +161,7 @@ def _not_measured(facts: Mapping[str, Any]) -> Text:
 
 
 def _played(rollouts: Sequence[Any]) -> Table:
-    from aegis_cli.evaluation import results  # with it comes torch, as with what it has read
+    from aegis_cli.evaluation import results  # imports torch, as the inspection did
 
     header = ("Task", "Colours", "Success %", "95 % interval", "Return %", "Episodes")
     apart = results.told_apart([result.played for result in rollouts])
@@ -181,7 +181,7 @@ def _played(rollouts: Sequence[Any]) -> Table:
 
 
 def _evaluated(open_loops: Sequence[Any]) -> Table:
-    from aegis_cli.evaluation import results  # with it comes torch, as with what it has read
+    from aegis_cli.evaluation import results  # imports torch, as the inspection did
 
     header = ("Open loop on", "Relative error", "95 % interval", "Hold's", "Frames")
     rows = []

@@ -176,13 +176,13 @@ def _accuracies(families: dict[str, float]) -> Table:
 
 
 def measured(report: Any) -> RenderableType:
-    """The figures of demonstrations or rollouts that there are.
+    """The available figures of demonstrations or rollouts.
 
-    A task has a success or a return, and what it has not is left out. Tables have the figures of
-    each task of a set, each target colour and each instruction, where there are several.
+    A task has either a success or a return, and the other one is left out. Tables have the figures
+    of each task of a set, each target colour and each instruction, if there are several.
     """
     found = {name: value for name, value in _scalars(report).items() if value is not None}
-    # What has a table below is taken out of the lines above.
+    # Figures with a table below are removed from the lines above.
     suites, tasks = found.pop("suites", None), found.pop("tasks", None)
     colors = found.pop("target_colors", None)
     instructions = _worst_first(found.pop("instructions", {}))
