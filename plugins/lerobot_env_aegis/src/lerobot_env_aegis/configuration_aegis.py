@@ -1,4 +1,4 @@
-"""What LeRobot may set of our simulated tasks."""
+"""The settings of our simulated tasks in LeRobot."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class AegisEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """What `AegisTask` is given besides the task's name."""
+        """The arguments of `AegisTask` besides the task's name."""
         return {
             "colors": self.colors,
             "camera": self.camera,

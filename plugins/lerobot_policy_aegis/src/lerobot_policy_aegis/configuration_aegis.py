@@ -1,4 +1,4 @@
-"""What LeRobot may set of a policy of Aegis."""
+"""The settings of an Aegis policy in LeRobot."""
 
 from __future__ import annotations
 
@@ -118,10 +118,10 @@ class AegisConfig(PreTrainedConfig):
             )
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """AdamW; or for kfac and nullspace the optimizer that protects.
+        """AdamW, or for kfac and nullspace the protecting optimizer.
 
         Raises:
-            AegisError: a method that protects, without an anchor.
+            AegisError: a protecting method has no anchor.
         """
         common = {
             "lr": self.expert_lr,
@@ -137,12 +137,12 @@ class AegisConfig(PreTrainedConfig):
         return AdamWConfig(**common)
 
     def get_scheduler_preset(self) -> AegisSchedulerConfig:
-        """The learning rates of `aegis train`."""
+        """The learning-rate schedule of `aegis train`."""
         return AegisSchedulerConfig(self.warmup_steps, self.decay_steps, self.final_lr_share)
 
     @property
     def observation_delta_indices(self) -> None:
-        """One frame, without a dimension of time."""
+        """A single frame, without a time dimension."""
         return None
 
     @property

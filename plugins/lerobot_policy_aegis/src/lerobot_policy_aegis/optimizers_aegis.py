@@ -1,7 +1,7 @@
-"""Optimizers that keep what a policy's VLM knew, for `lerobot-train --optimizer.type=...`.
+"""Optimizers that preserve what a policy's VLM knows, for `lerobot-train --optimizer.type=...`.
 
-LeRobot gives an optimizer parameters without names. How they are told nevertheless is said in
-aegis_cli/guard/optimizer.py.
+LeRobot gives an optimizer parameters without names. How they are identified nevertheless is
+explained in aegis_cli/guard/optimizer.py.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
         """The method's own options."""
 
     def check_anchor(self, option: str) -> None:
-        """Raise AegisError where no anchor is named.
+        """Raise AegisError if no anchor is given.
 
         Args:
-            option: what `.anchor` names it of, on the command line.
+            option: the command-line option that `.anchor` is appended to.
         """
         if self.anchor:
             return
@@ -57,10 +57,10 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
         )
 
     def build(self, params: Any) -> ProtectedAdamW:
-        """The optimizer of these parameters.
+        """The optimizer for these parameters.
 
         Raises:
-            AegisError: no anchor, or what `ProtectedAdamW` refuses.
+            AegisError: there is no anchor, or `ProtectedAdamW` refuses its arguments.
         """
         self.check_anchor("--optimizer")
         return ProtectedAdamW(

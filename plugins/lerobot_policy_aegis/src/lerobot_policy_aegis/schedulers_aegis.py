@@ -1,4 +1,4 @@
-"""The learning rates of `aegis train`, for `lerobot-train`."""
+"""The learning-rate schedule of `aegis train`, for `lerobot-train`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AegisSchedulerConfig(LRSchedulerConfig):
     final_lr_share: float = 0.1
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """The schedule of an optimizer, each of whose groups has its peak as its rate."""
+        """The schedule for an optimizer whose groups have their peak rates as learning rates."""
         steps = self.num_decay_steps or num_training_steps
         if self.num_warmup_steps >= num_training_steps:
             logging.getLogger(__name__).warning(
