@@ -38,7 +38,7 @@ class Estimate:
 
     @property
     def half(self) -> float | None:
-        """Distance of the mean from the farther end; None for a single run."""
+        """Distance of the mean from the farther end; None without an interval."""
         if self.ends is None:
             return None
         low, high = self.ends

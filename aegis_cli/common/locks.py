@@ -38,7 +38,7 @@ def alone(folder: Path) -> Generator[None]:
     try:
         yield
     finally:
-        # Failing to remove a lock file or an empty folder is no error.
+        # Removed while the lock is held. No process waits for it: others are refused at once.
         with contextlib.suppress(OSError):
             if beside is not None:
                 beside.unlink()

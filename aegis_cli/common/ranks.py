@@ -73,7 +73,7 @@ class Ranks:
                 tensor.copy_(found.view_as(tensor))
 
     def rows(self, size: int) -> slice:
-        """The rows, of `size`, of a sharded tensor that are here: the last ranks have fewer.
+        """The slice of `size` rows of a sharded tensor that is here; the last ranks have fewer.
 
         `fully_shard` splits like `torch.chunk`.
         """

@@ -1,6 +1,6 @@
 """Routed low-rank experts beside a frozen linear map:
 
-    y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    A_e [r, d_in] drawn, B_e [d_out, r] zero
+    y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    with A_e [r, d_in] random, B_e [d_out, r] zero
 
 Each task t has one router per map: the experts that it may use, in a fixed order, a softmax p over
 only these, and a scale s. A task computes only with the experts of its own router, so later

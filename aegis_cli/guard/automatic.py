@@ -61,7 +61,7 @@ class AutomaticLoop:
         self._ahead: AnchorGradient | None = None
 
     def begin(self, mask: Tensor | None, image: Tensor | None) -> None:
-        """A forward pass under gradients begins.
+        """A forward pass with gradients begins.
 
         Raises:
             AegisError: the model has parameters that the guard does not know, or the previous pass

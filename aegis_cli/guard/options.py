@@ -38,7 +38,7 @@ _TRAINING_ALONE = {
     "growth": 0.0,
     "step": "proximal",
 }
-_IN_BACKBONE = "vlm."  # before the names of a Hugging Face model in an anchor of `aegis anchor`
+_IN_BACKBONE = "vlm."  # prefix of a Hugging Face model's names in an anchor from `aegis anchor`
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""MAPS (arXiv 2511.19878): hold modules to their pre-trained weights, most near the pixels.
+"""MAPS (arXiv 2511.19878): hold modules to their pre-trained weights, most firmly near the pixels.
 
 It applies Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step. If
 c = -<g, theta_before - theta0> < 0, that is, if a step along -g leads back towards theta0 although

@@ -177,7 +177,7 @@ def make(
 
     Args:
         threads: number of threads with which the planner of a suite task simulates.
-        number: number of the episode that it is for, which selects the task of a set.
+        number: number of the episode that it is for; the environments of a set depend on it.
         seen_by: cameras that take pictures, in this order; empty for the task's own.
         published: whether to use the initial states that a benchmark has published, if there are
             any; otherwise each episode is drawn anew.

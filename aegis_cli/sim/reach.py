@@ -43,7 +43,7 @@ def around(tip: np.ndarray, goal: np.ndarray, keep_out_m: float = KEEP_OUT_M) ->
     if length == 0:
         return gap
     nearest = tip + gap * np.clip(-(tip @ gap) / length**2, 0, 1)
-    # A push may have moved the tip into the circle, which it may leave straight: hence r.
+    # A push may have moved the tip into the circle; it may leave in a straight line, hence r.
     if np.linalg.norm(nearest) >= min(keep_out_m, r) - 1e-9:
         return gap / length
     side = 1.0 if tip[0] * goal[1] - tip[1] * goal[0] >= 0 else -1.0
