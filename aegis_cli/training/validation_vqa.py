@@ -52,8 +52,7 @@ class ValidationQuestions:
         return dataclasses.replace(self, before=before, seconds=taken)
 
     def warn_of_little_knowledge(self, recipe: Recipe, on_event: OnEvent) -> None:
-        """Warn of sets that the backbone could hardly answer from the start: nothing can be lost.
-        """
+        """Warn of sets that the backbone could hardly answer at the start: nothing can be lost."""
         model, prompt = recipe.backbone, recipe.probe.ask
         for then in self.before:
             known = score(then)
