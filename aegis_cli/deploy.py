@@ -167,8 +167,8 @@ class DeployedPolicy:
             pictures, instruction, positions: see `predict_action_chunk`.
 
         Raises:
-            AegisError: as `predict_action_chunk`, at each call: a robot whose sensor fails does not
-                continue on an older prediction.
+            AegisError: as in `predict_action_chunk`, at each call: a robot whose sensor fails does
+                not continue on an older prediction.
         """
         seen = self.read(pictures, instruction, positions)
         if seen.instruction != self._follows:
@@ -262,7 +262,7 @@ class DeployedPolicy:
         """What a chunk has to continue; None if nothing is left.
 
         Raises:
-            AegisError: `previous` is no end of a chunk, or the delay is longer than it.
+            AegisError: `previous` cannot be the end of a chunk, or the delay is longer than it.
         """
         nothing = np.zeros((0, self.actions), np.float32)
         left = nothing if previous is None else _numbers(previous, "actions")

@@ -61,7 +61,8 @@ def load(
 
     Raises:
         AegisError: something is wrong with one of them, the sets are not of one robot, a set is
-            named twice, episodes are selected from several sets, or a renamed name is in no set.
+            named twice, episodes are selected from several sets, or a name to be renamed is in no
+            set.
     """
     chosen = each(paths)
     # First all that the meta folders can show: decoding a set can take hours.
@@ -274,7 +275,7 @@ def _check_selection(paths: Sequence[Path], selection: Selection) -> None:
 
 @dataclass(frozen=True)
 class Robot:
-    """What a set says of the robot that it was recorded with.
+    """The description of the robot that a set was recorded with.
 
     Attributes:
         sizes: the numbers of positions and of actions.
@@ -323,7 +324,7 @@ def _complete(
 
 
 def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
-    """Raise AegisError for a renamed name that occurs in none of these sets."""
+    """Raise AegisError for a name to be renamed that occurs in none of these sets."""
     if not rename:
         return
     # One set may already have the policy's names, while another needs the renaming.

@@ -60,7 +60,7 @@ def check_apart(rename: Renaming, names: Sequence[str], renamed: Sequence[str], 
 
 
 def check_known(rename: Renaming, names: Iterable[str], where: str) -> None:
-    """Raise AegisError for a renamed name that does not occur in the demonstrations.
+    """Raise AegisError for a name to be renamed that does not occur in the demonstrations.
 
     Args:
         names: all names that occur, cameras both with and without `observation.images.`.

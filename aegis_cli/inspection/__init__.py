@@ -102,7 +102,7 @@ def is_questions(path: Path) -> bool:
 
         # Anything but a LeRobot dataset is read as questions, or refused as such.
         return not download.is_dataset(str(path))
-    if path.exists() and path.suffix not in file.OF_QUESTIONS:  # told without torch
+    if path.exists() and path.suffix not in file.OF_QUESTIONS:  # decided without torch
         return False
     from aegis_cli.data.vqa import summary
 

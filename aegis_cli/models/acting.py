@@ -452,7 +452,7 @@ def _play(
 
 
 def _continued(active: Sequence[_PlayedEpisode], pace: _Pace) -> Continued | None:
-    """The actions that the next chunks continue; None at the start of episodes, or if not asked."""
+    """The actions that the next chunks continue; None at the start of episodes, or unguided."""
     left = [e.left for e in active if e.left is not None and len(e.left)]
     if pace.delay is None or not pace.guided or not left:
         return None

@@ -58,7 +58,7 @@ class ActionErrors:
     """Errors of chunks that were predicted at N frames.
 
     Attributes:
-        recorded: [N, H, A], what was done, in raw units.
+        recorded: [N, H, A], the recorded actions, in raw units.
         error: [N, H, A], prediction minus recording.
         hold: [N, H, A], the position at the frame minus the recording; None if actions are not
             positions.

@@ -1,8 +1,8 @@
 """A policy as a folder in the layout of LeRobot's policies; LeRobot itself is not needed.
 
-config.json what LeRobot needs to know: features, chunk, executed actions model.safetensors all
-tensors of the policy, under the names of its modules; the header has
-                           its sizes, its task and what else its user has to know
+config.json                what LeRobot needs to know: features, chunk, executed actions
+model.safetensors          all tensors of the policy, under the names of its modules; the header has
+                           its sizes, its task and what else a user needs to know
 policy_preprocessor.json   LeRobot's steps before and after the policy. They change no number,
 policy_postprocessor.json  because the policy has its own scales.
 backbone/                  a Hugging Face model's configuration and its processor's files

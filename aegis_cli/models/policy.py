@@ -60,7 +60,7 @@ class Policy(nn.Module):
 
         Args:
             proprio: scale of the robot's positions.
-            action: scale of its actions, minus what they are relative to.
+            action: scale of its actions minus what they are relative to.
             relative: for each action, the index of the position that it is predicted relative to,
                 or None if it is absolute; empty if all are absolute.
         """

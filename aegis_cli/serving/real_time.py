@@ -118,7 +118,7 @@ class RealTime:
             pictures, instruction, positions: see `DeployedPolicy.predict_action_chunk`.
 
         Raises:
-            AegisError: as `predict_action_chunk` for this observation, at each call, or for the
+            AegisError: as in `predict_action_chunk`, at each call for the observation, or for
                 actions predicted meanwhile.
         """
         if self._closed:

@@ -353,7 +353,7 @@ def _ledger(parts: Parts, backbone: Backbone) -> Ledger:
 
 
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
-    """Round, and set up gradient checkpointing of, the backbone as the recipe asks.
+    """Apply the recipe's weight dtype and gradient checkpointing to the backbone.
 
     Raises:
         AegisError: the backbone cannot do so, or two settings exclude each other.

@@ -1,7 +1,7 @@
 """The run folder: checkpoints written aside and renamed, and what is read back from them.
 
-recipe.yaml ledger.safetensors metrics.jsonl checkpoints/000500/backbone/model.safetensors a plain
-VLM; in the hub's layout with
+recipe.yaml  ledger.safetensors  metrics.jsonl
+checkpoints/000500/backbone/model.safetensors        a plain VLM; in the hub's layout with
                                                      config.json, the processor's files and a
                                                      README.md
                    expert.safetensors                the action expert and its scales

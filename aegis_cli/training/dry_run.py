@@ -359,7 +359,7 @@ def shortage(report: DryRunReport) -> str | None:
     missing = []
     if report.memory_fits is False:
         assert report.memory_free_mb is not None  # otherwise memory_fits is None
-        # Activations alone shrink with the batch.
+        # Only activations shrink with the batch.
         shared = 1 if report.memory_together_mb is None else report.processes
         rest = report.memory_needed_mb - shared * report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"

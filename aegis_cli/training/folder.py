@@ -127,7 +127,7 @@ def _differences(there: Trained, here: Trained) -> str:
     Two methods' options are not listed, since neither run reads the other's.
     """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys()
-    # A stream's split is part of its training only where it is not the default.
+    # A stream's split is part of its training only if it is not the default.
     shared |= {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
     return differences(_shaping(there, names), _shaping(here, names))
@@ -249,7 +249,7 @@ def remove(out: Path) -> None:
 
 
 def _is_foreign(path: Path, out: Path) -> bool:
-    """Whether a file or folder is none that Aegis writes into a run."""
+    """Whether a file or folder in a run is foreign: not one that Aegis writes there."""
     parts = path.relative_to(out).parts
     if files.is_left(out / parts[0]):  # a temporary file of a process that was killed
         return False

@@ -82,7 +82,7 @@ class Still:
 
     @property
     def said(self) -> str:
-        """The key and its value, as messages begin with them."""
+        """The key and its value, with which messages begin."""
         return f"{_KEY}: {', '.join(self.given)}"
 
     def hold(self) -> None:

@@ -116,7 +116,7 @@ def of(out: Path) -> Inputs | None:
 
 
 def _read(said: Any) -> Inputs | None:
-    """The places that a file's JSON holds; None if it does not hold any."""
+    """The places in a file's JSON; None if they are not there."""
     places = [said.get(name) for name in ("demos", "anchor")] if isinstance(said, dict) else []
     match places:
         case [[str(), *_] as demos, (str() | None) as anchor] if all(

@@ -134,9 +134,9 @@ def load_demonstrations(
     """Load the demonstrations that the backbone learns from.
 
     Args:
-        decides: whether this process decides, from the free disk space, if decoded frames are
-            cached when the recipe does not say; if not, another process has decided, and cached
-            frames are used if there are any.
+        decides: whether this process checks if the disk has room for decoded frames, when the
+            recipe does not say; otherwise another process has decided, and cached frames are used
+            if there are any.
 
     Raises:
         AegisError: the demonstrations are of another task, have words that the backbone does not

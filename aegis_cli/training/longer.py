@@ -49,7 +49,7 @@ def check(
 
     Args:
         recipe: the recipe that it is resumed with, as `plan` returns it.
-        places: of what it learns from.
+        places: of the data that it reads.
     """
     if resume and lengthens(out, recipe):
         _check_ended(out, recipe, on_event)
@@ -60,7 +60,7 @@ def check(
 
 
 def lengthens(out: Path, recipe: Recipe) -> bool:
-    """Whether `recipe` is that of the run in `out` with a last plan of more steps."""
+    """Whether `recipe` is the recipe of the run in `out`, extended by a plan of more steps."""
     earlier = recipe.train.plans[:-1]
     there = (out / "recipe.yaml").exists()
     return bool(earlier) and there and folder.continues(out, _replanned(recipe, earlier))

@@ -20,7 +20,7 @@ def prune(out: Path, step: int, count: int, recipe: Recipe) -> None:
     Args:
         step: step of the checkpoint that has just been written, which is the newest.
         count: how many of the last ones stay, including that one.
-        recipe: recipe of the run; the best checkpoint has to pass its gate.
+        recipe: recipe of the run, whose gate the best checkpoint should pass.
 
     Raises:
         AegisError: the log is damaged, or the disk cannot be written.
@@ -61,6 +61,6 @@ def most_at_once(planned: int, there: int, count: int | None) -> int:
     Args:
         planned: checkpoints that are still to be written.
         there: how many exist already.
-        count: as `train.keep_checkpoints` says; None: all stay.
+        count: as in `train.keep_checkpoints`; None: all are kept.
     """
     return planned if count is None else min(planned, max(1, count + 2 - there))

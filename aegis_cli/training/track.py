@@ -2,7 +2,7 @@
 
 Each gets the lines of metrics.jsonl, under the same names, and later what probes, rollouts and
 open-loop evaluations measure of the run. A tracker's package is imported only if a recipe names it.
-Nothing leaves the machine unless the user configures the tracker to send it, such as by its
+Nothing leaves the machine unless the user configures the tracker to send it, for example by its
 environment variables.
 """
 

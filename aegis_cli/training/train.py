@@ -220,7 +220,7 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
 
 
 def _machine(run: TrainingRun) -> dict[str, str | int]:
-    """The machine, and the precision that `train.precision` (such as `auto`) stands for there."""
+    """The machine, and the precision that `train.precision`, such as `auto`, means on it."""
     device = run.policy.backbone.device
     taken = devices.precision_taken(device, run.recipe.train.precision)
     return machine.describe() | {"precision": taken}
@@ -356,7 +356,7 @@ def _reading_state(out: Path) -> Generator[None]:
     """In errors about the last training state, say how the run can still be resumed.
 
     Raises:
-        AegisError: an AegisError was raised inside the block.
+        AegisError: the error that was raised inside the block.
     """
     try:
         yield

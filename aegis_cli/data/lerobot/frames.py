@@ -289,7 +289,7 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
 
 
 def _clip_ends(dataset: Dataset, camera: str) -> list[float]:
-    """The latest end of each episode's clip in its file, in seconds: the start of the next clip.
+    """Where each episode's clip ends in its file, in seconds: at the latest where the next begins.
 
     Infinity for the last clip of a file, if the meta folder does not give its end.
     """
@@ -361,7 +361,7 @@ def _write(
                 for decoded in counts:
                     done += decoded
                     on_event(Progress(stage, done, count, "frames"))
-            os.fsync(file.fileno())  # a power failure must not leave the name alone
+            os.fsync(file.fileno())  # else a power failure could leave a name without frames
             os.replace(aside, path)
     except OSError as error:
         raise AegisError(

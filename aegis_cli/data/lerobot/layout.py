@@ -406,7 +406,7 @@ def check_episodes(where: Path, info: Info, episodes: Mapping[int, EpisodeIndex]
     """Raise AegisError unless these are exactly the episodes and frames that `info.json` counts."""
     numbers = list(episodes)
     if len(numbers) != info.episodes or numbers != list(range(len(numbers))):
-        # Among one more number than there are rows, one is always missing.
+        # Of one more candidate than there are rows, at least one is always missing.
         missing = sorted(set(range(min(info.episodes, len(numbers) + 1))) - set(numbers))
         which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
         raise AegisError(

@@ -145,7 +145,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
         rng = np.random.default_rng([seed, SPLITS[split], i])
         number = rng.choice(len(kinds), p=shares / shares.sum())
         values = [int(rng.integers(len(words))) for words in kinds[number].attributes]
-        facts[i, : 1 + len(values)] = number, *values  # with one attribute the last stays
+        facts[i, : 1 + len(values)] = number, *values  # with one attribute the last stays UNSAID
         images[i] = paint[number](*values, rng)
         if (i + 1) % REPORT_EVERY == 0 or i + 1 == count:
             on_event(Progress(f"{split} pictures", i + 1, count, "pictures"))

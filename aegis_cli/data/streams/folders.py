@@ -18,7 +18,7 @@ from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask, has_one_gap
 
 TEMPLATE = "a photo of a {}"  # without a full stop, which the embedded encoder does not know
-# A file in a task's folder, with words for class folders whose names are not the words.
+# A file in a task's folder, with the words for class folders that are named otherwise.
 CLASSES = "classes.json"
 TEMPLATES = "templates.txt"
 VALIDATION = 20  # every 20th training image, if a task has no validation folder

@@ -45,7 +45,7 @@ class Pictures:
         return len(self.pictures)
 
     def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray | list[np.ndarray]:
-        """Images of some rows, uint8: [B, size, size, 3], or a list of [H, W, 3] of own sizes.
+        """Images of some rows, uint8: [B, size, size, 3], or a list of unscaled [H, W, 3].
 
         Raises:
             AegisError: an image cannot be decoded.

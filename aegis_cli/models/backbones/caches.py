@@ -10,7 +10,7 @@ CACHE, EARLIER = "cache", "past_key_values"  # since transformers 5.24, and befo
 
 
 def cache_argument(module: nn.Module) -> str:
-    """The name of the cache argument in a module's own forward, which depends on its release."""
+    """The name of the cache argument in a module's forward: the one it was written with."""
     return CACHE if CACHE in _arguments(module) else EARLIER
 
 
@@ -20,5 +20,5 @@ def takes_cache(module: nn.Module) -> bool:
 
 
 def _arguments(module: nn.Module) -> set[str]:
-    # Of the class: a compiled layer has another forward of its own.
+    # The class's forward, since a compiled layer has its own.
     return set(inspect.signature(type(module).forward).parameters)

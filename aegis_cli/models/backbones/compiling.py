@@ -1,7 +1,8 @@
 """Compiling a backbone with torch.compile: its whole pass, or each transformer layer by itself.
 
-If layers are compiled, the code between them, which depends on the data, is not: which rows are
-padded, where the images' tokens go, what hooks see. Layers of one kind share their compiled code.
+If layers are compiled, the code between them, which depends on the data, is not compiled: which
+rows are padded, where the images' tokens go, what hooks see. Layers of one kind share their
+compiled code.
 """
 
 from __future__ import annotations

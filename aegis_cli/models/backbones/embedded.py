@@ -328,7 +328,7 @@ class EmbeddedVLM(Backbone):
         """Pad rows of ids on the right: ids [B, S] and their mask [B, S].
 
         Args:
-            multiple: of which S is a multiple.
+            multiple: the number that S is a multiple of.
         """
         longest = max(len(row) for row in rows)
         _check_length(longest)
@@ -390,6 +390,6 @@ def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
     causal = position[:, None] >= position[None, :]  # [S, S]
     allowed = causal | in_prompt.unsqueeze(-2)
     is_token = (ids != pad).unsqueeze(-2)  # [B, N, 1, S]
-    # With the diagonal, no padded row attends to nothing at all.
+    # The diagonal gives padded rows something to attend to.
     itself = torch.eye(len(position), dtype=torch.bool, device=ids.device)
     return (allowed & is_token) | itself
