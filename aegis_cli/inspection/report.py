@@ -135,7 +135,7 @@ class InspectReport:
 
     @property
     def method(self) -> str:
-        """A run's method, and whether what it trained was merged afterwards."""
+        """A run's method, and whether its result was merged afterwards."""
         return f"{self.facts['method']}, merged" if "merge" in self.facts else self.facts["method"]
 
     def to_json(self) -> dict[str, Any]:

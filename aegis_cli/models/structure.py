@@ -488,7 +488,7 @@ def digest(state: Mapping[str, Tensor]) -> str:
 
 
 def outermost_lists(module: nn.Module) -> list[nn.ModuleList]:
-    """The lists of modules that lie in no other list, such as a transformer's layers."""
+    """The lists of modules that are inside no other list, such as a transformer's layers."""
     if isinstance(module, nn.ModuleList):
         return [module]
     return [found for child in module.children() for found in outermost_lists(child)]

@@ -134,7 +134,7 @@ class TrainingRun:
 
     @property
     def learning(self) -> list[nn.Parameter]:
-        """Every parameter that learns."""
+        """Every trainable parameter."""
         return [p for group in self.rates for p in group["params"]]
 
     @property
@@ -287,7 +287,8 @@ def build(
     # Before the method adapts the backbone: an anchor's sites are named as in the plain backbone.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     masters = _adapted(recipe, method, backbone, on_event)
-    # The first process writes checkpoints from an unsharded copy, which has what the method added.
+    # The first process writes checkpoints from an unsharded copy, which includes what the method
+    # added.
     plain = copy.deepcopy(policy) if shards and ranks.first else None
     owners = ranks if shards else ALONE
     # Sharding replaces the parameters, so whatever holds references to them is made afterwards: the
@@ -330,7 +331,7 @@ def _begun_policy(recipe: Recipe, loaded: loading.Loaded, on_event: OnEvent) -> 
 
 
 def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
-    """Make trainable what the method trains and `train.freeze` leaves; return the masters."""
+    """Make trainable what the method trains, unless `train.freeze` names it; return the masters."""
     own = list(backbone.parameters())
     freezing.adapt(method, backbone, recipes.options(recipe), recipe.train.freeze, on_event)
     # Afterwards, since adapters are float32 anyway, and frozen weights need no master.
@@ -422,7 +423,7 @@ def _start(
 def _learning_sites(
     backbone: Backbone, sites: Mapping[str, str], options: Mapping[str, Any]
 ) -> dict[str, str]:
-    """The sites that learn.
+    """The trainable sites.
 
     Raises:
         AegisError: a site of which only a part is trainable, or no trainable site of the protected

@@ -36,7 +36,7 @@ class Average:
         """Start the average at the current weights.
 
         Raises:
-            AegisError: weights that are narrower than float32, in which small steps are lost.
+            AegisError: weights are narrower than float32, in which small steps would be lost.
         """
         self._parameters = dict(parameters or {})
         self._decay = decay

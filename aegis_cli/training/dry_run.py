@@ -477,7 +477,7 @@ def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> i
     weights = [*training.policy.parameters(), *training.policy.buffers()]
     known = [*weights, *training.average.weights.values()]
     known += [*training.demos.held, *_plain(training)]
-    # What was there before anything was built, and what is counted under another name.
+    # Tensors from before anything was built, and those counted under another name.
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
     gc.collect()  # garbage does not count as kept
     alive = _alive(training.policy.backbone.device)

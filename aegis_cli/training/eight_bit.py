@@ -103,7 +103,7 @@ def to_tensors(state: dict[str, Any]) -> dict[str, Tensor]:
 
 
 def put_back(optimizer: Any, parameter: nn.Parameter, saved: dict[str, Tensor]) -> None:
-    """Give the optimizer a parameter's state, as `to_tensors` took it."""
+    """Give the optimizer a parameter's state, as saved by `to_tensors`."""
     device = parameter.device
     state: dict[str, Any] = {n: t.to(device, copy=True) for n, t in saved.items()}
     state[_COUNT] = int(saved[_COUNT])

@@ -1,4 +1,4 @@
-"""What `train.freeze` names: parts of the backbone that do not learn, whatever the method.
+"""What `train.freeze` names: parts of the backbone that stay frozen, whatever the method.
 
 A pattern matches whole names, of two kinds. Groups have the names that ledgers and dry runs give
 them, much the same in every backbone: `vision` or `stem`, `embeddings`, `layers.0`, `final_norm`,
@@ -68,7 +68,7 @@ def adapt(
 
 @dataclass(frozen=True)
 class Still:
-    """What `train.freeze` names of a backbone.
+    """What `train.freeze` names in a backbone.
 
     Attributes:
         given: the names and patterns, as the recipe has them.

@@ -785,7 +785,7 @@ def _move(run: TrainingRun, index: int, still: bool = False) -> None:
     for group, rate in zip(run.rates, _rates(run, index, shares), strict=True):
         group["lr"] = rate
         if eight_bit.is_marked(group):
-            group["lr"] = float(group["lr"])  # its kernel takes no tensor
+            group["lr"] = float(group["lr"])  # its kernel accepts no tensor
     for optimizer in run.optimizers:
         optimizer.step()
 
