@@ -28,7 +28,7 @@ def predict(
     on_event: OnEvent = ignore,
 ) -> torch.Tensor:
     """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise."""
-    # All noise is drawn at once: drawn in parts, it would depend on the size of the parts.
+    # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
     noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
     found = []
     on_event(Progress(stage, 0, len(at), "frames"))
