@@ -1,4 +1,4 @@
-"""A policy on the hub, as `aegis push` sends it, downloaded into the hub's own cache."""
+"""Download a policy that `aegis push` has sent to the hub, into the hub's own cache."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models import lerobot_folder
 
 _EXPERT = "expert.safetensors"  # of a checkpoint's layout
-# All of a checkpoint's layout, and of LeRobot's what is small. Of any other repository it is hardly
-# more than a configuration.
+# All files of a checkpoint's layout, and the small ones of LeRobot's. In any other repository these
+# match hardly more than a configuration.
 _PARTS = (lerobot_folder.CONFIG, _EXPERT, f"{lerobot_folder.BACKBONE}/*")
 _CARDS = ("*.md",)
 
 
 def locate(name: str | Path) -> Path:
-    """The folder of a run, a checkpoint or an exported policy, or of the copy of one on the hub.
+    """The folder of a run, a checkpoint or an exported policy, downloaded from the hub if needed.
 
-    A path that is not there and can be no id stays as it is: whoever reads it says what is missing.
+    A path that does not exist and cannot be an id is returned unchanged: its reader reports what is
+    missing.
 
     Args:
-        name: a path as somebody wrote it, or the id of a policy on the hub, which is downloaded.
+        name: a path as the user wrote it, or the id of a policy on the hub, which is downloaded.
 
     Raises:
-        AegisError: neither here nor to be had, or a repository without a policy of ours.
+        AegisError: it is neither here nor can be downloaded, or the repository has no policy of
+            Aegis.
     """
-    # What is on the disk goes before an id of the same name, which is asked for over a network.
+    # A path on the disk takes precedence over a hub id of the same name, which needs the network.
     path = Path(name)
     return path if path.exists() or hub.is_local(str(name)) else fetch(str(name))
 
@@ -61,7 +63,7 @@ def fetch(name: str) -> Path:
 
 
 def _instead(config: Path) -> str:
-    """What a repository of something else says that it is."""
+    """What a repository without a policy of Aegis contains instead, by its configuration."""
     if not config.is_file():
         return f", nor a {config.name}"
     try:
