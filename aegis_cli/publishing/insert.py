@@ -17,7 +17,6 @@ from aegis_cli.publishing import foreign_policy, tensor_files
 from aegis_cli.publishing.extract import Share, check_new, checked_cast, count, told
 from aegis_cli.publishing.foreign_policy import Pair
 from aegis_cli.publishing.tensor_files import TYPES
-from aegis_cli.publishing.vlm_names import key
 from aegis_cli.training import checkpoint
 
 _NOT_COPIED = (".git", ".cache")  # of a copy of a repository, and what a download leaves
@@ -121,12 +120,8 @@ class _Rows:
 
 def _sources(pair: Pair) -> dict[str, str]:
     """The policy's name of each tensor that the VLM has -> the VLM's name."""
-    found: dict[str, str] = {}
-    for name, other in pair.match.taken.items():
-        # Of a table and a head that are one in the policy, the one of the same name goes first.
-        same = key(other.removeprefix(pair.match.prefix)) == key(name)
-        if same or other not in found:
-            found[other] = name
+    # A table and a head that are one in the policy are alike in the VLM.
+    found = {other: name for name, other in pair.match.taken.items()}
     if pair.match.second is not None:
         second, first = pair.match.second
         # A head that has learned by itself stays: the VLM has none.

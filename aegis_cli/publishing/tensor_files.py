@@ -6,6 +6,7 @@ import contextlib
 import json
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,14 @@ TYPES = {
     "BF16": torch.bfloat16,
 }
 NAMES = {str(dtype).removeprefix("torch."): name for name, dtype in TYPES.items()}
+# Of others, which are copied and nothing else, the bytes are enough.
+_WHOLE = {
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "BOOL": torch.bool,
+}
 _AT_ONCE = 2**26  # bytes of a tensor that are in memory
 _INDEX = "*.safetensors.index.json"
 _ONE = "model.safetensors"
@@ -36,30 +45,48 @@ class TensorFile:
     Attributes:
         head: the header as it stands in the file, with its length before it.
         specs: its tensors, in the order in which they lie in the file.
+        offsets: where each of them begins and ends, from the end of the header on [bytes].
         metadata: what else it says; None: nothing.
     """
 
     path: Path
     head: bytes
     specs: Mapping[str, Spec]
+    offsets: Mapping[str, tuple[int, int]]
     metadata: Mapping[str, str] | None
 
 
 class Tensors:
     """The tensors of a model or a policy, wherever in its files they lie."""
 
-    def __init__(self, parts: Sequence[TensorFile], opened: Mapping[Path, safe_open]) -> None:
+    def __init__(self, parts: Sequence[TensorFile], opened: Mapping[Path, BufferedReader]) -> None:
         self.parts = parts
         self.specs = {name: spec for part in parts for name, spec in part.specs.items()}
-        self._files = {name: opened[part.path] for part in parts for name in part.specs}
+        self._parts = {name: part for part in parts for name in part.specs}
+        self._files = opened
 
     def rows(self, name: str, first: int, last: int) -> Tensor:
-        """Rows of a tensor; of one without axes all of it."""
-        file = self._files[name]
-        return file.get_slice(name)[first:last] if self.specs[name].shape else file.get_tensor(name)
+        """Rows of a tensor; of one without axes all of it.
 
-    def whole(self, name: str) -> Tensor:
-        return self._files[name].get_tensor(name)
+        They are read and not mapped: what is mapped of a large model fills the memory, too.
+
+        Raises:
+            AegisError: the file has become shorter meanwhile.
+        """
+        part, spec = self._parts[name], self.specs[name]
+        start, end = part.offsets[name]
+        rows = spec.shape[0] if spec.shape else 1
+        a_row = (end - start) // max(1, rows)
+        file = self._files[part.path]
+        file.seek(len(part.head) + start + first * a_row)
+        values = torch.empty((last - first) * a_row, dtype=torch.uint8)
+        if values.numel() and file.readinto(values.numpy().data) != values.numel():
+            raise AegisError(f"'{part.path}' has become shorter", "a complete file", _AGAIN)
+        dtype = {**TYPES, **_WHOLE}.get(spec.dtype)
+        if dtype is None:
+            return values
+        shape = (last - first, *spec.shape[1:]) if spec.shape else ()
+        return values.view(dtype).reshape(shape)
 
 
 def paths(folder: Path) -> list[Path]:
@@ -110,8 +137,10 @@ def opened(parts: Sequence[Path]) -> Generator[Tensors]:
             files.check_utf8(path, files.RENAME)
             try:
                 with files.reading(path, "check the path"):
-                    found[path] = stack.enter_context(safe_open(path, framework="pt"))
-                    read.append(_header(path))
+                    with safe_open(path, framework="np"):  # it finds what is wrong with a header
+                        pass
+                    found[path] = stack.enter_context(open(path, "rb"))
+                    read.append(_header(path, found[path]))
             except SafetensorError as error:
                 files.refuse_pointer(path)
                 raise AegisError(
@@ -130,16 +159,16 @@ def opened(parts: Sequence[Path]) -> Generator[Tensors]:
         yield Tensors(read, found)
 
 
-def _header(path: Path) -> TensorFile:
+def _header(path: Path, file: BufferedReader) -> TensorFile:
     """A file's header, which safetensors has found right already."""
-    with open(path, "rb") as file:
-        length = file.read(8)
-        raw = file.read(int.from_bytes(length, "little"))
+    length = file.read(8)
+    raw = file.read(int.from_bytes(length, "little"))
     table: dict[str, Any] = json.loads(raw)
     metadata = table.pop("__metadata__", None)
     order = sorted(table, key=lambda name: (table[name]["data_offsets"], name))
     specs = {name: Spec(tuple(table[name]["shape"]), table[name]["dtype"]) for name in order}
-    return TensorFile(path, length + raw, specs, metadata)
+    offsets = {name: tuple(table[name]["data_offsets"]) for name in order}
+    return TensorFile(path, length + raw, specs, offsets, metadata)
 
 
 def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
@@ -150,15 +179,17 @@ def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
     # With the widest types first, every tensor is aligned. Other types are whole numbers, and last.
     names = sorted(specs, key=lambda n: (-_size(specs[n].dtype), n))
     table: dict[str, Any] = {} if part.metadata is None else {"__metadata__": dict(part.metadata)}
-    end = 0
+    offsets, end = {}, 0
     for name in names:
         shape, dtype = specs[name]
         start, end = end, end + nbytes(specs[name])
+        offsets[name] = start, end
         table[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [start, end]}
     raw = json.dumps(table, separators=(",", ":")).encode()
     raw += b" " * (-len(raw) % 8)
     head = len(raw).to_bytes(8, "little") + raw
-    return TensorFile(part.path, head, {name: specs[name] for name in names}, part.metadata)
+    in_order = {name: specs[name] for name in names}
+    return TensorFile(part.path, head, in_order, offsets, part.metadata)
 
 
 _BITS = {"64": 8, "32": 4, "16": 2}

@@ -32,7 +32,7 @@ def extracted(report: Any) -> RenderableType:
         _row("that differ from the base's", report.moved, report.moved_parameters),
         *_shares("the base's", report.kept),
     ]
-    lines = []
+    lines = _whys(report.kept)
     if report.more:
         lines.append(f"only the policy has, and left out here: {few(report.more)}")
     if report.rounded:
@@ -58,10 +58,10 @@ def inserted(report: Any) -> RenderableType:
         (f"of these {report.changed:,} differ from before", "", ""),
         *_shares("left out", report.left_out),
     ]
-    parts = [pairs(facts), _table(rows)]
+    lines = _whys(report.left_out)
     if report.rounded:
-        parts.append(Text(f"{report.rounded:,} tensors have lost digits in the policy's types"))
-    return Group(*parts)
+        lines.append(f"{report.rounded:,} tensors have lost digits in the policy's types")
+    return Group(pairs(facts), _table(rows), *([Text("\n".join(lines))] if lines else []))
 
 
 def _row(what: str, tensors: int, parameters: int) -> Row:
@@ -69,10 +69,11 @@ def _row(what: str, tensors: int, parameters: int) -> Row:
 
 
 def _shares(kind: str, shares: Sequence[Any]) -> list[Row]:
-    return [
-        _row(f"{kind}: {share.what} ({share.why})", share.tensors, share.parameters)
-        for share in shares
-    ]
+    return [_row(f"{kind}: {share.what}", share.tensors, share.parameters) for share in shares]
+
+
+def _whys(shares: Sequence[Any]) -> list[str]:
+    return [f"{share.what}: {share.why}" for share in shares]
 
 
 def _table(rows: Sequence[Row]) -> RenderableType:
