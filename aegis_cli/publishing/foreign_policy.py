@@ -19,7 +19,6 @@ from aegis_cli.training import checkpoint
 
 _EXPECTED = "a policy's weights as safetensors: LeRobot's pretrained_model folder, or openpi's"
 _INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model")  # of LeRobot's trainings
-# What a policy and an extracted VLM are called in errors and reports, as a user gave them.
 _OTHER_WEIGHTS = (".bin", ".pt", ".pth", ".ckpt")
 
 
@@ -107,6 +106,8 @@ def _weights(at: Path, name: str) -> Sequence[Path]:
     """
     files.refuse_special(at)
     if at.is_file():
+        if at.suffix != ".safetensors":
+            raise AegisError(f"'{name}', no .safetensors file", _EXPECTED, "give its folder")
         return [at]
     own = recipes.is_stream_run(at) or (at / "recipe.yaml").is_file()
     if own or checkpoint.is_one(at) or model_folder.is_policy(at):

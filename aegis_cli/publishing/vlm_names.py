@@ -162,7 +162,7 @@ def _under_one_prefix(
         if any(map(_LAYER.match, found)) and any(not _is_language(each) for each in found)
     }
     if not whole:
-        raise _nothing(places, policy, called)
+        raise _nothing(places, len(base), policy, called)
     # `model.vlm.` and `model.vlm.model.` hold the same; the shorter one holds the head, too.
     found = _without_parts(whole)
     if len(found) > 1:
@@ -241,19 +241,23 @@ def _alike(own: Spec, other: Spec, each: str) -> bool:
 
 
 def _nothing(
-    places: Mapping[str, Mapping[str, list[str]]], policy: Specs, called: tuple[str, str]
+    places: Mapping[str, Mapping[str, list[str]]],
+    vlm_has: int,
+    policy: Specs,
+    called: tuple[str, str],
 ) -> AegisError:
-    """The error for a policy without the VLM."""
+    """The error for a policy without the VLM, of that many tensors."""
     expected = "a policy that was made from this VLM, with its vision and its language layers"
     fix = "give the VLM that the policy was made from"
     most = max(places, key=lambda prefix: len(places[prefix]), default=None)
     if most is not None and len(places[most]) > 1:
-        part = "language layers" if all(map(_is_language, places[most])) else "vision"
+        part = "vision" if all(map(_is_language, places[most])) else "language layers"
+        under = f", under '{most}'" if most else ""
         found = (
-            f"of '{called[1]}' nothing but {part} in '{called[0]}', under '{most}': "
-            f"{len(places[most])} of its tensors"
+            f"of {vlm_has:,} tensors of '{called[1]}' {len(places[most]):,} have their names in "
+            f"'{called[0]}'{under}, and none of its {part}"
         )
-        return AegisError(found, expected, f"{fix}; a policy without vision has no VLM to take out")
+        return AegisError(found, expected, fix)
     first = sorted({".".join(name.split(".")[:3]) for name in policy})
     found = f"none of the tensors of '{called[1]}' in '{called[0]}', which has {few(first)}"
     return AegisError(found, expected, fix)
@@ -343,9 +347,9 @@ def _kept(
             "give the VLM that the policy was made from; of a policy with an adapter, "
             "merge that first",
         )
-    span = f"{first} to {max(layers)}" if first < max(layers) else f"{first}"
+    span = f"layers {first} to {max(layers)}" if first < max(layers) else f"layer {first}"
     kinds = (
-        (f"language layers {span}", "the policy does not have them, so they never learned", upper),
+        (f"language {span}", "the policy does not have them, so they never learned", upper),
         ("behind the layers", "the policy does not have it, so it never learned", after),
         ("buffers", "they do not learn", buffers),
     )

@@ -44,7 +44,7 @@ def smolvla_gives_and_takes_its_vlm(folder: Path) -> str:
     prefix, own = "model.vlm_with_expert.vlm.", load_file(home / "policy" / WEIGHTS)
     check_taken(home, {n.removeprefix(prefix): t for n, t in own.items() if n.startswith(prefix)})
     (kept,) = report["kept"]
-    assert kept["what"] == "language layers 1", kept
+    assert kept["what"] == "language layer 1", kept
     again = SmolVLAPolicy.from_pretrained(home / "back", strict=True)
     check_equal(policy, again)
     return f"{report['taken']} of {report['tensors']} tensors, {kept['what']} put back"

@@ -114,7 +114,7 @@ def test_layers_that_the_policy_lacks_are_put_back_and_counted(
     upper = {name: t for name, t in before.items() if name not in there}
     assert equal(load_file(tmp_path / "vlm" / WEIGHTS), {**upper, **there})
     (kept,) = report.kept
-    assert kept.what == ("language layers 1 to 2" if depth == 1 else "language layers 2")
+    assert kept.what == ("language layers 1 to 2" if depth == 1 else "language layer 2")
     assert (kept.tensors, kept.parameters) == (len(upper), sum(t.numel() for t in upper.values()))
     assert report.taken_parameters + kept.parameters == report.parameters
     back = insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
@@ -308,27 +308,30 @@ def test_a_probe_tells_what_the_policy_has_forgotten(
     assert probed["trained"][1] != answers
 
 
+@pytest.mark.parametrize("form", ["smolvla", "pi0 of openpi"])
 def test_a_merge_of_it_goes_back_into_the_policy(
-    smolvlm: Path, tmp_path: Path, aegis: Aegis
+    form: str, hf_folder: Folder, tmp_path: Path, aegis: Aegis
 ) -> None:
-    source = policy(tmp_path / "policy", foreign.moved(smolvlm), "smolvla")
+    base = base_of(form, hf_folder)
+    source = policy(tmp_path / "policy", foreign.moved(base), form)
     for command in (
-        ("extract", source, "--base", smolvlm, "--out", tmp_path / "vlm"),
+        ("extract", source, "--base", base, "--out", tmp_path / "vlm"),
         (
-            *("merge", tmp_path / "vlm", "--base", smolvlm, "--method", "linear"),
-            *("--strength", "1", "--out", tmp_path / "merged"),
+            *("merge", tmp_path / "vlm", "--base", base, "--method", "linear"),
+            *("--strength", "0.5", "--out", tmp_path / "merged"),
         ),
         ("insert", tmp_path / "merged", "--into", source, "--out", tmp_path / "back"),
+        ("extract", tmp_path / "back", "--base", base, "--out", tmp_path / "again"),
     ):
         code, _, err = aegis(*command)
         assert code == 0, err
-    own = {n: t for n, t in load_file(source / WEIGHTS).items() if "lm_expert" in n}
-    back = load_file(tmp_path / "back" / WEIGHTS)
-    assert equal({name: back[name] for name in own}, own)
+    before, back = load_file(source / WEIGHTS), load_file(tmp_path / "back" / WEIGHTS)
+    expert = {n: tensor for n, tensor in before.items() if n.startswith(FORMS[form].expert)}
+    assert expert and before.keys() == back.keys()
+    assert equal({name: back[name] for name in expert}, expert)
     merged = load_file(tmp_path / "merged" / WEIGHTS)
-    prefix = "model.vlm_with_expert.vlm."
-    assert equal({name: back[prefix + name] for name in merged}, merged)
-    assert back.keys() == load_file(source / WEIGHTS).keys()
+    assert equal(load_file(tmp_path / "again" / WEIGHTS), merged)
+    assert not equal(merged, load_file(tmp_path / "vlm" / WEIGHTS))
 
 
 def test_both_tell_their_report_as_json(smolvlm: Path, tmp_path: Path, aegis: Aegis) -> None:
@@ -381,6 +384,7 @@ def test_what_is_no_policy_of_the_base_is_refused(
     source = policy(tmp_path / "policy", own, "pi0 of LeRobot")
     said = bad("extract", source, "--base", smolvlm)
     assert "give the VLM that the policy was made from" in said
+    assert "and none of its language layers" in said
     gone = {n: t for n, t in own.items() if ".layers.1." not in n or "vision" in n}
     middle = policy(tmp_path / "middle", gone, "pi0 of LeRobot")
     said = bad("extract", middle, "--base", paligemma)
@@ -412,6 +416,8 @@ def test_what_is_no_policy_at_all_is_refused(
     assert "policy.pt" in asked(tmp_path / "pickled")
     (tmp_path / "cut.safetensors").write_bytes(b"x" * 20)
     assert "truncated or not a safetensors file" in asked(tmp_path / "cut.safetensors")
+    (tmp_path / "policy.bin").write_bytes(b"x" * 20)
+    assert "no .safetensors file" in asked(tmp_path / "policy.bin")
     (tmp_path / "adapter").mkdir()
     (tmp_path / "adapter" / "adapter_config.json").write_text("{}")
     assert "an adapter of PEFT" in asked(tmp_path / "adapter")

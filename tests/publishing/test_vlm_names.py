@@ -94,9 +94,9 @@ def test_a_base_of_any_generation_has_the_layers_behind_the_policys_kept(
     upper = {GENERATIONS[of_base](n) for n in saved if foreign.is_layer(n, depth)}
     assert {name for kept in match.kept for name in kept.names} == upper
     assert set(match.taken) == set(own) - upper
-    spans = {1: "1 to 3", 2: "2 to 3", 3: "3"}
+    spans = {1: "layers 1 to 3", 2: "layers 2 to 3", 3: "layer 3"}
     assert [kept.what for kept in match.kept] == (
-        [f"language layers {spans[depth]}"] if depth < DEPTH else []
+        [f"language {spans[depth]}"] if depth < DEPTH else []
     )
 
 
@@ -200,7 +200,7 @@ def test_a_base_with_fewer_layers_is_refused() -> None:
 def test_a_policy_without_vision_or_without_anything_of_it_is_refused() -> None:
     own = base()
     blind = {name: spec for name, spec in own.items() if name not in SEEING}
-    with pytest.raises(AegisError, match="nothing but language layers"):
+    with pytest.raises(AegisError, match="and none of its vision"):
         found(own, policy(blind, "model.", "modules"))
     with pytest.raises(AegisError, match=r"none of the tensors .* which has model\.resnet\.0"):
         found(own, {"model.resnet.0.weight": Spec((3, 3), "F32")})
