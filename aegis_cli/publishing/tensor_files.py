@@ -25,7 +25,7 @@ TYPES = {
     "BF16": torch.bfloat16,
 }
 NAMES = {str(dtype).removeprefix("torch."): name for name, dtype in TYPES.items()}
-# Of others, which are copied and nothing else, the bytes are enough.
+# Whole numbers, as of buffers. Of any other type, which is copied and nothing else, the bytes do.
 _WHOLE = {
     "I64": torch.int64,
     "I32": torch.int32,
