@@ -68,6 +68,8 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
         )
     if model_folder.is_policy(path):
         return file.inspect(path / "model.safetensors")
+    if (kind := model_folder.foreign_policy(path)) is not None:
+        return _foreign_policy(path, kind)
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)
@@ -100,6 +102,16 @@ def _policy_folder(path: Path) -> InspectReport:
         backbone = {"kind": own.kind} | {k: own.facts[k] for k in ("family", "parameters")}
     facts = found.facts | {"backbone": backbone}
     return dataclasses.replace(found, kind="policy", path=str(path), facts=facts)
+
+
+def _foreign_policy(path: Path, kind: str) -> InspectReport:
+    """A policy of LeRobot's, by its weights' headers, and how its VLM is measured."""
+    # Beside the weights lie the scales of LeRobot's steps, as policy_preprocessor_*.safetensors.
+    parts = [part for part in model_folder.weights(path) if not part.name.startswith("policy_")]
+    tensors = tuple(info for part in parts for info in _tensor_infos(part))
+    count = sum(math.prod(tensor.shape) for tensor in tensors)
+    facts = {"type": kind, "parameters": count, "vlm": model_folder.take_out(path)}
+    return InspectReport("lerobot-policy", str(path), facts, tensors)
 
 
 def _hub_model(path: Path) -> InspectReport:

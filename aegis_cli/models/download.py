@@ -8,6 +8,7 @@ from pathlib import Path
 from aegis_cli.common import files, hub
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.backbones import model_folder
 
 _EXPERT = "expert.safetensors"  # of a checkpoint's layout
 # All files of a checkpoint's layout, and the small ones of LeRobot's. In any other repository these
@@ -53,12 +54,17 @@ def fetch(name: str) -> Path:
         return _snapshot(name, (*_PARTS, lerobot_folder.MODEL))
     if (folder / _EXPERT).is_file() and (folder / lerobot_folder.BACKBONE).is_dir():
         return folder
+    fix = (
+        "check the name; where the policy lies in a folder of it: "
+        f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER"
+    )
+    if model_folder.foreign_policy(folder) is not None:
+        fix += f"; {model_folder.take_out(name)}"
     raise AegisError(
         f"the repository '{name}' of the hub has no policy of Aegis{_instead(config)}",
         f"what aegis push sends: {_EXPERT} and {lerobot_folder.BACKBONE}/, or LeRobot's layout "
         f"with {lerobot_folder.CONFIG} of the type {lerobot_folder.TYPE}",
-        "check the name; where the policy lies in a folder of it: "
-        f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER",
+        fix,
     )
 
 

@@ -311,6 +311,7 @@ def last(folder: Path) -> Path:
     """
     path = Path(folder) / "checkpoints" / LAST
     if not (path / EXPERT).is_file():
+        model_folder.refuse_foreign_policy(Path(folder))
         raise AegisError(
             f"no checkpoint in '{folder}'",
             "a run folder with checkpoints/last, the folder of one of its checkpoints, or a "

@@ -92,14 +92,14 @@ def load(name: str) -> Backbone:
             named.
     """
     if (shape := shapes.of_backbone(name)) is not None:
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import of_shape
 
         return of_shape.build(shape)
     own, layers = divided(name)
     path = locate(name)
     if path.is_dir():
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import hf
 
         backbone = hf.load(path, layers)
@@ -117,6 +117,12 @@ def load(name: str) -> Backbone:
         from aegis_cli.models import lerobot_folder
 
         return lerobot_folder.load(path.parent)[0].backbone
+    if not artifacts.is_artifact(path):
+        raise AegisError(
+            f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
+            "a backbone that Aegis wrote, or the folder of a Hugging Face model",
+            f"check the path; of a robot policy, {model_folder.take_out(name)}",
+        )
     from aegis_cli.models.backbones.embedded import load_file
 
     return load_file(path)[0]
@@ -141,7 +147,7 @@ def load_dual(name: str) -> DualEncoder:
     """
     path = locate(name)
     if path.is_dir():
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import clip
 
         return clip.load(path)
@@ -195,7 +201,8 @@ def _no_backbone(name: str) -> AegisError:
     return AegisError(found, expected, fix)
 
 
-def _need_transformers(name: str) -> None:
+def need_transformers(name: str) -> None:
+    """Raise AegisError unless transformers is there to load the model of that name."""
     if not _has_transformers():
         found = f"a Hugging Face model at '{name}', and no transformers to load it"
         raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")

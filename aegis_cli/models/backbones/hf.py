@@ -548,6 +548,14 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
     return backbone
 
 
+def check(folder: Path) -> None:
+    """Raise AegisError unless a folder is that of a model which takes images with its text."""
+    model_folder.check_files(folder, transformers.CONFIG_MAPPING)
+    with quiet(), loading(folder, "model"):
+        config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
+        _check_kind(folder, config)
+
+
 def described(folder: Path) -> HFBackbone:
     """The model that a folder of `save_description` describes; its weights are still to come.
 
