@@ -55,6 +55,10 @@ class MomentSum(ABC):
         """What it consists of, to be added to that of other processes in place."""
 
     @abstractmethod
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        """Go on from what another sum of this kind and width consisted of."""
+
+    @abstractmethod
     def spectrum(self, count: int, energy: float) -> Spectrum:
         """The spectrum of the mean over `count` rows, on the CPU.
 
@@ -130,6 +134,9 @@ class FullSum(MomentSum):
     def parts(self) -> list[Tensor]:
         return self._sums
 
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        self._sums = list(parts)
+
     def spectrum(self, count: int, energy: float) -> Spectrum:
         found = decompose(self.matrix() / count, energy)
         assert found.vectors is not None
@@ -176,6 +183,9 @@ class Sketch(MomentSum):
 
     def parts(self) -> list[Tensor]:
         return [self._seen, self._trace]
+
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        self._seen, self._trace = parts
 
     @torch.no_grad()
     def spectrum(self, count: int, energy: float) -> Spectrum:
@@ -252,6 +262,9 @@ class TraceOnly(MomentSum):
 
     def parts(self) -> list[Tensor]:
         return [self._trace]
+
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        (self._trace,) = parts
 
     def spectrum(self, count: int, energy: float) -> Spectrum:
         rest = self._trace.cpu() / count / self._width

@@ -846,7 +846,7 @@ def test_of_several_processes_the_launcher_is_named_too(
 
 
 def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
-    for name in ("train", "dry-run", "pipeline", "demos", "probe", "rollout"):
+    for name in ("train", "dry-run", "pipeline", "demos", "probe", "rollout", "anchor"):
         stage(name, error=KeyboardInterrupt())
     code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
     assert (code, out) == (130, "") and "Traceback" not in err
@@ -860,6 +860,8 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     for command, kept in (("probe", "answers so far"), ("rollout", "groups of episodes")):
         said = aegis(command, "r")[2]
         assert f"interrupted; {kept}" in said and said.endswith(f"go on with: aegis {command} r\n")
+    said = aegis("anchor", "--out", "x")[2]
+    assert "interrupted; what is measured so far is kept; go on with: aegis anchor" in said
     whole = "interrupted; no half-written file is left; begin again with: aegis"
     assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")
     dry = ("--demos", "d", "--out", "r", "--dry-run")
