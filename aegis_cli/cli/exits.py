@@ -34,6 +34,7 @@ from aegis_cli.recipes.decoding import below
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
 _KEEPS = {  # what others do not measure again, where the cache can be written
     "anchor": "what is measured so far is kept",
+    "evaluate": "predictions so far are kept",
     "probe": "answers so far are kept",
     "rollout": "groups of episodes are kept that were played to their end (of 64, or LIBERO's 10)",
 }
