@@ -59,7 +59,7 @@ MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 _TESTS_BEGUN = itertools.count()
 _CACHE, _MEASURED = (
     cache_folders.folder,
-    ("anchors", "answers", "digests", "episodes", "predictions"),
+    ("anchors", "answers", "digests", "episodes", "merges", "predictions"),
 )
 
 # An example may take longer on a machine that does something else, too.

@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -54,6 +54,16 @@ def load(name: str) -> Loaded:
     return Loaded(model, files.sha256_value({"weights": content, "settings": model.settings()}))
 
 
+def about(model: Backbone) -> dict[str, Any]:
+    """All that a model's answers depend on in it, as JSON; its weights are read for that."""
+    return {"weights": model.fingerprint(), "settings": model.settings()}
+
+
+def of_now(model: Backbone) -> Loaded:
+    """A model as it is by now, maybe with weights of no file."""
+    return Loaded(model, files.sha256_value(about(model)))
+
+
 def _places(name: str) -> dict[Path, object]:
     """The files of a model, where they lie by now, as they are; none where it does not load."""
     try:
@@ -85,8 +95,8 @@ def ask(
         if loaded.digest is None:
             graded = grade(model.answers, own, batch_size, on_event)
         else:
-            about = {"model": loaded.digest, **circumstances.of_answers()}
-            kept = KeptLines("answers", about, on_event)
+            by = {"model": loaded.digest, **circumstances.of_answers()}
+            kept = KeptLines("answers", by, on_event)
             graded = _asked(model, own, batch_size, kept, on_event)
     return [one for part in ranks.gathered(graded) for one in part]
 

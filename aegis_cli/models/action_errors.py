@@ -6,7 +6,6 @@ Each prediction begins at a recorded frame, and nothing is executed.
 from __future__ import annotations
 
 import base64
-import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli.common import files
+from aegis_cli.common import kept_lines
 from aegis_cli.common.estimates import t_quantile
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.kept_lines import KeptLines
@@ -68,18 +67,17 @@ def _line(first: int, chunks: torch.Tensor) -> dict[str, Any]:
         "dtype": str(chunks.dtype).removeprefix("torch."),
         "chunks": base64.b64encode(raw).decode(),
     }
-    return {**line, "sha256": files.sha256_value(line)}
+    return kept_lines.sealed(line)
 
 
 def _kept(kept: KeptLines) -> Iterator[tuple[int, torch.Tensor]]:
     """The batches that are kept whole, by the place of the first frame; others are left out."""
     for line in kept.read():
-        digest = line.pop("sha256", None)
-        with contextlib.suppress(ValueError):  # of a number that JSON has not
-            if files.sha256_value(line) == digest:
-                raw = bytearray(base64.b64decode(line["chunks"]))
-                flat = torch.frombuffer(raw, dtype=getattr(torch, line["dtype"]))
-                yield line["first"], flat.view(line["shape"])
+        said = kept_lines.unsealed(line)
+        if said is not None:
+            raw = bytearray(base64.b64decode(said["chunks"]))
+            flat = torch.frombuffer(raw, dtype=getattr(torch, said["dtype"]))
+            yield said["first"], flat.view(said["shape"])
 
 
 def training_std(policy: Policy, meta: PolicyMeta) -> np.ndarray:
