@@ -176,13 +176,15 @@ class Piece:
             if held.number is not None:
                 held.leave()
 
+        with interrupts.deferred(self._tell_of_signal) as held:
+            yield keep
+
+    def _tell_of_signal(self) -> None:
         text = (
             "a signal came: the batch under way is finished, and what is measured so far is kept. "
             "Another one ends this at once, without what came after it was last kept"
         )
-        tell = lambda: self.work._on_event(Warned(_STAGE, text))  # noqa: E731
-        with interrupts.deferred(tell) as held:
-            yield keep
+        self.work._on_event(Warned(_STAGE, text))
 
     def finish(self, kept: Kept) -> None:
         """Keep the result in place of the sums; all processes call this together."""

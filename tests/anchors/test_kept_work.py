@@ -11,7 +11,10 @@ from typing import Any
 
 import pytest
 import torch
+from samples import processes
+from samples.kept_anchors import go_on_there
 from samples.parallel_runs import MeasuringAgain, run_together
+from samples.second_device import POSSIBLE
 from samples.tiny import make_tiny
 from samples.vqa_files import picture, write_jsonl
 
@@ -317,6 +320,12 @@ def test_several_processes_go_on_each_with_its_own_sums(
     found = [(tmp_path / name / "anchor.safetensors").read_bytes() for name in names]
     assert all(one == found[0] for one in found)
     assert not list((tmp_path / "cache" / "anchors").iterdir())
+
+
+@pytest.mark.skipif(not POSSIBLE, reason="this torch takes no device of others' making")
+def test_an_anchor_goes_on_on_a_device_besides_the_cpu(tiny_folder: Path, tmp_path: Path) -> None:
+    places = processes.alone(go_on_there, tiny_folder, tmp_path, ALL, GROUP, 9)
+    assert places == 6
 
 
 def rows(width: int, seed: int) -> torch.Tensor:
