@@ -17,6 +17,8 @@ from aegis_cli.common import cache, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 
+_SEAL = "sha256"
+
 
 class KeptLines:
     """Lines of JSON that are kept for later measurements of the same thing.
@@ -64,6 +66,20 @@ class KeptLines:
             text = f"what is measured is not kept, so that an interruption loses it ({why})"
             fix = "set AEGIS_CACHE to a folder that can be written"
             self._on_event(Warned(self.path.parent.name, f"{text}: {fix}"))
+
+
+def sealed(line: Mapping[str, Any]) -> dict[str, Any]:
+    """A line with a digest of what it says."""
+    return {**line, _SEAL: files.sha256_value(dict(line))}
+
+
+def unsealed(line: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What such a line says; None of one that is not as it was written."""
+    said = {name: value for name, value in line.items() if name != _SEAL}
+    with contextlib.suppress(ValueError):  # of a number that JSON has not
+        if files.sha256_value(said) == line.get(_SEAL):
+            return said
+    return None
 
 
 def _ends_a_line(path: Path) -> bool:

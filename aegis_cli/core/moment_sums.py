@@ -56,6 +56,10 @@ class MomentSum(ABC):
         """Its tensors, to which those of other processes are added in place."""
 
     @abstractmethod
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        """Go on from what another sum of this kind and width consisted of."""
+
+    @abstractmethod
     def spectrum(self, count: int, energy: float) -> Spectrum:
         """The spectrum of the mean over `count` rows, on the CPU.
 
@@ -131,6 +135,9 @@ class FullSum(MomentSum):
     def parts(self) -> list[Tensor]:
         return self._sums
 
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        self._sums = list(parts)
+
     def spectrum(self, count: int, energy: float) -> Spectrum:
         found = decompose(self.matrix() / count, energy)
         assert found.vectors is not None
@@ -177,6 +184,9 @@ class Sketch(MomentSum):
 
     def parts(self) -> list[Tensor]:
         return [self._seen, self._trace]
+
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        self._seen, self._trace = parts
 
     @torch.no_grad()
     def spectrum(self, count: int, energy: float) -> Spectrum:
@@ -253,6 +263,9 @@ class TraceOnly(MomentSum):
 
     def parts(self) -> list[Tensor]:
         return [self._trace]
+
+    def restore(self, parts: Sequence[Tensor]) -> None:
+        (self._trace,) = parts
 
     def spectrum(self, count: int, energy: float) -> Spectrum:
         rest = self._trace.cpu() / count / self._width

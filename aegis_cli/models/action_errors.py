@@ -5,13 +5,18 @@ Each prediction starts from a recorded frame, and nothing is executed.
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
+from aegis_cli.common import kept_lines
 from aegis_cli.common.estimates import t_quantile
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.models.policy import Policy
@@ -26,19 +31,53 @@ def predict(
     batch_size: int,
     stage: str,
     on_event: OnEvent = ignore,
+    kept: KeptLines | None = None,
 ) -> torch.Tensor:
-    """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise."""
+    """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise.
+
+    Args:
+        kept: what was predicted before at these frames under the same circumstances, batch by
+            batch, and is not predicted again; what is predicted is added. None keeps nothing.
+    """
     # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
     noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
-    found = []
-    on_event(Progress(stage, 0, len(at), "frames"))
+    found = {} if kept is None else dict(_kept(kept))  # chunks by their first frame's place
+    done = sum(map(len, found.values()))
+    on_event(Progress(stage, done, len(at), "frames"))
     for first in range(0, len(at), batch_size):
+        if first in found:
+            continue
         part = slice(first, first + batch_size)
         batch = shown.batch(at[part], 1)
         acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
-        found.append(acted.cpu())
-        on_event(Progress(stage, min(first + batch_size, len(at)), len(at), "frames"))
-    return torch.cat(found)
+        found[first] = acted.cpu()
+        if kept is not None:
+            kept.add([_line(first, found[first])])
+        done += len(acted)
+        on_event(Progress(stage, done, len(at), "frames"))
+    return torch.cat([found[first] for first in sorted(found)])
+
+
+def _line(first: int, chunks: torch.Tensor) -> dict[str, Any]:
+    """A batch's chunks as they are kept, bit for bit."""
+    raw = chunks.contiguous().view(torch.uint8).numpy().tobytes()
+    line = {
+        "first": first,
+        "shape": list(chunks.shape),
+        "dtype": str(chunks.dtype).removeprefix("torch."),
+        "chunks": base64.b64encode(raw).decode(),
+    }
+    return kept_lines.sealed(line)
+
+
+def _kept(kept: KeptLines) -> Iterator[tuple[int, torch.Tensor]]:
+    """The batches that are kept whole, by the place of the first frame; others are left out."""
+    for line in kept.read():
+        said = kept_lines.unsealed(line)
+        if said is not None:
+            raw = bytearray(base64.b64decode(said["chunks"]))
+            flat = torch.frombuffer(raw, dtype=getattr(torch, said["dtype"]))
+            yield said["first"], flat.view(said["shape"])
 
 
 def training_std(policy: Policy, meta: PolicyMeta) -> np.ndarray:
