@@ -1,15 +1,15 @@
-"""A trained policy in a program of one's own: pictures, instruction and positions in, actions out.
+"""A trained policy for your own program: pictures, instruction and positions in, actions out.
 
     policy = load_policy("runs/x")
     policy.reset()  # a new episode
     action = policy.select_action(frame, "go to the red target", positions)
 
-An observation of LeRobot, or what a robot of LeRobot's sees, stands for pictures and positions:
+A LeRobot observation, or that of a LeRobot robot, can be given instead of pictures and positions:
 
     action = policy.select_action(robot.get_observation(), "go to the red target")
     robot.send_action(policy.named(action))
 
-The methods are named as those of LeRobot's policies. All values are in the units of the
+The methods have the names of LeRobot's policy methods. All values are in the units of the
 demonstrations.
 """
 
@@ -48,37 +48,36 @@ Positions = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Seen:
-    """What a policy acts on: pictures in the backbone's order, text, and positions [P] float32."""
+    """A policy's input: pictures in the backbone's order, text, and positions [P] float32."""
 
     pictures: list[np.ndarray]
     instruction: str
     positions: np.ndarray
 
     def copy(self) -> Seen:
-        """The same in memory of its own."""
+        """A copy that shares no memory."""
         pictures = [picture.copy() for picture in self.pictures]
         return Seen(pictures, self.instruction, self.positions.copy())
 
 
 class DeployedPolicy:
-    """One robot's policy, loaded and ready to act.
+    """A robot's policy, loaded and ready to act.
 
     Attributes:
         task: the task that it was trained on; None for a dataset of no simulated task.
-        cameras: names of the pictures that it takes, in their order; empty for a single picture
-            without a name.
-        sizes: (height, width) of the pictures that it was trained on, one a camera; empty where
-            that is not known, or the backbone reads squares of `image_size`.
-        positions, actions: P and A, how many numbers each of them has.
+        cameras: names of the pictures that it takes, in order; empty for a single unnamed picture.
+        sizes: (height, width) of the pictures that it was trained on, one per camera; empty if
+            unknown, or if the backbone reads squares of `image_size`.
+        positions, actions: P and A, the sizes of the two vectors.
         chunk: how many actions are predicted at once, of which `replan` are executed.
         ensemble: the decay of the temporal ensemble (see `core.ensemble`), which predicts at every
             step; None without one.
-        action_names, state_names: of the A actions and the P positions, in their order; None where
-            the demonstrations had none, or the policy is older than these names.
-        state: the features of the demonstrations that the positions are, `observation.state` as a
-            rule. `predict_action_chunk` reads them from an observation that has all of them.
-        fps: actions per second, as many as the demonstrations had frames; None where that is not
-            known.
+        action_names, state_names: of the A actions and the P positions, in order; None if the
+            demonstrations had no names, or the policy is older than this feature.
+        state: the features of the demonstrations that make up the positions, usually
+            `observation.state`. `predict_action_chunk` reads them from an observation that has all
+            of them.
+        fps: actions per second, equal to the frame rate of the demonstrations; None if unknown.
     """
 
     def __init__(
@@ -96,8 +95,8 @@ class DeployedPolicy:
 
         Args:
             recorded: what a checkpoint's meta says of the demonstrations: `action_names`,
-                `proprio_names`, `state` and `fps`, each only where it is known.
-            ensemble: decay of a temporal ensemble; then `replan` is 1 whatever is given.
+                `proprio_names`, `state` and `fps`, each only if it is known.
+            ensemble: decay of a temporal ensemble; `replan` is then always 1.
         """
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self._seed = task, tuple(cameras), seed
@@ -110,7 +109,7 @@ class DeployedPolicy:
         self.state_names = _names(known.get("proprio_names"))
         self.state = tuple(listed(known.get("state", layout.STATE)))
         self.fps: float | None = known.get("fps")
-        # A backbone notes what its modules do in a pass, and would note that of two at once.
+        # A backbone records what its modules do in a pass, and would mix up two at once.
         self._one_at_a_time = threading.Lock()
         self.reset()
 
@@ -136,9 +135,9 @@ class DeployedPolicy:
         self._policy.backbone.check_prompt(text)
 
     def begin(self) -> DeployedPolicy:
-        """The same policy at the beginning of an episode of its own; the weights are shared.
+        """The same policy at the start of a separate episode; the weights are shared.
 
-        Several may act from several threads; they wait for each other.
+        Several of them may be used from several threads; they wait for each other.
         """
         other = copy.copy(self)
         other._generator = torch.Generator()
@@ -146,10 +145,10 @@ class DeployedPolicy:
         return other
 
     def reset(self) -> None:
-        """Begin an episode: forget the last prediction, and begin the flow's noise anew."""
+        """Begin an episode: forget the last prediction, and restart the flow's noise."""
         self._ahead: deque[np.ndarray] = deque()
         self._averaged = None if self.ensemble is None else TemporalEnsemble(self.ensemble)
-        self._follows: str | None = None  # the instruction that the actions ahead are of
+        self._follows: str | None = None  # the instruction of the last prediction
         self._generator.manual_seed(self._seed)
 
     def select_action(
@@ -158,18 +157,18 @@ class DeployedPolicy:
         instruction: str | None = None,
         positions: Positions | None = None,
     ) -> np.ndarray:
-        """The next action [A]; every `replan`-th call predicts, the others go on with its chunk.
+        """The next action [A]; every `replan`-th call predicts, the others continue its chunk.
 
-        With a temporal ensemble each call predicts, and the action is the mean of what the calls so
-        far have predicted for it. Another instruction than that of the chunk predicts at once, and
-        drops what is left of earlier ones.
+        With a temporal ensemble each call predicts, and the action is the weighted mean of the
+        predictions made for it so far. A changed instruction predicts at once, and drops what is
+        left of earlier predictions.
 
         Args:
             pictures, instruction, positions: see `predict_action_chunk`.
 
         Raises:
-            AegisError: what `predict_action_chunk` finds wrong, at each call: a robot whose sensor
-                fails does not move on by an older prediction.
+            AegisError: as in `predict_action_chunk`, at each call: a robot whose sensor fails does
+                not continue on an older prediction.
         """
         seen = self.read(pictures, instruction, positions)
         if seen.instruction != self._follows:
@@ -195,34 +194,33 @@ class DeployedPolicy:
     ) -> np.ndarray:
         """The next actions [H, A] float32.
 
-        A robot that moves while it waits for them tells what it does meanwhile (`previous`), and
-        gets a chunk that continues it: real-time chunking, see `core.continuation`. It executes its
-        own actions until the chunk is there, `delay` of them, and then the chunk's from that number
-        on. `RealTime` does all of this.
+        A robot that moves while it waits for them passes the actions it is executing (`previous`),
+        and gets a chunk that continues them: real-time chunking, see `core.continuation`. It
+        executes `delay` of its own actions until the chunk arrives, and then the chunk's actions
+        from index `delay` on. `RealTime` does all of this.
 
         Args:
-            pictures: RGB [H, W, 3] uint8 of any size, which are fitted to the size that the
-                backbone was trained on; one picture, or a mapping of the cameras' names to theirs,
-                with or without LeRobot's `observation.images.` before them. Without positions, a
-                whole observation as `data.lerobot.observation` reads it.
+            pictures: RGB [H, W, 3] uint8 of any size, which are resized to the size that the
+                backbone was trained on; one picture, or a mapping from camera names, with or
+                without LeRobot's prefix `observation.images.`. Without positions, a whole
+                observation as `data.lerobot.observation` reads it.
             instruction: a text in words that the backbone knows; None: the observation's `task`.
             positions: proprioception [P], in the demonstrations' order; None: the observation's.
-            previous: what is left of the last chunk at this observation [n, A], n <= H; None:
-                nothing.
-            delay: how many of these actions are executed before the new chunk is there.
+            previous: the rest of the last chunk at this observation [n, A], n <= H; None: nothing.
+            delay: how many of these actions are executed before the new chunk arrives.
 
         Raises:
-            AegisError: other pictures or numbers than it was trained on, words that the backbone
-                does not know, or predicted actions that are not finite.
+            AegisError: pictures or numbers differ from those it was trained on, the backbone does
+                not know a word, or predicted actions are not finite.
         """
         seen = self.read(pictures, instruction, positions)
         return self.predict(seen, self._continued(previous, delay))
 
     def named(self, action: np.ndarray) -> dict[str, float]:
-        """The numbers of an action [A] by their names, as a robot's `send_action` takes them.
+        """The numbers of an action [A] by name, as for a robot's `send_action`.
 
         Raises:
-            AegisError: the policy does not know the names, or these are not its numbers.
+            AegisError: the policy does not know the names, or the action has another size.
         """
         if self.action_names is None:
             raise AegisError(
@@ -252,7 +250,7 @@ class DeployedPolicy:
         Raises:
             AegisError: they are not finite.
         """
-        # Within a program's own inference mode nothing could be differentiated.
+        # In a caller's inference mode nothing could be differentiated.
         with self._one_at_a_time, torch.inference_mode(mode=False):
             frames = [torch.from_numpy(self._fitted(p, i)) for i, p in enumerate(seen.pictures)]
             images = [tuple(frames)] if len(frames) > 1 else frames[0][None]
@@ -261,10 +259,10 @@ class DeployedPolicy:
         return check_actions(acted[0].cpu()).numpy()
 
     def _continued(self, previous: np.ndarray | None, delay: int | np.integer) -> Continued | None:
-        """What a chunk is to continue; None where nothing is left.
+        """What a chunk has to continue; None if nothing is left.
 
         Raises:
-            AegisError: it is no end of a chunk, or the delay is longer.
+            AegisError: `previous` cannot be the end of a chunk, or the delay is longer than it.
         """
         nothing = np.zeros((0, self.actions), np.float32)
         left = nothing if previous is None else _numbers(previous, "actions")
@@ -302,10 +300,10 @@ class DeployedPolicy:
         instruction: str | None = None,
         positions: Positions | None = None,
     ) -> Seen:
-        """What `predict` takes, of the same observation as `predict_action_chunk` takes.
+        """The input of `predict`, from the same arguments as `predict_action_chunk`.
 
         Raises:
-            AegisError: other pictures or numbers than the policy was trained on.
+            AegisError: pictures or numbers differ from those the policy was trained on.
         """
         if positions is None:
             if not isinstance(pictures, Mapping):
@@ -343,7 +341,7 @@ class DeployedPolicy:
         return Seen(found, instruction, given)
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
-        """The pictures in the order in which the backbone takes them."""
+        """The pictures in the backbone's order."""
         if isinstance(pictures, Mapping):
             named = {layout.short(name): picture for name, picture in pictures.items()}
             names = [layout.short(name) for name in self.cameras]
@@ -365,14 +363,14 @@ class DeployedPolicy:
         return [pictures]
 
     def _fitted(self, picture: np.ndarray, camera: int) -> np.ndarray:
-        """The picture of the camera of that number in the size that training showed."""
+        """The picture of camera number `camera`, resized to the size used in training."""
         side = self.image_size
         if side is not None:
             picture = fit(picture, side, side)
         elif self.sizes:
             picture = fit(picture, *self.sizes[camera])
-        # PyTorch takes no negative strides, and warns of what nobody may write to, such as the
-        # pixels of a file. Then it is copied.
+        # PyTorch accepts no negative strides, and warns of read-only memory, such as a file's
+        # pixels. Such pictures are copied.
         return np.require(picture, requirements=["C_CONTIGUOUS", "WRITEABLE"])
 
 
@@ -380,7 +378,7 @@ def _numbers(given: Positions, what: str = "positions") -> np.ndarray:
     """Positions or actions as float32.
 
     Raises:
-        AegisError: they are no numbers.
+        AegisError: they are not numbers.
     """
     try:
         return np.asarray(given, dtype=np.float32)
@@ -393,10 +391,10 @@ def _picture(of: str, given: np.ndarray) -> np.ndarray:
     """One camera's picture.
 
     Args:
-        of: which camera's it is, in an error.
+        of: which camera it is from, for an error.
 
     Raises:
-        AegisError: it is none.
+        AegisError: it is no picture.
     """
     found = np.asarray(given)
     is_picture = found.ndim == 3 and found.shape[2] == 3 and found.dtype == np.uint8
@@ -417,7 +415,7 @@ def _names(given: Sequence[str] | None) -> tuple[str, ...] | None:
     return None if given is None else tuple(given)
 
 
-@torch.inference_mode(mode=False)  # weights that are made within one cannot be differentiated by
+@torch.inference_mode(mode=False)  # weights made in inference mode cannot be differentiated through
 @devices.cpu_by_default()
 def load_policy(
     run: str | Path,
@@ -426,21 +424,21 @@ def load_policy(
     precision: str = devices.AUTO,
     ensemble: float | None = None,
 ) -> DeployedPolicy:
-    """The policy of a run, on the GPU where there is one.
+    """Load the policy of a run, on the GPU if there is one.
 
     Args:
         run: what `aegis train` or `aegis export` wrote, or the id on the hub of a policy that
             `aegis push` sent.
         task: which one, if the run is a stream of robot tasks.
-        seed: seeds the noise that the flow begins with.
-        precision: of matrix products, bf16 or float32; auto is bf16 on a GPU that multiplies in it,
-            as training does there. What the policy answers is float32.
-        ensemble: decay of a temporal ensemble; None: as the policy was trained, which is without
-            one unless its recipe has `rollout.ensemble`.
+        seed: seed of the flow's initial noise.
+        precision: of matrix products, bf16 or float32; auto is bf16 on a GPU that supports it, as
+            in training. The returned actions are float32.
+        ensemble: decay of a temporal ensemble; None: the setting that the policy was trained with,
+            which is no ensemble unless its recipe has `rollout.ensemble`.
 
     Raises:
-        AegisError: no run, files that are missing, broken or not of one checkpoint, a task that
-            it has not learned, or a decay that is not finite.
+        AegisError: there is no run, files are missing, broken or from different checkpoints, the
+            task was not learned, or the decay is not finite.
     """
     if ensemble is not None:
         temporal.check(ensemble)
@@ -493,10 +491,10 @@ def _of_stream(
 
 
 def load_acting(run: Path, task: str | None) -> Acting:
-    """What `aegis rollout` lets act: the policy of a training run, or of one task of a stream.
+    """Load what `aegis rollout` runs: the policy of a training run, or of one task of a stream.
 
     Raises:
-        AegisError: no such run, or a task that it has not learned.
+        AegisError: there is no such run, or it has not learned the task.
     """
     load = robots.load_policy if is_robot_stream_run(run) else load_run
     return load(run, task)

@@ -57,7 +57,10 @@ LONG = (
 MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 
 _TESTS_BEGUN = itertools.count()
-_CACHE, _MEASURED = cache_folders.folder, ("answers", "digests", "episodes")
+_CACHE, _MEASURED = (
+    cache_folders.folder,
+    ("anchors", "answers", "digests", "episodes", "merges", "predictions"),
+)
 
 # An example may take longer on a machine that does something else, too.
 settings.register_profile("unhurried", deadline=None)

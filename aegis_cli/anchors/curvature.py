@@ -13,11 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.graph import GradientEdge, get_gradient_edge
 
-from aegis_cli.anchors import inputs, passes
+from aegis_cli.anchors import inputs, kept_work, passes, second_moments
 from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import FINITE, SecondMoments
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
+from aegis_cli.common.kept_tensors import Kept
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.numerics import widened
@@ -225,6 +226,17 @@ class CurvatureRecorder:
         """Let go of the watched passes' graph."""
         self._last, self._open, self._graph.entries = None, [], []
 
+    def kept(self) -> Kept:
+        """The sums so far, to be kept while no graph waits for a backward pass."""
+        sums = self._sums.kept()
+        entropy = [self.entropy.nats, self.entropy.words]
+        return Kept({**sums.figures, "entropy": entropy}, sums.tensors)
+
+    def restore(self, kept: Kept, device: torch.device) -> None:
+        """Go on from what was kept, before the first pass, where `measure` draws the words."""
+        self._sums.restore(kept, device)
+        self.entropy.nats, self.entropy.words = kept.figures["entropy"]
+
     def add_up(self, ranks: Ranks) -> None:
         """Count what all processes have gone back through, each in passes of its own."""
         self._sums.add_up(ranks)
@@ -345,6 +357,7 @@ def measure(
     ranks: Ranks = ALONE,
     temperature: float = 1.0,
     entropy: AnswerEntropy | None = None,
+    work: kept_work.Work = kept_work.NOTHING,
 ) -> dict[str, Spectrum]:
     """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
 
@@ -358,21 +371,33 @@ def measure(
         ranks: the processes that share the passes.
         temperature: what the answers' scores are divided by before words are drawn from them.
         entropy: what is to count the answers of this process.
+        work: as for `inputs.measure`.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
     """
     found: dict[str, Spectrum] = {}
+    entropy = entropy or AnswerEntropy()
     sized = partial(_size, whole)
     for maps, stage in passes.groups(model, "anchor curvature", memory, sized):
+        piece = work.piece(stage)
+        if (known := piece.finished()) is not None:
+            passes.tell_known(asked, stage, on_event)
+            found |= second_moments.from_kept(known)
+            entropy.nats, entropy.words = known.figures["entropies"][ranks.rank]
+            continue
         recorder = CurvatureRecorder(
             model, maps, seed, follow_uses=False, whole=whole, temperature=temperature
         )
-        recorder.entropy = entropy or recorder.entropy
+        recorder.entropy = entropy
         if not recorder.names:
             continue
-        with recorder.watch(), torch.enable_grad():
-            for part in passes.run(model, asked, batch_size, stage, on_event, ranks):
+        done = 0
+        if (begun := piece.begun()) is not None:
+            recorder.restore(begun, model.device)
+            done = begun.figures["done"]
+        with recorder.watch(), torch.enable_grad(), piece.going(recorder.kept) as passed:
+            for part in passes.run(model, asked, batch_size, stage, on_event, ranks, done, passed):
                 # Questions of one image may share its graph: their drawn words are independent, so
                 # what their gradients have in common is 0 on average.
                 uniform = _uniform(seed, part.question)
@@ -381,7 +406,12 @@ def measure(
         recorder.check_complete()
         spectra = recorder.spectra(energy, True, f"{stage} spectra", on_event)
         # They come in the backward pass's order.
-        found |= {name: spectra[name] for name in recorder.names}
+        spectra = {name: spectra[name] for name in recorder.names}
+        kept = second_moments.to_keep(spectra)
+        # Of every process, whose sum is that of all groups up to here.
+        entropies = ranks.gathered((entropy.nats, entropy.words))
+        piece.finish(Kept({**kept.figures, "entropies": entropies}, kept.tensors))
+        found |= spectra
     return found
 
 

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aegis_cli.anchors import passes
+from aegis_cli.anchors import kept_work, passes, second_moments
 from aegis_cli.anchors.hooks import SharedInput, describe_use, modules_of_sites, watch_uses
 from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common import memory as memory_of_process
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.kept_tensors import Kept
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.numerics import widened
@@ -31,6 +32,7 @@ if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scen
     from aegis_cli.data.vqa.dataset import VQASet
 
 _LARGE = 10**8  # bytes of sums
+_DRAWS = "draws"  # where the state of the generator is kept
 
 
 @dataclass
@@ -161,6 +163,17 @@ class InputRecorder:
         self._check_covered()
         for site, read in self._ids.items():
             self._count_table(site, read)
+
+    def kept(self) -> Kept:
+        """The sums so far and the place in the draws, to be kept between two passes."""
+        self._count_reading()  # what was read last waits for others that may read it, too
+        sums = self._sums.kept()
+        return Kept(sums.figures, {**sums.tensors, _DRAWS: self._generator.get_state()})
+
+    def restore(self, kept: Kept, device: torch.device) -> None:
+        """Go on from what was kept, before the first pass."""
+        self._sums.restore(kept, device)
+        self._generator.set_state(kept.tensors[_DRAWS])
 
     def add_up(self, ranks: Ranks) -> None:
         """Count what all processes have read, each in passes of its own."""
@@ -334,6 +347,7 @@ def measure(
     whole: int = moment_sums.WHOLE,
     ranks: Ranks = ALONE,
     drawn: Drawn = ALL,
+    work: kept_work.Work = kept_work.NOTHING,
 ) -> dict[str, Spectrum]:
     """Measure the inputs of every site of one of our backbones, and of each tied head.
 
@@ -345,6 +359,7 @@ def measure(
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes.
         drawn: as for `InputRecorder`; each process draws by itself.
+        work: what is kept of an interrupted measurement, and of this one.
 
     Raises:
         AegisError: modules that no inputs describe, or that these questions do not use.
@@ -356,14 +371,25 @@ def measure(
             # Sums lie between what the passes take and free, of which much would be kept.
             until_measured.enter_context(memory_of_process.returned())
         for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
+            piece = work.piece(stage)
+            if (known := piece.finished()) is not None:
+                passes.tell_known(asked, stage, on_event)
+                found |= second_moments.from_kept(known)
+                continue
             own = drawn.of_process(ranks.rank)
             recorder = InputRecorder(model, maps, follow_uses=False, whole=whole, drawn=own)
-            with recorder.watch(None):
-                for _ in passes.run(model, asked, batch_size, stage, on_event, ranks):
+            done = 0
+            if (begun := piece.begun()) is not None:
+                recorder.restore(begun, model.device)
+                done = begun.figures["done"]
+            with recorder.watch(None), piece.going(recorder.kept) as passed:
+                for _ in passes.run(model, asked, batch_size, stage, on_event, ranks, done, passed):
                     pass
             recorder.add_up(ranks)
             recorder.check_complete()
-            found |= recorder.spectra(energy, True, f"{stage} spectra", on_event)
+            spectra = recorder.spectra(energy, True, f"{stage} spectra", on_event)
+            piece.finish(second_moments.to_keep(spectra))
+            found |= spectra
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from aegis_cli.anchors import anchor_file, curvature, fisher, inputs, moments
-from aegis_cli.common import artifacts, devices, files
+from aegis_cli.anchors.kept_work import Work
+from aegis_cli.common import artifacts, circumstances, devices, files, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined
@@ -22,8 +23,9 @@ from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data import demonstrations, mixture
 from aegis_cli.data.selection import ALL, Selection
-from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa import digests, sets
 from aegis_cli.data.vqa.dataset import VQASet
+from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
@@ -46,7 +48,8 @@ class AnchorReport:
             without inputs.
         entropy: of the answers' words by the backbone's own distribution, in nats a word; None
             without curvature.
-        seconds: wall time by part, without rendering the questions.
+        seconds: wall time by part, without rendering the questions; with that before an
+            interruption, as far as its work was kept.
         megabytes: size of the file, in 10^6 bytes.
     """
 
@@ -73,6 +76,7 @@ def run(
     on_event: OnEvent = ignore,
     demos: Path | None = None,
     selection: Selection = ALL,
+    keep: bool = True,
 ) -> AnchorReport:
     """Measure the parts asked for on `settings.samples` questions with images and answers.
 
@@ -82,10 +86,14 @@ def run(
 
     Where torchrun has started several processes, each calls this, and they share the passes.
 
+    What is measured is kept in the cache until the anchor is written: called again with the same
+    inputs after an interruption, it goes on, to the same bytes on a CPU.
+
     Args:
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
         selection: which of their frames; nothing but pictures and instructions is read.
+        keep: whether it is kept, and what was kept before is taken.
 
     Raises:
         AegisError: inputs that cannot be read, or parts that frames do not tell.
@@ -94,9 +102,11 @@ def run(
         _warn_of_unread(settings, on_event)
         if settings.source == "demos":
             shown = replace(selection, state=(), action=())
-            measured = _on_frames(backbone, settings, Path(out), demos, shown, on_event, ranks)
+            measured = _on_frames(
+                backbone, settings, Path(out), demos, shown, on_event, ranks, keep
+            )
         else:
-            measured = _on_questions(backbone, settings, Path(out), on_event, ranks)
+            measured = _on_questions(backbone, settings, Path(out), on_event, ranks, keep)
         if measured.entropy is not None:
             curvature.warn_of_sure_answers(
                 measured.entropy,
@@ -107,7 +117,9 @@ def run(
                 on_event,
             )
         _warn_of_few(measured.samples, settings, on_event)
-        return ranks.by_first(lambda: _written(measured, settings, Path(out)))
+        report = ranks.by_first(lambda: _written(measured, settings, Path(out)))
+        measured.work.remove()
+        return report
 
 
 # The parts each of which reads a setting that others do not.
@@ -190,6 +202,7 @@ class _Measured:
     Attributes:
         inputs: sha256 of what it was measured on, by a name for it.
         meta: what that is called.
+        work: what is kept until the anchor is written.
         entropy: of the answers, in nats a word; None without curvature.
     """
 
@@ -200,11 +213,12 @@ class _Measured:
     seconds: dict[str, float]
     inputs: Mapping[str, str]
     meta: Mapping[str, Any]
+    work: Work
     entropy: float | None = None
 
 
 def _on_questions(
-    backbone: str, settings: Settings, out: Path, on_event: OnEvent, ranks: Ranks
+    backbone: str, settings: Settings, out: Path, on_event: OnEvent, ranks: Ranks, keep: bool
 ) -> _Measured:
     source = sets.read(settings.vqa, settings.skip_bad, on_event, settings.ask)
     files.check_utf8(out, "choose another --out")
@@ -215,18 +229,50 @@ def _on_questions(
     asked = source.choose(
         "anchor", settings.samples, settings.seed, [model.check_text], on_event
     ).sized(model.image_size)
+    fingerprint = ranks.by_first(model.fingerprint)
+
+    def read() -> dict[str, Any]:
+        # Their order, and which of them are about one image, decide how they are passed.
+        shown = [digests.of_questions(asked), asked.image_of.tolist()]
+        return {"questions": files.sha256_value(shown)}
+
+    about = _about(model, fingerprint, settings, ranks, read) if keep else None
+    work = Work(about, ranks, on_event)
     entropy = curvature.AnswerEntropy()
-    anchor, seconds = _PartMeasurement(model, asked, settings, on_event, ranks, entropy).parts()
+    part = _PartMeasurement(model, asked, settings, on_event, ranks, work, entropy)
+    anchor, seconds = part.parts()
     return _Measured(
         anchor,
-        fingerprint=model.fingerprint(),
+        fingerprint=fingerprint,
         samples=len(asked.questions),
         skipped=asked.skipped,
         seconds=seconds,
         inputs=source.sha256,
         meta={"vqa": source.name} | ({} if source.ask == sets.PLAIN else {"ask": source.ask}),
-        entropy=entropy.mean(ranks) if anchor.curvature else None,
+        work=work,
+        entropy=entropy.mean(ranks) if "curvature" in settings.parts else None,
     )
+
+
+def _about(
+    model: Backbone,
+    fingerprint: str,
+    settings: Settings,
+    ranks: Ranks,
+    read: Callable[[], Mapping[str, Any]],
+) -> dict[str, Any]:
+    """All that a measurement depends on, by which what is kept of it is found.
+
+    Args:
+        read: tells what the backbone reads; the first process alone is asked.
+    """
+    return {
+        "weights": fingerprint,
+        "settings": model.settings(),
+        "anchor": asdict(settings),
+        "processes": ranks.count,
+        **ranks.by_first(lambda: {**read(), **circumstances.of_answers()}),
+    }
 
 
 def _on_frames(
@@ -237,6 +283,7 @@ def _on_frames(
     selection: Selection,
     on_event: OnEvent,
     ranks: Ranks,
+    keep: bool,
 ) -> _Measured:
     """The moments of frames of episodes, drawn without repetition, with their instructions."""
     demos = _check_frames(settings, demos)
@@ -253,7 +300,11 @@ def _on_frames(
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
     # Drawn at random and read in their order, as videos are decoded.
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
-    start = time.perf_counter()
+    fingerprint = ranks.by_first(model.fingerprint)
+    of = {"demos": found.sha256, "frames": frames.tolist(), "selection": repr(selection)}
+    of |= machine.versions(("av",))  # which decodes videos
+    about = _about(model, fingerprint, settings, ranks, lambda: of) if keep else None
+    work, start = Work(about, ranks, on_event), time.perf_counter()
 
     def read(rows: torch.Tensor) -> moments.Read:
         texts = [found.instructions[i] for i in found.instruction_of[rows].tolist()]
@@ -265,15 +316,16 @@ def _on_frames(
     if found.cameras:
         meta["cameras"] = list(found.cameras)
     batches = frames.split(settings.batch_size)
-    image, text = moments.measure_passes(model, batches, read, len(frames), on_event, ranks)
+    image, text = moments.measure_passes(model, batches, read, len(frames), on_event, ranks, work)
     return _Measured(
         Anchor(image, text),
-        fingerprint=model.fingerprint(),
+        fingerprint=fingerprint,
         samples=len(frames),
         skipped=0,
-        seconds={"moments": time.perf_counter() - start},
+        seconds={"moments": work.before_s + time.perf_counter() - start},
         inputs={"demos": found.sha256},
         meta=meta,
+        work=work,
     )
 
 
@@ -300,6 +352,7 @@ class _PartMeasurement:
     """The questions that each part is measured on, and what with.
 
     Attributes:
+        work: what is kept of the parts.
         entropy: what counts the answers of the curvature.
     """
 
@@ -308,6 +361,7 @@ class _PartMeasurement:
     settings: Settings
     on_event: OnEvent
     ranks: Ranks
+    work: Work
     entropy: curvature.AnswerEntropy
 
     def parts(self) -> tuple[Anchor, dict[str, float]]:
@@ -321,16 +375,24 @@ class _PartMeasurement:
         found: dict[str, Any] = {}
         seconds: dict[str, float] = {}
         for part in sorted(set(self.settings.parts)):
-            start = time.perf_counter()
+            start, before_s = time.perf_counter(), self.work.before_s
             found[part] = measures[part]()
-            seconds[part] = time.perf_counter() - start
+            seconds[part] = self.work.before_s - before_s + time.perf_counter() - start
         image, text = found.pop("moments", ((), ()))
         return Anchor(image, text, **found), seconds
 
     def _moments(self) -> tuple[list[Moments], list[Moments]]:
-        batches = self.asked.batches(self.settings.batch_size)
-        count = len(self.asked.questions)
-        return moments.measure(self.model, batches, count, self.on_event, self.ranks)
+        count, size = len(self.asked.questions), self.settings.batch_size
+        # By their rows: of a batch that was passed before, no image is decoded again.
+        batches = [slice(first, first + size) for first in range(0, count, size)]
+
+        def read(rows: slice) -> moments.Read:
+            part = self.asked.part(rows)
+            return tensors(part.images[part.image_of]), [q.text for q in part.questions]
+
+        return moments.measure_passes(
+            self.model, batches, read, count, self.on_event, self.ranks, self.work
+        )
 
     def _inputs(self) -> dict[str, Spectrum]:
         return inputs.measure(
@@ -343,6 +405,7 @@ class _PartMeasurement:
             whole=self.settings.exact_width,
             ranks=self.ranks,
             drawn=inputs.Drawn(self.settings.tokens, self.settings.seed),
+            work=self.work,
         )
 
     def _curvature(self) -> dict[str, Spectrum]:
@@ -358,11 +421,12 @@ class _PartMeasurement:
             ranks=self.ranks,
             temperature=self.settings.temperature,
             entropy=self.entropy,
+            work=self.work,
         )
 
     def _fisher(self) -> dict[str, Tensor]:
         samples = min(self.settings.fisher_samples, len(self.asked.questions))
-        return fisher.measure(self.model, self.asked, samples, self.on_event, self.ranks)
+        return fisher.measure(self.model, self.asked, samples, self.on_event, self.ranks, self.work)
 
     @property
     def _memory(self) -> int | None:

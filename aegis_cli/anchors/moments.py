@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 from torch import Tensor
 
+from aegis_cli.anchors import kept_work
 from aegis_cli.common import prefetch
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.kept_tensors import Kept
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.core.moments import Moments, add_moments, empty, merge
 from aegis_cli.data.batch import Images
@@ -50,6 +52,15 @@ class MomentRecorder:
         self.image = add_moments(self.image or nothing, hidden, mask & image)
         self.text = add_moments(self.text or nothing, hidden, mask & ~image)
 
+    def kept(self) -> Kept:
+        """The moments so far, to be kept."""
+        return _to_keep(self.image, self.text)
+
+    def restore(self, kept: Kept, device: torch.device) -> None:
+        """Go on from moments that were kept."""
+        found = _from_kept(kept)
+        self.image, self.text = ([layer.to(device) for layer in layers] for layers in found)
+
 
 def measure(
     model: Backbone,
@@ -83,6 +94,7 @@ def measure_passes(
     total: int,
     on_event: OnEvent = ignore,
     ranks: Ranks = ALONE,
+    work: kept_work.Work = kept_work.NOTHING,
 ) -> tuple[list[Moments], list[Moments]]:
     """The moments of each layer over image and text tokens, of images that are read with texts.
 
@@ -91,16 +103,33 @@ def measure_passes(
             threads.
         total: how many there are, for the progress.
         ranks: the processes that take turns in passing a batch.
+        work: what is kept of an interrupted measurement, and of this one.
     """
-    recorder, done = MomentRecorder(), 0
+    piece = work.piece("anchor")
+    if (known := piece.finished()) is not None:
+        on_event(Progress("anchor", total, total, "samples"))
+        return _from_kept(known)
+    recorder, done, before = MomentRecorder(), 0, 0
+    if (begun := piece.begun()) is not None:
+        recorder.restore(begun, model.device)
+        done, before = begun.figures["samples"], begun.figures["done"]
+
+    def sums() -> Kept:
+        found = recorder.kept()
+        return Kept({**found.figures, "samples": done}, found.tensors)
+
     # Whole batches in turns: merging is associative, so that who passed which does not matter.
-    own = itertools.islice(batches, ranks.rank, None, ranks.count)
+    own = itertools.islice(batches, ranks.rank + before * ranks.count, None, ranks.count)
     on_event(Progress("anchor", done, total, "samples"))
-    with prefetch.for_device(lambda batch: model.process(*read(batch)), own, model.device) as ready:
-        for inputs in ready:
+    with (
+        prefetch.for_device(lambda batch: model.process(*read(batch)), own, model.device) as ready,
+        piece.going(sums) as passed,
+    ):
+        for number, inputs in enumerate(ready, start=before + 1):
             encoding = model.encode(inputs.to(model.device))
             recorder.add(encoding.hidden, encoding.mask, encoding.image)
             done += len(inputs.ids)
+            passed(number)
             on_event(Progress("anchor", done, total, "samples"))
     image: list[Moments] = []
     text: list[Moments] = []
@@ -109,7 +138,30 @@ def measure_passes(
     measured = [[layer.to(cpu) for layer in found] for found in (recorder.image, recorder.text)]
     for of_image, of_text in ranks.gathered(measured):
         image, text = _merged(image, of_image), _merged(text, of_text)
+    piece.finish(_to_keep(image, text))
     return image, text
+
+
+def _to_keep(image: Sequence[Moments], text: Sequence[Moments]) -> Kept:
+    counts: dict[str, list[int]] = {}
+    tensors: dict[str, Tensor] = {}
+    for name, layers in (("image", image), ("text", text)):
+        counts[name] = [layer.count for layer in layers]
+        for place, layer in enumerate(layers):
+            tensors[f"{name}.{place}.mean"], tensors[f"{name}.{place}.var"] = layer.mean, layer.var
+    return Kept({"counts": counts}, tensors)
+
+
+def _from_kept(kept: Kept) -> tuple[list[Moments], list[Moments]]:
+    """The moments over image and text tokens; none for a process that has figures alone."""
+
+    def layers(name: str) -> list[Moments]:
+        return [
+            Moments(count, *(kept.tensors[f"{name}.{place}.{kind}"] for kind in ("mean", "var")))
+            for place, count in enumerate(kept.figures["counts"][name] if kept.tensors else ())
+        ]
+
+    return layers("image"), layers("text")
 
 
 def _merged(found: list[Moments], more: list[Moments]) -> list[Moments]:

@@ -69,6 +69,11 @@ def groups(
         yield Maps(kinds, {}, heads, {}), name
 
 
+def tell_known(asked: VQASet, stage: str, on_event: OnEvent) -> None:
+    """Tell that this was passed before, and what came of it is known."""
+    on_event(Progress(stage, len(asked.images), len(asked.images), "images"))
+
+
 def run(
     model: Backbone,
     asked: VQASet,
@@ -76,19 +81,23 @@ def run(
     stage: str,
     on_event: OnEvent,
     ranks: Ranks = ALONE,
+    done: int = 0,
+    passed: Callable[[int], object] | None = None,
 ) -> Iterator[AnswerScores]:
     """Pass the whole set, up to `batch_size` images at a time with all their questions.
 
     Args:
         ranks: the processes that pass a part of the images each.
+        done: how many of its part this process has passed before.
+        passed: called with how many these are, each time that all scores of a batch were taken.
 
     Yields:
         The scores of the answers' words, part by part, with the number of each question in the set.
     """
     image_of, step = torch.from_numpy(asked.image_of), min(IMAGES, batch_size)
     own = Share(ranks.rank, ranks.count).rows(len(asked.images))
-    on_event(Progress(stage, 0, own.stop - own.start, "images"))
-    for first in range(own.start, own.stop, step):
+    on_event(Progress(stage, done, own.stop - own.start, "images"))
+    for first in range(own.start + done, own.stop, step):
         last = min(first + step, own.stop)
         # Numbers of the questions about these images, wherever they stand in the set.
         rows = ((image_of >= first) & (image_of < last)).nonzero().squeeze(1)
@@ -98,4 +107,6 @@ def run(
         together = min(QUESTIONS, batch_size)
         for part in model.read_vqa(images, image_of[rows] - first, texts, answers, together):
             yield AnswerScores(part.scores, rows[part.question])
+        if passed is not None:
+            passed(last - own.start)
         on_event(Progress(stage, last - own.start, own.stop - own.start, "images"))

@@ -10,6 +10,7 @@ from torch import Tensor
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.kept_tensors import Kept
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
@@ -34,6 +35,7 @@ class SecondMoments:
         """
         self._whole = whole
         self._rows: dict[Readers, MomentSum] = {}
+        self._widths: dict[Readers, tuple[int, bool]] = {}  # and whether they are unfolded patches
         self._small: dict[str, Tensor] = {}  # those of normalisations and tables
         self._counts: dict[str, int] = {}
 
@@ -56,12 +58,36 @@ class SecondMoments:
         # Whichever of them came first, it is the same sum.
         readers = tuple(sorted(names))
         if readers not in self._rows:
-            self._rows[readers] = moment_sums.make(
-                rows.shape[1], rows.device, convolution, self._whole
-            )
+            self._begin(readers, rows.shape[1], convolution, rows.device)
         self._rows[readers].add(rows)
         for name in readers:
             self._counts[name] = self._counts.get(name, 0) + len(rows)
+
+    def kept(self) -> Kept:
+        """The sums so far, to be kept."""
+        tensors: dict[str, Tensor] = {}
+        rows = []
+        for place, (readers, moment) in enumerate(self._rows.items()):
+            parts = moment.parts()
+            rows.append([readers, *self._widths[readers], len(parts)])
+            tensors |= {f"rows.{place}.{i}": part for i, part in enumerate(parts)}
+        tensors |= {f"small.{name}": moment for name, moment in self._small.items()}
+        # In their order, by which spectra come and sums are added to others.
+        figures = {"rows": rows, "small": list(self._small), "counts": list(self._counts.items())}
+        return Kept(figures, tensors)
+
+    def restore(self, kept: Kept, device: torch.device) -> None:
+        """Go on from sums that were kept, before any of one's own."""
+        for place, (names, width, convolution, count) in enumerate(kept.figures["rows"]):
+            parts = [kept.tensors[f"rows.{place}.{i}"].to(device) for i in range(count)]
+            self._begin(tuple(names), width, convolution, device)
+            self._rows[tuple(names)].restore(parts)
+        self._small = {n: kept.tensors[f"small.{n}"].to(device) for n in kept.figures["small"]}
+        self._counts = dict(kept.figures["counts"])
+
+    def _begin(self, readers: Readers, width: int, convolution: bool, device: torch.device) -> None:
+        self._rows[readers] = moment_sums.make(width, device, convolution, self._whole)
+        self._widths[readers] = width, convolution
 
     def add_up(self, ranks: Ranks) -> None:
         """Make every sum that over the passes of all processes.
@@ -158,6 +184,31 @@ def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
         if leader != name:
             followers[name] = leader
     return followers
+
+
+def to_keep(spectra: Mapping[str, Spectrum]) -> Kept:
+    """Spectra as they are kept, each once for all that share it."""
+    followers = shared(spectra)
+    tensors: dict[str, Tensor] = {}
+    for name, spectrum in spectra.items():
+        if name not in followers:
+            tensors[f"{name}.values"] = spectrum.values
+            if spectrum.vectors is not None:
+                tensors[f"{name}.vectors"] = spectrum.vectors
+    leaders = [(name, followers.get(name, name), one.whole) for name, one in spectra.items()]
+    return Kept({"spectra": leaders}, tensors)
+
+
+def from_kept(kept: Kept) -> dict[str, Spectrum]:
+    """The spectra that were kept; none for a process that has figures alone."""
+    found: dict[str, Spectrum] = {}
+    for name, leader, whole in kept.figures["spectra"] if kept.tensors else ():
+        if leader != name:
+            found[name] = found[leader]
+            continue
+        values, vectors = kept.tensors[f"{name}.values"], kept.tensors.get(f"{name}.vectors")
+        found[name] = Spectrum(values, vectors, whole)
+    return found
 
 
 def _check_finite(name: str, parts: Iterable[Tensor]) -> None:

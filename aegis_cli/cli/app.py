@@ -1272,6 +1272,75 @@ def push(
     stages.PUSH.run(run, repo, form and form.value, private, dry_run, dtype.value, as_json=as_json)
 
 
+@app.command(short_help="Take the VLM out of a policy trained elsewhere.")
+def extract(
+    policy: Annotated[
+        str,
+        Argument(
+            metavar="POLICY",
+            help="A policy's folder or .safetensors file, as LeRobot or openpi wrote it, or its id "
+            "on the hub.",
+        ),
+    ],
+    base: Annotated[
+        str,
+        Option(
+            metavar="MODEL",
+            help="The VLM that the policy was made from: a Hugging Face model's folder or id.",
+        ),
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    dtype: Annotated[
+        Dtype,
+        Option("--dtype", help="Type of the weights: what --base is stored in, or another."),
+    ] = Dtype.source,
+    as_json: Json = False,
+) -> None:
+    """Take the VLM out of a robot policy that another program trained, as a Hugging Face model.
+
+    aegis probe FOLDER --baseline MODEL tells what it has forgotten. aegis anchor, train and merge
+    take the folder as any backbone, and aegis insert puts a VLM back into the policy.
+
+    The policy's tensors are found by their names and shapes. What it does not have, as SmolVLA the
+    upper half of its VLM's layers, is the base's, and so are tokenizer and processor.
+
+    \b
+    Example: aegis extract pretrained_model --base google/paligemma-3b-pt-224 --out vlm
+    """
+    stages.EXTRACT.run(policy, base, out, dtype.value, as_json=as_json)
+
+
+@app.command(short_help="Put a VLM back into a policy trained elsewhere.")
+def insert(
+    vlm: Annotated[
+        str,
+        Argument(
+            metavar="MODEL",
+            help="A VLM's folder, such as aegis merge made of what aegis extract wrote.",
+        ),
+    ],
+    into: Annotated[
+        str,
+        Option(
+            metavar="POLICY",
+            help="The policy's folder, as LeRobot or openpi wrote it, or its id on the hub.",
+        ),
+    ],
+    out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    as_json: Json = False,
+) -> None:
+    """Put a VLM back into a robot policy that another program trained, as a new folder.
+
+    The folder has all that the policy's has. The VLM's tensors stand under the policy's names, in
+    its types; what the policy does not have is left out. What aegis extract took out gives the
+    same weights again, unless --dtype or the base's type has rounded them.
+
+    \b
+    Example: aegis insert merged --into pretrained_model --out policy
+    """
+    stages.INSERT.run(vlm, into, out, as_json=as_json)
+
+
 @app.command(short_help="Train the embedded models from scratch.")
 def pretrain(
     recipe: RecipeArg,

@@ -33,6 +33,9 @@ from aegis_cli.recipes.decoding import below
 # What is added to a command to resume it; `run` skips stages that are up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
 _KEEPS = {  # what other commands do not measure again, if the cache can be written
+    "anchor": "what is measured so far is kept",
+    "evaluate": "predictions so far are kept",
+    "merge": "the strengths so far are kept",
     "probe": "answers so far are kept",
     "rollout": "groups of episodes are kept that were played to their end (of 64, or LIBERO's 10)",
 }
@@ -276,7 +279,8 @@ def _what_now(meta: Mapping[str, Any]) -> str:
     flag = _WITH_RESUME.get(args[0])
     if flag is None or "--dry-run" in args:
         again = f"{_program()} {shlex.join(args)}"
-        if args[0] in _KEEPS:
+        # A merge of one strength is no sweep.
+        if args[0] in _KEEPS and not any(word.startswith("--strength") for word in args):
             return f"{_KEEPS[args[0]]}; go on with: {again}"
         return f"no half-written file is left; begin again with: {again}"
     alone = _alone(meta.get(GOES_ON))

@@ -1,1 +1,1 @@
-"""What any module may use: errors, events, files, artifacts, devices, pictures."""
+"""Shared foundations for all modules: errors, events, files, artifacts, devices, pictures."""

@@ -1,7 +1,7 @@
-"""Artifacts on disk: safetensors files whose one metadata key, `aegis`, says what they are.
+"""Artifacts on disk: safetensors files whose only metadata key, `aegis`, describes them.
 
-Equal inputs give equal bytes, a file is either complete or absent, and nothing wrong loads quietly.
-What a kind must contain is declared in kinds.py; this module knows no model.
+Equal inputs give equal bytes, a file is either complete or absent, and nothing wrong loads
+silently. The content of each kind is declared in kinds.py; this module knows no model.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _FORMAT = {
     torch.int8: "I8",
     torch.uint8: "U8",
 }
-_NO_DIGEST = "0" * 64  # stands where a file's digest is to be
+_NO_DIGEST = "0" * 64  # placeholder for a file's digest
 
 
 def save(
@@ -101,16 +101,16 @@ def save(
         path: the file to write; its folder must exist.
         kind: one of KINDS.
         tensors: what to store; on any device, in any layout.
-        seed: the seed that made it.
+        seed: the seed that it was made with.
         inputs: sha256 of every file that it was made from, by a name for the file.
         fingerprint: digest of the backbone that it belongs to.
-        units: units by tensor name or fnmatch pattern; "1" where none matches.
-        meta: JSON that only this kind understands.
+        units: units by tensor name or fnmatch pattern; "1" if none matches.
+        meta: JSON whose meaning depends on the kind.
 
     Raises:
-        AegisError: the content is not what the kind demands, or the file cannot be written.
+        AegisError: the content does not fit the kind, or the file cannot be written.
     """
-    # A GPU's come to the CPU one at a time: a training state may be larger than the memory there.
+    # GPU tensors are moved to the CPU one at a time: a training state may exceed its memory.
     plain = {name: tensor.detach() for name, tensor in tensors.items()}
     table = _table(plain, units or {})
     try:
@@ -123,9 +123,9 @@ def save(
         kind, schema(kind), __version__, fingerprint, dict(inputs or {}), seed, table, pure
     )
     _validate(path, header, plain, _check_inputs(kind))
-    # As `asdict` has it, which would copy thousands of shapes one number at a time.
+    # Like `asdict`, which would copy thousands of shapes one number at a time.
     fields = vars(header) | {"tensors": {name: vars(spec) for name, spec in table.items()}}
-    # To hash takes as long as a fast disk. So a thread does it while the same values are written.
+    # Hashing takes as long as writing to a fast disk, so a thread does it during the write.
     with ThreadPoolExecutor(1, "digest") as pool:
         hashed = pool.submit(_digest, fields, plain)
         write_atomically(Path(path), lambda file: _write_safetensors(file, plain, fields, hashed))
@@ -136,8 +136,8 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     """Read and validate one artifact; its tensors stay memory-mapped.
 
     It checks, in this order: the kind, the schema (older ones are migrated), the exact tensors with
-    shapes and dtypes, the digest if the file has one, that numbers are finite, the kind's domain,
-    and the backbone's fingerprint if one is given.
+    shapes and dtypes, the digest if the file has one, that values are finite and in the kind's
+    domain, and the backbone's fingerprint if one is given.
 
     Raises:
         AegisError: the first check that fails.
@@ -147,7 +147,7 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
         header = parse_header(path, metadata, kind)
         tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
     again = rewrite(header.kind)
-    # Units are said by the header alone.
+    # Only the header has units.
     found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
     listed = {name: replace(spec, unit="") for name, spec in header.tensors.items()}
     if found != listed:
@@ -156,7 +156,7 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
             "the file as Aegis wrote it",
             again,
         )
-    # Of the fields as they stand in the file: those of an older schema are others by now.
+    # The digest covers the fields as stored in the file; migrated ones of older schemas differ.
     fields = json.loads(metadata["aegis"])
     if header.digest is not None and header.digest != _digest(fields, tensors):
         raise AegisError(
@@ -177,9 +177,9 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
 
 
 def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[str, Tensor]]:
-    """Lift an older file, schema by schema, to the one that this version writes."""
+    """Migrate an older file, schema by schema, to the one that this version writes."""
     meta = header.meta
-    # The first one lifts schema 1, so that a file of the newest schema meets none.
+    # The first migration is from schema 1, so a file with the newest schema needs none.
     for migration in MIGRATIONS.get(header.kind, ())[header.schema - 1 :]:
         tensors, meta = migration(tensors, meta)
     units = {name: spec.unit for name, spec in header.tensors.items()}
@@ -190,7 +190,7 @@ def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[s
 def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> None:
     """Raise AegisError unless layout, finiteness and domain are right.
 
-    The checks run in this order, because each needs what the one before it found right.
+    The checks run in this order, because each relies on the one before it.
     """
     checks = (
         (layout_problems(header.kind, tensors), "exactly the tensors of this kind"),
@@ -203,7 +203,7 @@ def _validate(path: str | Path, header: Header, tensors: Tensors, fix: str) -> N
 
 
 def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
-    """What is wrong with values, and with metadata in a damaged file that has no digest."""
+    """Problems of the values, and of the metadata in a damaged file without a digest."""
     try:
         yield from KINDS[header.kind].domain(_OnCpu(tensors), header.meta)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
@@ -211,7 +211,7 @@ def _domain_problems(header: Header, tensors: Tensors) -> Iterator[str]:
 
 
 def _not_finite(tensors: Tensors) -> Iterator[str]:
-    with single_threaded():  # thousands of short sums, at each of which threads would meet
+    with single_threaded():  # thousands of short sums, each of which would synchronise threads
         wrong = {name: tensor for name, tensor in tensors.items() if not is_finite(tensor)}
     for name, tensor in wrong.items():
         bad = int((~tensor.isfinite()).sum())
@@ -221,15 +221,15 @@ def _not_finite(tensors: Tensors) -> Iterator[str]:
 def _write_safetensors(
     file: BinaryIO, tensors: Tensors, fields: Mapping[str, Any], digest: Future[str]
 ) -> None:
-    """The safetensors format (length, JSON header, data), streamed.
+    """Write the safetensors format (length, JSON header, data) as a stream.
 
-    Not safetensors.torch.save_file: that one writes mode 0600, hides the errno of a full disk,
-    refuses tensors that share memory, and its bytes may change with its version.
+    Not by safetensors.torch.save_file, which writes mode 0600, hides the errno of a full disk,
+    refuses tensors that share memory, and whose bytes may change with its version.
 
     Args:
-        fields: of the header, without the digest, which is put in its place when it is known.
+        fields: fields of the header without the digest, which is filled in when it is known.
     """
-    # With the widest types first, every tensor is aligned.
+    # With the widest dtypes first, every tensor is aligned.
     names = sorted(tensors, key=lambda name: (-tensors[name].element_size(), name))
     table: dict[str, Any] = {}
     end = 0
@@ -239,12 +239,12 @@ def _write_safetensors(
         table[name] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
     file.write(_head(table, fields, _NO_DIGEST))
     pour(file, (_bytes(tensors[name]) for name in names))
-    file.seek(0)  # the same head once more, now that the thread has come to its end
+    file.seek(0)  # write the head again with the digest, once the thread is done
     file.write(_head(table, fields, digest.result()))
 
 
 def _head(table: Mapping[str, Any], fields: Mapping[str, Any], digest: str) -> bytes:
-    """What a file begins with; it is as long with any digest."""
+    """The beginning of a file; its length does not depend on the digest."""
     metadata = {"aegis": canonical({**fields, "digest": digest})}
     raw = canonical({**table, "__metadata__": metadata}).encode()
     raw += b" " * (-len(raw) % 8)  # so that the data begins at a multiple of 8 bytes
@@ -261,12 +261,12 @@ def _digest(fields: Mapping[str, Any], tensors: Tensors) -> str:
 
 
 def _bytes(tensor: Tensor) -> memoryview:
-    """A tensor's values as they lie in memory [bytes], one after the other."""
+    """A tensor's values as contiguous bytes."""
     return tensor.cpu().reshape(-1).view(torch.uint8).numpy().data
 
 
 class _OnCpu(Mapping[str, Tensor]):
-    """Tensors by name, each brought to the CPU when it is asked for."""
+    """Tensors by name, each moved to the CPU on access."""
 
     def __init__(self, tensors: Tensors) -> None:
         self._tensors = tensors
@@ -293,7 +293,7 @@ def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
 
 @cache
 def _matcher(pattern: str) -> Callable[[str], object]:
-    """What tells whether a name matches; kinds have few patterns, and each save asks for them."""
+    """A function that tells whether a name matches; cached, because every save needs it."""
     return re.compile(fnmatch.translate(pattern)).match
 
 

@@ -1,4 +1,4 @@
-"""Where Aegis keeps what it can make again, such as decoded frames."""
+"""The cache: files that Aegis can create again, such as decoded frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import time
 from pathlib import Path
 
-_KEPT_S = 30 * 86_400.0  # small files that nobody has used for so long are removed
+_KEPT_S = 30 * 86_400.0  # small files that were not used for this long are removed
 
 
 def folder(name: str) -> Path:
@@ -18,14 +18,14 @@ def folder(name: str) -> Path:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the files of a folder that nobody has used for a long time."""
-    with contextlib.suppress(OSError):  # of another user, or not there yet
+    """Remove the files in a folder that were not used for a long time."""
+    with contextlib.suppress(OSError):  # owned by another user, or not there yet
         for path in folder.iterdir():
             if time.time() - path.stat().st_mtime > _KEPT_S:
                 path.unlink()
 
 
 def touch(path: Path) -> None:
-    """Say that a file of the cache is in use."""
-    with contextlib.suppress(OSError):  # another user's, who says so too
+    """Mark a file in the cache as used."""
+    with contextlib.suppress(OSError):  # owned by another user, who marks it too
         os.utime(path)

@@ -1,4 +1,4 @@
-"""Commands that a message names, so that a shell takes them as they are printed."""
+"""Commands in messages, quoted so that a shell accepts them as printed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import shlex
 
 
 def aegis(*words: object) -> str:
-    """A call of `aegis` with these words, each quoted where it has to be."""
+    """A call of `aegis` with these words, quoted where necessary."""
     return shell("aegis", *words)
 
 

@@ -1,4 +1,4 @@
-"""Where to compute, and in which precision."""
+"""The device to compute on, and the precision."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aegis_cli.common import launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 
-# Which device is wanted. Processes that this one starts inherit it with the environment.
+# The wanted device. Child processes inherit it with the environment.
 VARIABLE = "AEGIS_DEVICE"
 AUTO = "auto"
 EXPECTED = "auto, cpu, cuda, or cuda:N with the number of a GPU"
@@ -33,7 +33,7 @@ def chosen(name: str | None) -> Generator[None]:
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = name
     try:
-        pick()  # raises here, and not in the midst of the work
+        pick()  # raises here, not in the middle of the work
         yield
     finally:
         if before is None:
@@ -44,10 +44,10 @@ def chosen(name: str | None) -> Generator[None]:
 
 @contextlib.contextmanager
 def cpu_by_default() -> Generator[None]:
-    """Inside the block, or a function that it decorates, what names no device is on the CPU.
+    """Make the CPU the default device inside the block, or in a function that it decorates.
 
-    A caller of the library may have set another one by `torch.set_default_device`. Where none is
-    set, nothing is done: the mode would cost every call of PyTorch's a little.
+    A user of the library may have set another one with `torch.set_default_device`. Otherwise
+    nothing is done: the mode would slow down every call of PyTorch a little.
     """
     if torch.get_default_device().type == "cpu":
         yield
@@ -59,13 +59,13 @@ def cpu_by_default() -> Generator[None]:
 def pick() -> torch.device:
     """The device that was chosen, else the GPU if there is one, else the CPU.
 
-    From here on float32 means float32: cuDNN would round to TF32 in convolutions.
+    It also disables TF32, to which cuDNN would round in float32 convolutions.
 
     Raises:
-        AegisError: one was chosen that is not there.
+        AegisError: the chosen device does not exist.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # PyTorch 2.9 calls the setting an old one, 2.13 does not
+        warnings.simplefilter("ignore")  # PyTorch 2.9 calls the setting deprecated, 2.13 does not
         torch.backends.cudnn.allow_tf32 = False
     name = os.environ.get(VARIABLE) or AUTO
     if name == AUTO:
@@ -78,7 +78,7 @@ def pick() -> torch.device:
         return torch.device("cpu")
     _check_gpu(name, number)
     if number:
-        torch.cuda.set_device(int(number))  # what torch asks of "the" GPU is of this one then
+        torch.cuda.set_device(int(number))  # so that torch's current GPU is this one
     return torch.device(name)
 
 
@@ -101,36 +101,36 @@ def on_gpu() -> bool:
 
 
 def reading_stalls(device: torch.device) -> bool:
-    """Whether reading a number of the device is a *sync*: it waits until all queued work is done.
+    """Whether reading a number from the device is a *sync*: it waits until all queued work is done.
 
-    A GPU then idles until it is given more. So what a step leaves is read now and then, and what
-    depends on a number within a step is computed on the device.
+    A GPU then idles until it gets more. So the results of steps are read only now and then, and
+    whatever depends on a number within a step is computed on the device.
     """
     return device.type != "cpu"
 
 
 def send(x: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the CPU on that device; the program goes on while a GPU copies it."""
+    """Copy a CPU tensor to a device; for a GPU, asynchronously."""
     if device.type != "cuda" or not x.is_cpu:
         return x.to(device)
-    return x.pin_memory().to(device, non_blocking=True)  # only pinned memory is copied meanwhile
+    return x.pin_memory().to(device, non_blocking=True)  # only pinned memory copies asynchronously
 
 
 def autocast(device: torch.device, precision: str) -> contextlib.AbstractContextManager[object]:
-    """A context in which matrix products are taken in the type that `precision` names.
+    """A context in which matrix products run in the dtype that `precision` names.
 
-    `bf16` means matrix products in bfloat16, `float32` changes nothing, and `auto` is bf16 where
-    the hardware multiplies in it. With AMX or on a GPU bf16 is several times faster than float32; a
-    CPU without AMX took 1.7 times as long.
+    `bf16` means matrix products in bfloat16, `float32` changes nothing, and `auto` is bf16 if the
+    hardware multiplies in it. With AMX or on a GPU bf16 is several times faster than float32; a CPU
+    without AMX took 1.7 times as long.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=takes_bf16(device, precision))
 
 
 def acting_precision(device: torch.device, wanted: str) -> str:
-    """What a policy acts in: `auto` is bf16 on a GPU that multiplies in it, and else float32.
+    """The precision a policy acts in: `auto` is bf16 on a GPU that supports it, else float32.
 
     Raises:
-        AegisError: no precision.
+        AegisError: `wanted` is not a precision.
     """
     if wanted in ("bf16", "float32"):
         return wanted
@@ -140,21 +140,20 @@ def acting_precision(device: torch.device, wanted: str) -> str:
 
 
 def takes_bf16(device: torch.device, precision: str) -> bool:
-    """Whether `autocast` takes matrix products in bfloat16 there."""
+    """Whether `autocast` uses bfloat16 matrix products on the device."""
     return precision == "bf16" or (precision == "auto" and multiplies_bf16(device))
 
 
 def precision_taken(device: torch.device, precision: str) -> str:
-    """What `autocast` takes matrix products in there: bf16 or float32, for `auto` too."""
+    """The precision of `autocast` on the device: bf16 or float32, with `auto` resolved."""
     return "bf16" if takes_bf16(device, precision) else "float32"
 
 
 def multiplies_bf16(device: torch.device) -> bool:
-    """Whether the hardware multiplies in bfloat16: a GPU of NVIDIA's since Ampere, one of another
-    maker, or a processor with AMX.
+    """Whether the hardware multiplies in bfloat16.
 
-    ARM's list of features has no such entry, and an older torch has no list at all. Both count as
-    no.
+    NVIDIA GPUs do since Ampere, as do other vendors' GPUs and processors with AMX. ARM's list of
+    features has no such entry, and an older torch has no list at all; both count as no.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -162,14 +161,15 @@ def multiplies_bf16(device: torch.device) -> bool:
     return device.type != "cpu" or bool(asked().get("amx_bf16", False))
 
 
-# What torch calls a processor's instructions for products in bfloat16.
+# torch's names for processor instructions for products in bfloat16.
 _BF16_INSTRUCTIONS = ("amx_bf16", "avx512_bf16")
 
 
 def warn_of_slow_bf16(device: torch.device, precision: str, on_event: OnEvent) -> None:
-    """Warn where bf16 is asked for by name, and the processor is known to have nothing for it.
+    """Warn if bf16 is requested explicitly and the processor is known to lack instructions for it.
 
-    One whose list has no such entries, as ARM's, may have instructions of other names.
+    A processor whose list has no such entries, such as ARM's, may have instructions with other
+    names.
     """
     if device.type != "cpu" or precision != "bf16":
         return
@@ -188,8 +188,9 @@ def warn_of_slow_bf16(device: torch.device, precision: str, on_event: OnEvent) -
 def single_threaded() -> Generator[None]:
     """Use one CPU thread inside the block.
 
-    LAPACK's eigensolver waits at thousands of small barriers. On two cores that other work shares,
-    two threads took from 3 to 280 times as long as one. So it is with sums of thousands of tensors.
+    LAPACK's eigensolver waits at thousands of small barriers. On two cores shared with other work,
+    two threads took from 3 to 280 times as long as one. The same holds for sums of thousands of
+    tensors.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

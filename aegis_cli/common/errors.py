@@ -23,18 +23,18 @@ class AegisError(Exception):
 
 
 class PeerLost(AegisError):
-    """Another of several processes has ended, which says itself why."""
+    """Another of several processes has ended; it reports the reason itself."""
 
 
 class Diverged(AegisError):
-    """Training met a number that is not finite; what was saved before is good."""
+    """Training met a number that is not finite; earlier checkpoints are intact."""
 
     def __init__(self, found: str, expected: str, fix: str, good_steps: int) -> None:
         super().__init__(found, expected, fix)
         self.good_steps = good_steps
 
     def __reduce__(self) -> tuple[type[Diverged], tuple[str, str, str, int]]:
-        """How to pickle it: an exception is made anew from its `args`, and these lack the steps."""
+        """Support pickling: an exception is recreated from its `args`, which lack the steps."""
         return Diverged, (self.found, self.expected, self.fix, self.good_steps)
 
 
@@ -46,12 +46,12 @@ def check_finite(figures: Mapping[str, float], where: str, fix: str, good_steps:
 
 
 def few(names: Sequence[str]) -> str:
-    """Some of the names, and how many there are where that is not all."""
+    """The first few names, and the total count if there are more."""
     shown = ", ".join(names[:_NAMED])
     return shown if len(names) <= _NAMED else f"{shown}, ... {len(names)} in all"
 
 
 def in_short(error: Exception) -> str:
-    """The beginning of what an error says, on one line."""
+    """The beginning of an error's message, on one line."""
     said = " ".join(str(error).split())
     return textwrap.shorten(said, 200, placeholder=" ...") or type(error).__name__

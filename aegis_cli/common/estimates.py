@@ -1,4 +1,4 @@
-"""Means over seeds with Student's t-intervals: few runs, each a draw from one distribution."""
+"""Means over seeds with Student's t-intervals, for few runs drawn from one distribution."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
-LEVEL = 0.95  # probability that an interval holds the expectation
+LEVEL = 0.95  # probability that an interval contains the expectation
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,8 @@ class Estimate:
     """Mean of `runs` values with the 95 % interval of their expectation.
 
     A single run has no interval: `interval` is None. `crossed` is the interval of the crossed
-    bootstrap over runs and over what they were measured on (`bootstrap.crossed_interval`), where
-    that is known.
+    bootstrap over runs and over the items they were measured on (`bootstrap.crossed_interval`), if
+    known.
     """
 
     mean: float
@@ -29,7 +29,7 @@ class Estimate:
     def ends(self) -> tuple[float, float] | None:
         """The lower end of the lower interval and the upper end of the higher one.
 
-        A claim that is made of these holds by both intervals.
+        A claim based on these holds by both intervals.
         """
         known = [interval for interval in (self.interval, self.crossed) if interval is not None]
         if not known:
@@ -38,7 +38,7 @@ class Estimate:
 
     @property
     def half(self) -> float | None:
-        """How far the mean is from the farther of the ends; None of a single run."""
+        """Distance of the mean from the farther end; None without an interval."""
         if self.ends is None:
             return None
         low, high = self.ends
@@ -48,7 +48,7 @@ class Estimate:
 def estimate(values: Sequence[float]) -> Estimate:
     """The mean of n values and its interval, mean +- t(n - 1) s / sqrt(n) (Student, 1908).
 
-    Here s is the sample's standard deviation, with the divisor n - 1.
+    Here s is the sample standard deviation, with the divisor n - 1.
     """
     n, mean = len(values), statistics.fmean(values)
     if n == 1:
@@ -67,5 +67,5 @@ def t_quantile(freedom: int, level: float = LEVEL) -> float:
     """
     from scipy.special import stdtrit  # slow to load, and only tables of several seeds need it
 
-    both_sides = (1 + level) / 2  # stdtrit inverts P(T <= t), which has the lower tail too
+    both_sides = (1 + level) / 2  # stdtrit inverts P(T <= t), which includes the lower tail
     return float(stdtrit(freedom, both_sides))

@@ -1,4 +1,4 @@
-"""What a running stage tells its caller; stages never print."""
+"""Events by which a running stage reports to its caller; stages never print."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Progress:
 
 @dataclass(frozen=True)
 class Warned:
-    """`stage` goes on, but its result may not be what the user has in mind; `text` says why.
+    """`stage` continues, but its result may not be what the user expects; `text` says why.
 
-    That a signal has come is told from a thread of its own, while the stage is at work.
+    The arrival of a signal is reported from a separate thread, while the stage is running.
     """
 
     stage: str
@@ -39,9 +39,9 @@ def ignore(_: Event) -> None:
 
 @contextmanager
 def loading_told(stage: str, on_event: OnEvent) -> Generator[None]:
-    """Tell that a stage loads its model and what it reads, and when it has.
+    """Report that a stage is loading its model and inputs, and when it has finished.
 
-    Otherwise nobody hears of a stage for a minute or more, if its log is a pipe.
+    Otherwise a stage whose log is a pipe would show nothing for a minute or more.
     """
     on_event(Progress(f"{stage} (loading)", 0, 1, "model"))
     yield

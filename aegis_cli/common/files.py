@@ -1,4 +1,4 @@
-"""Files that are whole or absent: atomic writes, and reading whose errors name the cure."""
+"""Files that are complete or absent: atomic writes, and reading with errors that name the fix."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from typing import Any, BinaryIO
 from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError
 
-# What to do about the path of an input that is no text.
+# The fix for an input whose path is not valid text.
 RENAME = "rename that file or folder"
-_REPEATED = 100  # bytes of a name that are repeated in a temporary's; file systems take 143 or more
-_NUMBER = r"\.\d+\.tmp"  # how such a name ends
-_LEFT = re.compile(r"\.(.+)" + _NUMBER)  # with the name of what it was to become
+_REPEATED = 100  # most bytes of a name that a temporary one repeats; file systems allow >= 143
+_NUMBER = r"\.\d+\.tmp"  # the end of such a temporary name
+_LEFT = re.compile(r"\.(.+)" + _NUMBER)  # with the final name
 _LFS = b"version https://git-lfs.github.com/spec/v1"  # how its pointers begin
-# Where `str.splitlines` ends a line and JSON does not; as escapes they end none.
+# Characters that end a line for `str.splitlines` but not for JSON; escaped, they end none.
 _LINE_ENDS = str.maketrans({end: f"\\u{ord(end):04x}" for end in "\x85\u2028\u2029"})
-_ATTEMPTS = 100  # at a folder above which others come and go
-_AT_ONCE = 2**26  # bytes after which the disk begins to write them
+_ATTEMPTS = 100  # to make a folder while other processes create and remove those above
+_AT_ONCE = 2**26  # bytes after which the disk starts to write them
 
 
 def canonical(obj: Any) -> str:
@@ -38,12 +38,12 @@ def canonical(obj: Any) -> str:
 
 
 def sha256_value(obj: Any) -> str:
-    """Hex digest of a value's `canonical` text; equal values have equal ones."""
+    """Hex digest of a value's `canonical` text; equal values have equal digests."""
     return hashlib.sha256(canonical(obj).encode()).hexdigest()
 
 
 def sha256_file(path: str | Path, fix: str = "check the path") -> str:
-    """Hex digest of a file's bytes; `fix` is for a missing one."""
+    """Hex digest of a file's bytes; `fix` is the advice if it is missing."""
     with reading(path, fix), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -63,7 +63,7 @@ def save_json_lines(path: str | Path, objects: Iterable[Any]) -> None:
     """Write JSON Lines in plain UTF-8: all of it, or nothing."""
     lines = [json.dumps(obj, ensure_ascii=False) for obj in objects]
     text = "".join(line.translate(_LINE_ENDS) + "\n" for line in lines)
-    # Half of a surrogate pair has no UTF-8. Its backslash escape is also that of JSON.
+    # A lone surrogate has no UTF-8 encoding. Its backslash escape is also valid in JSON.
     data = text.encode("utf-8", "backslashreplace")
     write_atomically(Path(path), lambda file: file.write(data))
 
@@ -82,10 +82,10 @@ def load_json(path: str | Path) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text says.
+    """The value of a JSON text.
 
     Raises:
-        ValueError: it is none, or is nested too deep to be read.
+        ValueError: it is not JSON, or is nested too deeply to be read.
     """
     try:
         return json.loads(text)
@@ -94,18 +94,18 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, reach the disk, then rename, so that no half-written file ever stays.
+    """Write beside `path`, sync to disk, then rename, so that no half-written file remains.
 
-    A link is followed: the file that it leads to is replaced, and the link stays.
+    A link is followed: the file that it points to is replaced, and the link stays.
 
     Raises:
-        AegisError: `path` is there and no regular file, or it cannot be written.
+        AegisError: `path` exists and is not a regular file, or it cannot be written.
     """
     path = _target(path)
     try:
         with aside(path) as (temporary, file):
             write(file)
-            # To the disk before the name: else a power cut could leave the name of an empty file.
+            # Sync before renaming: otherwise a power cut could leave an empty file.
             file.flush()
             os.fsync(file.fileno())
             os.replace(temporary, path)
@@ -116,9 +116,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def pour(file: BinaryIO, parts: Iterable[memoryview]) -> None:
-    """Write parts one after the other, while the disk is at work on those before.
+    """Write parts in order, while the disk is still writing the earlier ones.
 
-    Else the system keeps gigabytes in memory until the end asks for all of them at once.
+    Otherwise the system keeps gigabytes in memory until the final sync needs them all at once.
     """
     begun = file.tell()
     for part in parts:
@@ -128,21 +128,21 @@ def pour(file: BinaryIO, parts: Iterable[memoryview]) -> None:
                 file.flush()
                 _begin_to_write(file.fileno(), begun)
                 begun = file.tell()
-        del part  # before the next one is made, for a GPU's is a copy
+        del part  # before the next one is made, because that of a GPU tensor is a copy
 
 
 def _begin_to_write(descriptor: int, start: int = 0) -> None:
-    """Let the disk begin with what has been written to a file from some byte on; wait for nothing.
+    """Start writing a file's data to disk from byte `start` on, without waiting.
 
-    Linux does so where it is told that memory need not hold a file. What is not on the disk yet
-    stays in memory, which is all that there is here.
+    Linux does so when told that it need not cache a file. Data that is not on the disk yet stays in
+    memory, which here is all of it.
     """
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(descriptor, start, 0, os.POSIX_FADV_DONTNEED)
 
 
 def begin_to_write(folder: Path) -> None:
-    """Let the disk begin with the files of a folder, which somebody else has written a moment ago.
+    """Start writing the files of a folder to disk that other code has just written.
 
     `reach_disk` then has less to wait for.
     """
@@ -153,7 +153,7 @@ def begin_to_write(folder: Path) -> None:
 
 
 def reach_disk(folder: Path) -> None:
-    """Wait until all that a folder holds is on the disk, so that no power cut takes it."""
+    """Wait until everything in a folder is on the disk, so that it survives a power cut."""
     for path in (*folder.rglob("*"), folder):
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -164,17 +164,17 @@ def reach_disk(folder: Path) -> None:
 
 @contextlib.contextmanager
 def aside(path: Path) -> Generator[tuple[Path, BinaryIO]]:
-    """A new file beside `path`, to be filled and renamed; where it is not renamed it is removed.
+    """A new file beside `path`, to be filled and renamed; if it is not renamed, it is removed.
 
-    What killed processes have left of the same file is removed first. Everybody else who writes it
-    leaves this one alone, because it is locked.
+    Leftovers of the same file from killed processes are removed first. Other processes that write
+    it leave this one alone, because it is locked.
     """
     sweep(path)
     with contextlib.ExitStack() as stack:
         while True:
             place = _place(path)
             file = stack.enter_context(open(place, "xb"))
-            stack.callback(_remove, place)  # after the rename there is nothing to remove
+            stack.callback(_remove, place)  # has no effect after the rename
             if _is_locked(file.fileno(), place):
                 break
         yield place, file
@@ -182,7 +182,7 @@ def aside(path: Path) -> Generator[tuple[Path, BinaryIO]]:
 
 @contextlib.contextmanager
 def folder_aside(path: Path) -> Generator[Path]:
-    """A new folder beside `path`, as `aside` makes a file."""
+    """A new folder beside `path`, like the file of `aside`."""
     sweep(path)
     with contextlib.ExitStack() as stack:
         while True:
@@ -199,11 +199,11 @@ def folder_aside(path: Path) -> Generator[Path]:
 def put(aside: Path, folder: Path) -> None:
     """Rename a folder that was written aside, once it is on the disk.
 
-    There is none of that name yet, or an empty one.
+    No folder with that name may exist yet, except an empty one.
 
     Raises:
         AegisError: another process has written it meanwhile.
-        OSError: what else a rename meets.
+        OSError: the rename fails for another reason.
     """
     reach_disk(aside)
     try:
@@ -217,19 +217,19 @@ def put(aside: Path, folder: Path) -> None:
 
 
 def _place(path: Path) -> Path:
-    """Where `path` is written until it is whole.
+    """Where `path` is written until it is complete.
 
-    Its number is drawn. A process's own one would come again, in a container with every command.
+    The number is random, because process ids repeat: in a container, even for every command.
     """
     return path.with_name(f"{hidden(path)}.{secrets.randbelow(10**9)}.tmp")
 
 
 def _is_locked(descriptor: int, place: Path) -> bool:
-    """Lock what was made a moment ago, where the file system can.
+    """Lock a file or folder that was just created, if the file system supports it.
 
     Returns:
-        Whether it is there still. Before it was locked, somebody may have taken it for what a
-        killed process had left.
+        Whether it still exists. Before it was locked, another process may have removed it as the
+        leftover of a killed one.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -241,41 +241,41 @@ def _is_locked(descriptor: int, place: Path) -> bool:
 
 
 def sweep(path: Path) -> None:
-    """Remove what processes have left that were killed while they wrote `path`."""
+    """Remove leftovers of processes that were killed while writing `path`."""
     _sweep(path.parent, re.compile(re.escape(hidden(path)) + _NUMBER))
 
 
 def sweep_all(folder: Path) -> None:
-    """Remove what killed processes have left in a folder to which Aegis alone writes."""
+    """Remove leftovers of killed processes in a folder that only Aegis writes to."""
     _sweep(folder, _LEFT)
 
 
 def is_left(path: Path) -> bool:
-    """Whether a path has the name of what is not whole yet, or never was."""
+    """Whether a path has the name of a temporary file or folder, which is incomplete."""
     return _LEFT.fullmatch(path.name) is not None
 
 
 def is_vacant(folder: Path) -> bool:
-    """Whether nothing is at a path, or a folder with nothing in it that is whole."""
+    """Whether a path does not exist, or is a folder that contains nothing complete."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(map(is_left, folder.iterdir()))
 
 
 def _sweep(folder: Path, name: re.Pattern[str]) -> None:
-    with contextlib.suppress(OSError):  # whoever writes there says what is wrong with it
+    with contextlib.suppress(OSError):  # writing there will report what is wrong
         for left in [path for path in folder.iterdir() if name.fullmatch(path.name)]:
             with contextlib.suppress(OSError):
                 _remove_unlocked(left)
 
 
 def _remove_unlocked(left: Path) -> None:
-    """Remove a file or folder that nobody writes.
+    """Remove a file or folder that no process is writing.
 
     Raises:
-        OSError: somebody does, or the file system does not tell.
+        OSError: a process is, or the file system cannot tell.
     """
-    # Neither along a link, nor waiting at a pipe: anything may have such a name.
+    # Do not follow a link or wait at a pipe: anything may have such a name.
     descriptor = os.open(left, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -294,9 +294,9 @@ def _remove(path: Path) -> None:
 
 
 def hidden(path: Path) -> str:
-    """The beginning of the names that are used beside `path` until it is whole.
+    """The beginning of the temporary names that are used beside `path`.
 
-    A long name is not repeated: with what is added it would be longer than a file system takes.
+    A long name is hashed: with the additions it would be longer than a file system allows.
     """
     name = os.fsencode(path.name)
     short = path.name if len(name) <= _REPEATED else hashlib.sha256(name).hexdigest()
@@ -304,7 +304,7 @@ def hidden(path: Path) -> str:
 
 
 def lies_in(path: Path, folder: Path) -> bool:
-    """Whether something that is there lies in a folder, or is it, whatever links lead to it."""
+    """Whether an existing path lies in a folder or is the folder itself, with links resolved."""
     return path.exists() and path.resolve().is_relative_to(folder.resolve())
 
 
@@ -312,7 +312,7 @@ def check_writable(path: Path) -> None:
     """Fail before the work, not after it; writing still checks.
 
     Raises:
-        AegisError: no folder to write to, or something there that is no regular file.
+        AegisError: there is no folder to write to, or `path` is not a regular file.
     """
     path = _target(path)
     folder = path.parent
@@ -329,11 +329,11 @@ def check_writable(path: Path) -> None:
 
 
 def _target(path: Path) -> Path:
-    """The file that writing to `path` replaces or makes.
+    """The file that writing to `path` replaces or creates.
 
     Raises:
-        AegisError: a device, a pipe or a socket is there. The rename would put a file in its place,
-            for every program of the machine.
+        AegisError: it is a device, a pipe or a socket. The rename would replace it by a file, for
+            every program on the machine.
     """
     target = followed(path)
     if (special := _special(target)) is not None:
@@ -346,15 +346,15 @@ def _target(path: Path) -> Path:
 
 
 def followed(path: Path) -> Path:
-    """Where a link leads, whether or not something is there; a path that is none as it is."""
+    """The target of a link, whether or not it exists; any other path is returned unchanged."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def _special(path: Path) -> str | None:
-    """What a path is that is neither a regular file nor a folder; None where it is one, or not."""
+    """The kind of a path that is a device, pipe or socket; None for anything else."""
     try:
         mode = path.stat().st_mode
-    except (OSError, ValueError):  # nothing is there, or nobody may look: to open it will tell
+    except (OSError, ValueError):  # missing or not accessible: opening it will report that
         return None
     kinds = {
         stat.S_IFCHR: "a device",
@@ -366,12 +366,12 @@ def _special(path: Path) -> str | None:
 
 
 def check_utf8(path: str | Path, fix: str) -> None:
-    """Refuse a path whose bytes are no text.
+    """Refuse a path whose bytes are not UTF-8 text.
 
-    safetensors, tokenizers and pyarrow take none, and what they say sounds like damage.
+    safetensors, tokenizers and pyarrow do not accept one, and their errors sound like damage.
 
     Raises:
-        AegisError: it is one.
+        AegisError: it is not UTF-8, or the locale reads names as something else.
     """
     try:
         str(path).encode()
@@ -381,7 +381,7 @@ def check_utf8(path: str | Path, fix: str) -> None:
             named = os.fsencode(path).decode()
         except UnicodeDecodeError:
             raise AegisError(found, "a path in UTF-8", fix) from error
-        # The name is well, and Python has been told that names are ASCII.
+        # The name is valid, but Python has been told that names are ASCII.
         raise AegisError(
             f"the path '{named}' in a locale of {sys.getfilesystemencoding()} names",
             "a locale that reads names as UTF-8",
@@ -390,20 +390,20 @@ def check_utf8(path: str | Path, fix: str) -> None:
 
 
 def check_apart(option: str, path: Path, others: Iterable[Path]) -> None:
-    """Refuse to write, as `option` asks, over what the same command reads, or writes too."""
+    """Refuse an `option` that would overwrite a file that the same command reads or writes."""
     if os.path.realpath(path) in [os.path.realpath(other) for other in others]:
         found = f"{option} {path}, which this command also reads or writes"
         raise AegisError(found, "a file of its own", f"choose another {option}")
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and those above it.
+    """Create a folder and its parents.
 
-    Another process may remove an empty one of those above meanwhile, as `locks.alone` does at its
-    end. Then they are made again.
+    Another process may meanwhile remove an empty parent, as `locks.alone` does at its end. Then
+    they are created again.
 
     Raises:
-        AegisError: it cannot be created, or lies behind a link that leads nowhere.
+        AegisError: it cannot be created, or lies behind a broken link.
     """
     for above in (path, *path.parents):
         if above.is_symlink() and not above.exists():
@@ -418,7 +418,7 @@ def make_folder(path: Path) -> None:
             with contextlib.suppress(FileNotFoundError):
                 path.mkdir(parents=True, exist_ok=True)
                 return
-        path.mkdir(parents=True, exist_ok=True)  # once more, now to raise
+        path.mkdir(parents=True, exist_ok=True)  # a last attempt, which may raise
     except OSError as error:
         problem = f"cannot create the folder '{path}': {error.strerror or error}"
         raise AegisError(problem, "a place to write to", cure(path.parent, error)) from error
@@ -427,7 +427,7 @@ def make_folder(path: Path) -> None:
 def refuse_special(path: str | Path) -> None:
     """Refuse a pipe, a socket or a device as an input, before it is opened.
 
-    Whoever opens a pipe waits, and its bytes come only once.
+    Opening a pipe blocks, and its bytes can be read only once.
 
     Raises:
         AegisError: it is one of them.
@@ -437,9 +437,10 @@ def refuse_special(path: str | Path) -> None:
 
 
 def refuse_pointer(path: str | Path) -> None:
-    """Refuse what Git LFS leaves in place of a large file until it is pulled.
+    """Refuse the pointer that Git LFS leaves in place of a large file until it is pulled.
 
-    Those who read formats call it once they have failed: what they say sounds like damage.
+    Readers of file formats call it once they have failed, because their own errors sound like
+    damage.
 
     Raises:
         AegisError: it is such a pointer.
@@ -447,7 +448,7 @@ def refuse_pointer(path: str | Path) -> None:
     try:
         with open(path, "rb") as file:
             is_pointer = file.read(len(_LFS)) == _LFS
-    except (OSError, ValueError):  # a folder, or nothing: whoever reads it says so
+    except (OSError, ValueError):  # a folder, or missing: reading it reports that
         return
     if is_pointer:
         raise AegisError(
@@ -459,10 +460,10 @@ def refuse_pointer(path: str | Path) -> None:
 
 @contextlib.contextmanager
 def reading(path: str | Path, fix: str) -> Generator[None]:
-    """Turn a missing or unreadable file into an AegisError; `fix` is for the missing one.
+    """Turn a missing or unreadable file into an AegisError; `fix` is the advice if it is missing.
 
     Raises:
-        AegisError: it is missing, cannot be read, or is no regular file.
+        AegisError: it is missing, cannot be read, or is not a regular file.
     """
     refuse_special(path)
     try:
@@ -477,7 +478,7 @@ def reading(path: str | Path, fix: str) -> Generator[None]:
 
 
 def cure(folder: Path, error: OSError) -> str:
-    """What to do about a folder in which something could not be written."""
+    """The advice for a folder in which something could not be written."""
     folder = _lasting(folder)
     if error.errno == errno.ENOENT:
         return commands.shell("mkdir", "-p", folder)
@@ -489,7 +490,7 @@ def cure(folder: Path, error: OSError) -> str:
 
 
 def _meant(path: Path) -> Path:
-    """The path that one of what is written aside will have, for that is all that a user knows."""
+    """The final path of something written aside, which is the only one that a user knows."""
     found = path
     for around in path.parents:
         if match := _LEFT.fullmatch(around.name):
@@ -498,7 +499,7 @@ def _meant(path: Path) -> Path:
 
 
 def _lasting(folder: Path) -> Path:
-    """The folder around what is written aside, for that is removed at an error."""
+    """The folder around anything written aside, because that is removed after an error."""
     around = (folder, *folder.parents)
     aside = [one for one in around if one.name.startswith(".") and one.suffix == ".tmp"]
     return aside[-1].parent if aside else folder

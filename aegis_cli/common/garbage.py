@@ -1,4 +1,4 @@
-"""What is not looked through for garbage: modules, and all there is when a process ends."""
+"""Objects that garbage collection skips: modules, and everything when a process ends."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def left_out() -> Generator[None]:
-    """Collect no garbage within the block, and look through nothing of what is there at its end.
+    """Collect no garbage inside the block, and exclude all objects that exist at its end.
 
-    It is for imports. What trains, torch above all, has hundreds of thousands of objects, of which
-    hardly one is garbage: to look through them again and again takes an eighth of the time.
+    It is for imports. The training libraries, torch above all, have hundreds of thousands of
+    objects, hardly any of which is garbage: scanning them again and again takes an eighth of the
+    time.
     """
     collects = gc.isenabled()
     gc.disable()
@@ -26,11 +27,11 @@ def left_out() -> Generator[None]:
 
 
 def leave_at_end() -> None:
-    """Let Python end without looking through all that torch and a model consist of.
+    """Let Python exit without scanning all objects of torch and a model.
 
-    Else it does so again and again: seconds, and many of them on a busy machine. Where triton is
-    there, which PyTorch's builds for GPUs bring, it has to: the bindings of triton 3.9 write dozens
-    of lines about whatever is left of them.
+    Otherwise it does so several times, which takes seconds, and many on a busy machine. With
+    triton, which comes with PyTorch's GPU builds, the scan is necessary: the bindings of triton 3.9
+    print dozens of lines about their objects that are left.
     """
     if "triton" in sys.modules:
         gc.unfreeze()

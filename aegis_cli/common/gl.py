@@ -1,4 +1,4 @@
-"""Headless rendering: choose an OpenGL backend before MuJoCo's import, or say what is missing."""
+"""Headless rendering: choose an OpenGL backend before importing MuJoCo, or say what is missing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 from aegis_cli.common import interrupts
 from aegis_cli.common.errors import AegisError
 
-# For each backend the library that it loads, and the Debian or Ubuntu package that brings it.
+# For each backend, the library that it loads and the Debian or Ubuntu package that provides it.
 _LIBRARY = {
     "egl": ("EGL", "libegl1"),
     "osmesa": ("OSMesa", "libosmesa6"),
@@ -25,10 +25,10 @@ def choose_backend() -> str:
     Raises:
         AegisError: the library the backend needs is not on this machine.
     """
-    # Pictures of 64 x 64 pixels do not repay threads in Mesa's software renderer.
+    # For pictures of 64 x 64 pixels, threads in Mesa's software renderer do not pay off.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if sys.platform != "linux":  # there the system itself draws without a window
+    if sys.platform != "linux":  # other systems render without a window by themselves
         return chosen or "default"
     _import_triton()
     if chosen:
@@ -46,10 +46,10 @@ def choose_backend() -> str:
 
 
 def _import_triton() -> None:
-    """Import it, where it is installed, before Mesa's renderer.
+    """Import triton, if it is installed, before Mesa's renderer.
 
-    PyTorch brings it for GPUs, and transformers imports it. Both hold a copy of LLVM: when Mesa's
-    is at work already, the import of triton ends the process by a segmentation fault.
+    It comes with PyTorch for GPUs, and transformers imports it. Triton and Mesa each contain a copy
+    of LLVM: once Mesa's is in use, importing triton crashes the process with a segmentation fault.
     """
     with contextlib.suppress(ImportError):
         importlib.import_module("triton")
@@ -72,16 +72,16 @@ def _check_library(backend: str) -> None:
 
 
 def check() -> None:
-    """Render nothing once, so that a missing driver is found before any work starts.
+    """Open an OpenGL context once, so that a missing driver is found before any work starts.
 
     Raises:
-        AegisError: no OpenGL context can be made; names the package that brings it.
+        AegisError: no OpenGL context can be created; the message names the package to install.
     """
     backend = choose_backend()
     try:
         import mujoco
 
-        with interrupts.deferred():  # half of a context cannot be closed
+        with interrupts.deferred():  # a half-created context cannot be closed
             context = mujoco.GLContext(8, 8)
             context.make_current()
             context.free()

@@ -1,6 +1,6 @@
-"""What an artifact's header says: what the file is, what made it and what it holds.
+"""The header of an artifact: what the file is, how it was made and what it holds.
 
-Nothing here loads torch, so that `aegis inspect` answers at once.
+Nothing here loads torch, so that `aegis inspect` responds at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """What a header says about one tensor."""
+    """A header's entry for one tensor."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -38,10 +38,10 @@ class TensorSpec:
 
 @dataclass(frozen=True)
 class Header:
-    """The `aegis` metadata of a file: what it is, what made it and what it holds.
+    """The `aegis` metadata of a file: what it is, how it was made and what it holds.
 
-    `digest` is the sha256 of all else that the file says, and of its tensors' bytes; None in a file
-    of before there was one.
+    `digest` is the sha256 of the other fields and of the tensors' bytes; None in a file written
+    before digests were introduced.
     """
 
     kind: str
@@ -55,7 +55,7 @@ class Header:
     digest: str | None = None
 
 
-# Kind -> the functions that lift schema 1 to 2, 2 to 3, ... Append only: an entry never changes.
+# Kind -> the functions that migrate schema 1 to 2, 2 to 3, ... Append-only: entries never change.
 Migration = Callable[
     ["dict[str, Tensor]", dict[str, Any]], "tuple[dict[str, Tensor], dict[str, Any]]"
 ]
@@ -71,13 +71,13 @@ def schema(kind: str) -> int:
 
 
 def read_header(path: str | Path, kind: str | None = None) -> Header:
-    """What a file is, from its header's bytes alone; of that kind, if one is given."""
+    """The header of a file, without reading its tensors; it must be of `kind`, if that is given."""
     with opened(path, kind) as file:
         return parse_header(path, file.metadata(), kind)
 
 
 def is_artifact(path: str | Path) -> bool:
-    """Whether a safetensors file is one of Aegis's, rather than another program's.
+    """Whether a safetensors file was written by Aegis rather than another program.
 
     Raises:
         AegisError: it cannot be read.
@@ -93,21 +93,21 @@ def opened(
     """The open file.
 
     Args:
-        kind: what it should be, for the error's advice.
-        framework: what its tensors are read as.
+        kind: the kind that it should be, for the error's advice.
+        framework: framework that the tensors are read for.
 
     Raises:
-        AegisError: it is missing, truncated or no safetensors file, or its path is no text
-            and its tensors are read for torch.
+        AegisError: it is missing, truncated or not a safetensors file, or its path is not text and
+            its tensors are read for torch.
     """
-    from safetensors import SafetensorError, safe_open  # which --help has no need of
+    from safetensors import SafetensorError, safe_open  # not needed for --help
 
     fix = rewrite(kind)
     try:
         with reading(path, fix), safe_open(path, framework=framework) as file:
             yield file
     except (SafetensorError, RuntimeError) as error:
-        # torch maps the file after its header was read, and says so if it was cut meanwhile.
+        # torch maps the file after reading its header, and raises if it was truncated meanwhile.
         if not isinstance(error, SafetensorError) and _CUT not in str(error):
             raise
         check_utf8(path, RENAME)
@@ -122,8 +122,8 @@ def parse_header(
     """The header in a file's metadata.
 
     Raises:
-        AegisError: the file is not one of Aegis's, not of the `expected` kind, of a later version,
-            or damaged.
+        AegisError: the file was not written by Aegis, is not of the `expected` kind, is of a later
+            version, or is damaged.
     """
     if metadata is None or "aegis" not in metadata:
         raise AegisError(
@@ -156,9 +156,9 @@ def _spec(said: Mapping[str, Any]) -> TensorSpec:
 
 
 def _check_types(header: Header) -> None:
-    """Raise TypeError or ValueError unless the fields are of the types that they are declared as.
+    """Raise TypeError or ValueError unless the fields have their declared types.
 
-    A damaged file is found here, and not where a field is used.
+    A damaged file is detected here, not where a field is used.
     """
     if type(header.schema) is not int or header.schema < 1:
         raise ValueError(f"schema {header.schema!r}")
@@ -173,7 +173,7 @@ def _check_types(header: Header) -> None:
     if not all(isinstance(digest, str) for digest in header.inputs.values()):
         raise TypeError("an input whose digest is no text")
     for name, spec in header.tensors.items():
-        sizes = all(type(size) is int for size in spec.shape)  # not `isinstance`: True is one
+        sizes = all(type(size) is int for size in spec.shape)  # not `isinstance`: True is an int
         if not sizes or not isinstance(spec.unit, str) or not isinstance(spec.dtype, str):
             raise TypeError(f"'{name}' is {spec}")
 
@@ -203,7 +203,7 @@ def _check_schema(path: str | Path, kind: str, number: int) -> None:
 
 
 def rewrite(kind: str | None) -> str:
-    """What to do about a file of that kind, or of any, that cannot be used."""
+    """The advice for an unusable file of that kind, or of any kind."""
     known = [KINDS[kind]] if kind in KINDS else KINDS.values()
     commands = sorted({each.command for each in known})
     return f"run {' or '.join(repr(c) for c in commands)} to write it"

@@ -1,7 +1,7 @@
-"""`~/` at the beginning of a path, for the person's own folder.
+"""`~/` at the beginning of a path, for the user's home folder.
 
-A shell puts it there in `--out ~/x`, but bash does not in `--out=~/x`, and nobody does in a recipe.
-What is left would name a folder `~` in the present one.
+A shell expands it in `--out ~/x`, but bash does not in `--out=~/x`, and nothing does in a recipe.
+Unexpanded it would name a folder `~` in the current one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _OPTION = re.compile(r"(--?[\w-]+=)(~/.*)", re.DOTALL)
 
 
 def at_home(value: Any) -> Any:
-    """Plain values with the home folder for `~/` in texts; `./~/x` is a folder of that name."""
+    """Plain values with `~/` in strings expanded; `./~/x` still names a folder `~`."""
     if isinstance(value, str):
         return os.path.expanduser(value) if value.startswith("~/") else value
     if isinstance(value, dict):
@@ -23,6 +23,6 @@ def at_home(value: Any) -> Any:
 
 
 def word_at_home(word: str) -> str:
-    """The same of a word of a command line, which may be an option with its value."""
+    """The same for a word of a command line, which may be an option with its value."""
     option = _OPTION.fullmatch(word)
     return option[1] + at_home(option[2]) if option else at_home(word)

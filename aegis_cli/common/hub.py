@@ -1,4 +1,4 @@
-"""Names on the Hugging Face hub: what has the form of one, and its files on this disk."""
+"""Names on the Hugging Face hub: which names have the form of one, and downloading its files."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _ID = re.compile(r"[\w-][\w.-]*/[\w.-]+")
 
 
 def is_id(name: str) -> bool:
-    """Whether a name has the form of one on the hub, which a path may have too."""
+    """Whether a name has the form of a hub id, which a path may have too."""
     return bool(_ID.fullmatch(name))
 
 
 def is_local(name: str) -> bool:
     """Whether a name can only be a path: the hub is never asked for a typo in one."""
     is_file = Path(name).suffix in _FILES
-    # `runs/x` is a run that is not there, since that is where the documentation puts runs.
+    # `runs/x` is a missing run, because the documentation puts runs there.
     return not is_id(name) or is_file or _first(name) == "runs" or Path(_first(name)).is_dir()
 
 
 def not_asked(name: str) -> str:
-    """What to add to the advice for a missing path which a folder alone keeps from being an id."""
+    """Extra advice for a missing path that only an existing folder keeps from being a hub id."""
     if not is_id(name) or not Path(_first(name)).is_dir():
         return ""
     return (
@@ -42,7 +42,7 @@ def _first(name: str) -> str:
 
 
 def is_installed() -> bool:
-    """Whether the package that asks the hub is there."""
+    """Whether the package for access to the hub is installed."""
     return importlib.util.find_spec("huggingface_hub") is not None
 
 
@@ -50,7 +50,7 @@ def list_files(name: str, kind: Kind) -> list[str]:
     """The paths of a repository's files.
 
     Raises:
-        OSError, ValueError: the hub has none of that name, or cannot be asked.
+        OSError, ValueError: the hub has no such repository, or cannot be reached.
     """
     import huggingface_hub
 
@@ -65,14 +65,14 @@ def snapshot(
     unwanted: Sequence[str] = (),
     cached: bool = False,
 ) -> Path:
-    """The local folder of a repository's newest files, downloaded if they are not there.
+    """The local folder with a repository's newest files, downloaded if necessary.
 
     Args:
-        wanted, unwanted: patterns of the files' paths.
-        cached: whether only the hub's cache is looked at.
+        wanted, unwanted: patterns of file paths.
+        cached: whether to look only in the hub's cache.
 
     Raises:
-        OSError, ValueError: neither in the cache nor to be had.
+        OSError, ValueError: they are not in the cache and cannot be downloaded.
     """
     import huggingface_hub
 
@@ -89,7 +89,7 @@ def snapshot(
 
 @contextlib.contextmanager
 def _as_os_error() -> Generator[None]:
-    """Raise OSError for what goes wrong with the connection, which is any error of httpx's."""
+    """Raise OSError for connection problems, which may be any error of httpx."""
     from huggingface_hub.errors import HTTPError
 
     try:

@@ -1,6 +1,6 @@
-"""Ctrl-C, and the signals that end a process from outside, which end its work in the same way.
+"""Ctrl-C and the signals that end a process from outside, all handled in the same way.
 
-SIGTERM is what `kill`, a container and a batch system send; SIGHUP comes when a terminal closes.
+SIGTERM is sent by `kill`, containers and batch systems; SIGHUP arrives when a terminal closes.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Any, NoReturn
 from aegis_cli.common.events import OnEvent, Warned
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
-_AGAIN_S = 0.01  # after which a signal comes again whose exception was dropped
+_AGAIN_S = 0.01  # delay before a signal is sent again whose exception was dropped
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that ends the process; what is done at Ctrl-C is done for it too."""
+    """A signal that ends the process; it is handled like Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
 
 
-_stopped: list[int] = []  # signals that `stop` has raised since somebody began to listen
+_stopped: list[int] = []  # signals that `stop` has raised since `listening` began
 
 
 def stop(number: int, _: FrameType | None) -> NoReturn:
@@ -39,15 +39,15 @@ def stop(number: int, _: FrameType | None) -> NoReturn:
 
 
 def leave(number: int, _: FrameType | None) -> NoReturn:
-    """A signal handler that ends the process at once, for as long as nothing is under way."""
+    """A signal handler that ends the process at once, for use while no work is in progress."""
     raise SystemExit(128 + number)
 
 
 def leave_at_ctrl_c() -> None:
-    """Let Ctrl-C end the process with its own code until somebody listens.
+    """Let Ctrl-C end the process with its own exit code until `listening` begins.
 
-    Python's usual exception ends with a traceback, or, in some versions of typer, with code 1, a
-    failed gate's.
+    Python's usual exception ends with a traceback, or, in some versions of typer, with code 1,
+    which is that of a failed gate.
     """
     if _in_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, leave)
@@ -57,16 +57,16 @@ def leave_at_ctrl_c() -> None:
 def listening() -> Generator[None]:
     """Let SIGINT, SIGTERM and SIGHUP raise Stopped inside the block.
 
-    One that is ignored, as SIGHUP is under nohup, or that somebody handles, is left as it is.
+    A signal that is ignored, as SIGHUP is under nohup, or that has another handler, is left as is.
 
     Raises:
-        Stopped: a signal came, also where another error came of it: a library in C that is called
-            at that moment may turn it into an error of its own.
+        Stopped: a signal came, even if it led to another error: a C library that is running at that
+            moment may turn it into an error of its own.
     """
     usual = {signal.default_int_handler, leave, signal.SIG_DFL}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
     before = {n: handler for n, handler in handlers.items() if _in_main() and handler in usual}
-    _stopped.clear()  # what came in an earlier block has been raised there
+    _stopped.clear()  # signals of an earlier block were raised there
     for number in before:
         signal.signal(number, stop)
     try:
@@ -85,8 +85,8 @@ def listening() -> Generator[None]:
 def ending_at_once() -> Generator[None]:
     """Let a signal that would raise Stopped end the process at once inside the block.
 
-    A handler of Python's runs only when a call into C has come back, which one that waits for
-    others may never do. The block must leave nothing half-done.
+    A Python signal handler runs only when a call into C has returned, and a call that waits for
+    other processes may never return. The block must leave nothing half-done.
     """
     numbers = (signal.SIGINT, *_ENDING) if _in_main() else ()
     before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) is stop}
@@ -101,9 +101,9 @@ def ending_at_once() -> Generator[None]:
 
 @contextmanager
 def _sending_again() -> Generator[None]:
-    """Send a signal again whose exception was dropped inside the block.
+    """Send a signal again if its exception was dropped inside the block.
 
-    A library in C or Rust that is called at that moment, and cannot pass an exception on, drops it.
+    A C or Rust library that is running at that moment and cannot propagate exceptions drops it.
     """
     usual = sys.unraisablehook
     timers: list[threading.Timer] = []
@@ -112,7 +112,7 @@ def _sending_again() -> Generator[None]:
         if not isinstance(dropped.exc_value, Stopped):
             usual(dropped)
             return
-        # Not at once: here the handler would raise into this very hook.
+        # Not at once, because the handler would raise into this very hook.
         timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.number))
         timer.daemon = True
         timers.append(timer)
@@ -128,28 +128,28 @@ def _sending_again() -> Generator[None]:
 
 
 def _in_main() -> bool:
-    """Whether this is the main thread, which alone may set handlers, and in which they run."""
+    """Whether this is the main thread; only it may set signal handlers, and they run in it."""
     return threading.current_thread() is threading.main_thread()
 
 
 class Deferred:
-    """A signal that waits until the work has come to a point at which it can be left.
+    """A signal that waits until the work has reached a point where it can stop.
 
     Attributes:
-        number: the signal; None while none came.
+        number: the signal; None until one comes.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
 
     def handle(self, number: int, _: FrameType | None) -> None:
-        """Note a signal, or raise: who asks twice does not want to wait."""
+        """Record a signal, or raise at the second one, because the user does not want to wait."""
         if self.number is not None:
             self.leave()
         self.number = number
 
     def leave(self) -> NoReturn:
-        """Raise what the signal would have raised."""
+        """Raise the exception that the signal would have raised."""
         if self.number in (None, signal.SIGINT):
             raise KeyboardInterrupt
         raise Stopped(self.number)
@@ -157,19 +157,19 @@ class Deferred:
 
 @contextmanager
 def deferred(tell: Callable[[], None] | None = None) -> Generator[Deferred]:
-    """Hold back the signals that would raise, until the block calls `leave`, or ends.
+    """Hold back the signals that would raise, until the block calls `leave` or ends.
 
-    A signal with another handler, or none, keeps it.
+    A signal with another handler, or none, is left as it is.
 
     Args:
-        tell: is called once, from a thread of its own, as soon as a signal has come.
+        tell: called once, from a separate thread, as soon as a signal has come.
     """
     held = Deferred()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
     raising = (signal.default_int_handler, stop)
     before = {n: handler for n, handler in handlers.items() if _in_main() and handler in raising}
     telling = _telling(tell, before) if tell is not None and before else nullcontext()
-    # Around all of it, so that its thread has ended when a held signal is raised below.
+    # Around everything, so that its thread has ended when a held signal is raised below.
     with telling:
         for number in before:
             signal.signal(number, held.handle)
@@ -184,7 +184,7 @@ def deferred(tell: Callable[[], None] | None = None) -> Generator[Deferred]:
 
 @contextmanager
 def saved_first(stage: str, on_event: OnEvent) -> Generator[Deferred]:
-    """As `deferred`, for a stage that saves its steps before it leaves; it says so at once."""
+    """Like `deferred`, for a stage that saves its steps before it stops, and announces that."""
     text = (
         "a signal came: the step under way is finished and saved first. Another one ends this at "
         "once, without the steps since the last checkpoint"
@@ -197,15 +197,15 @@ def saved_first(stage: str, on_event: OnEvent) -> Generator[Deferred]:
 def _telling(tell: Callable[[], None], numbers: Collection[int]) -> Generator[None]:
     """Call `tell` once one of these signals has come inside the block.
 
-    A handler of Python's waits for a call into C, such as a backward pass of many seconds. Python
-    also writes the signal's number to a file at the moment at which it comes, and a thread may
-    read it there. Where somebody else reads it, nothing is told.
+    A Python signal handler waits for a call into C, such as a backward pass of many seconds. But
+    Python also writes the signal's number to a file descriptor as soon as it comes, and a thread
+    can read it there. If other code already reads it, `tell` is not called.
     """
     reader, writer = socket.socketpair()
     with reader, writer:
         writer.setblocking(False)
         before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-        if before != -1:  # somebody else's, such as an event loop of asyncio
+        if before != -1:  # in use by other code, such as an asyncio event loop
             signal.set_wakeup_fd(before)
             yield
             return
@@ -222,5 +222,5 @@ def _telling(tell: Callable[[], None], numbers: Collection[int]) -> Generator[No
             yield
         finally:
             signal.set_wakeup_fd(-1)
-            writer.shutdown(socket.SHUT_WR)  # the thread reads the end, and ends itself
+            writer.shutdown(socket.SHUT_WR)  # the thread reads the end of the stream, and exits
             thread.join()

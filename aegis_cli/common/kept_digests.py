@@ -1,7 +1,7 @@
-"""Digests of files as large as videos, which are kept until somebody writes to a file.
+"""Digests of large files such as videos, which are cached until a file is written to.
 
-A data set of many gigabytes is read whole for its digest. That is done once, by as many threads as
-there are cores, and not again each time that something of it is read, by whichever process.
+Computing the digest of a data set of many gigabytes reads all of it. That is done once, by as many
+threads as there are cores, and not again each time that some process reads from it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.processes import worker_count
 
-LARGE = 2**20  # bytes; what is smaller is read in no time
-# A file that was written to so lately may be written to again within the clock's resolution, and
-# its times would not show it.
+LARGE = 2**20  # bytes; smaller files are read in no time
+# A file written to this recently may be written to again within the clock's resolution, and its
+# times would not show it.
 _SETTLED_S = 2.0
 _MB = 10**6
 
-# What changes where somebody writes to a file: size and time alone would miss one that took
-# another's place with its time.
+# What changes when a file is written to. Size and time alone would miss a file that was replaced by
+# another one with the same time.
 Stamp = tuple[int, int, int, int]
 _known: dict[tuple[Path, Stamp], str] = {}
 
@@ -39,11 +39,11 @@ def of_files(
     """Hex sha256 of each file's bytes.
 
     Args:
-        home: the folder of the data set that they belong to, for which digests are kept together.
-        fix: what to do about a missing one.
+        home: the folder of their data set, whose digests are kept together.
+        fix: the advice for a missing file.
 
     Raises:
-        AegisError: one that cannot be read.
+        AegisError: a file cannot be read.
     """
     keys = {path: _key(path, fix) for path in paths}
     unknown = {path: key for path, key in keys.items() if key not in _known}
@@ -57,10 +57,10 @@ def of_files(
 
 
 def stamp(path: Path) -> Stamp:
-    """What tells the file that a path leads to now from what it may become.
+    """Identifies the current state of the file at a path.
 
     Raises:
-        OSError: nothing is there.
+        OSError: there is no file.
     """
     state = path.stat()
     return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
@@ -72,11 +72,11 @@ def _key(path: Path, fix: str) -> tuple[Path, Stamp]:
 
 
 def _know(large: Mapping[Path, tuple[Path, Stamp]], home: Path, on_event: OnEvent) -> None:
-    """Learn the digests of large files, from those that are kept or by reading them."""
+    """Get the digests of large files, from the cache or by reading them."""
     store = cache.folder("digests") / f"{files.sha256_value(str(home.resolve()))[:32]}.json"
     cache.sweep(store.parent)
     try:
-        # Others who begin with the same data set wait for what this one reads.
+        # Other processes that start with the same data set wait for this one's result.
         with _locked(store, on_event):
             kept = _kept(store)
             cache.touch(store)
@@ -97,7 +97,7 @@ class _Unkept(Exception):
 
 @contextlib.contextmanager
 def _locked(store: Path, on_event: OnEvent) -> Generator[None]:
-    """Wait until no other process reads the files of this data set for their digests."""
+    """Wait until no other process is computing the digests of this data set."""
     try:
         files.make_folder(store.parent)
         lock = os.open(store.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o644)
@@ -106,7 +106,7 @@ def _locked(store: Path, on_event: OnEvent) -> Generator[None]:
     except OSError as error:
         raise _Unkept(error.strerror or str(error)) from error
     try:
-        with contextlib.suppress(OSError):  # a file system without locks: each reads for itself
+        with contextlib.suppress(OSError):  # a file system without locks: each reads by itself
             os.utime(lock)
             _lock(lock, on_event)
         yield
@@ -115,7 +115,7 @@ def _locked(store: Path, on_event: OnEvent) -> Generator[None]:
 
 
 def _lock(lock: int, on_event: OnEvent) -> None:
-    """Take a lock, and tell of it where another process has it, which may take minutes.
+    """Take a lock, and report if another process holds it, which may take minutes.
 
     Raises:
         OSError: the file system has no locks.
@@ -130,10 +130,10 @@ def _lock(lock: int, on_event: OnEvent) -> None:
 
 
 def _read(unread: Mapping[Path, tuple[Path, Stamp]], on_event: OnEvent) -> dict[Any, str]:
-    """Read files whole; those that may not change unseen are to be kept.
+    """Compute the digests of files.
 
     Returns:
-        Their digests by their keys, of the ones to keep.
+        By key, the digests to keep: those of files that cannot change without being noticed.
     """
     if not unread:
         return {}
@@ -159,7 +159,7 @@ def _read(unread: Mapping[Path, tuple[Path, Stamp]], on_event: OnEvent) -> dict[
 
 
 def _kept(store: Path) -> dict[tuple[Path, Stamp], str]:
-    """What is kept; of a damaged file nothing, for all of it can be read again."""
+    """The kept digests; none if the cache file is damaged, as they can be computed again."""
     try:
         listed = json.loads(store.read_bytes())
         return {
@@ -171,7 +171,7 @@ def _kept(store: Path) -> dict[tuple[Path, Stamp], str]:
 
 
 def _keep(store: Path, digests: Mapping[tuple[Path, Stamp], str]) -> None:
-    """Write them down, of each file that is still there the newest."""
+    """Write the digests, only the newest for each file that still exists."""
     listed = {
         str(path): (*stamp, digest) for (path, stamp), digest in digests.items() if path.exists()
     }

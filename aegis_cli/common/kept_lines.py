@@ -1,6 +1,6 @@
-"""What long work has measured so far, line by line, so that it goes on where it was interrupted.
+"""Cached measurements of long work, line by line, so that it resumes where it was interrupted.
 
-A file in the cache holds what was measured under one set of circumstances. Several processes may
+A file in the cache holds the measurements made under one set of conditions. Several processes may
 add to it at once.
 """
 
@@ -17,15 +17,17 @@ from aegis_cli.common import cache, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned
 
+_SEAL = "sha256"
+
 
 class KeptLines:
-    """Lines of JSON that are kept for whoever measures the same again.
+    """Lines of JSON that are kept for later measurements of the same thing.
 
     Args:
-        kind: names the folder in the cache.
-        about: all that the measurements depend on, as JSON: of other circumstances nothing is
-            found.
-        on_event: told once where nothing can be kept; the work goes on.
+        kind: name of the folder in the cache.
+        about: everything that the measurements depend on, as JSON; lines with other values of it
+            are never found.
+        on_event: called once if nothing can be kept; the work continues.
     """
 
     def __init__(self, kind: str, about: Mapping[str, Any], on_event: OnEvent) -> None:
@@ -35,10 +37,10 @@ class KeptLines:
         cache.sweep(self.path.parent)
 
     def read(self) -> Iterator[dict[str, Any]]:
-        """What is kept. A line that was cut off, as by a full disk, is left out."""
+        """The kept lines. A line that was cut off, for example by a full disk, is left out."""
         try:
             raw = self.path.read_bytes()
-        except OSError:  # nothing is kept, or not for this user: it is measured
+        except OSError:  # nothing is kept, or not for this user: measure it
             return
         cache.touch(self.path)
         for line in raw.splitlines():
@@ -54,8 +56,8 @@ class KeptLines:
         text = "".join(json.dumps(line) + "\n" for line in lines)
         try:
             files.make_folder(self.path.parent)
-            # Opened anew each time, and written in one go: so lines of several processes do not
-            # mix. A line that was cut off is ended first.
+            # Reopened each time and written in one call, so that lines of several processes do not
+            # mix. A line that was cut off is terminated first.
             with open(self.path, "ab") as file:
                 file.write(b"\n" * (not _ends_a_line(self.path)) + text.encode())
         except (OSError, AegisError) as error:
@@ -64,6 +66,20 @@ class KeptLines:
             text = f"what is measured is not kept, so that an interruption loses it ({why})"
             fix = "set AEGIS_CACHE to a folder that can be written"
             self._on_event(Warned(self.path.parent.name, f"{text}: {fix}"))
+
+
+def sealed(line: Mapping[str, Any]) -> dict[str, Any]:
+    """A line with a digest of what it says."""
+    return {**line, _SEAL: files.sha256_value(dict(line))}
+
+
+def unsealed(line: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What such a line says; None of one that is not as it was written."""
+    said = {name: value for name, value in line.items() if name != _SEAL}
+    with contextlib.suppress(ValueError):  # of a number that JSON has not
+        if files.sha256_value(said) == line.get(_SEAL):
+            return said
+    return None
 
 
 def _ends_a_line(path: Path) -> bool:

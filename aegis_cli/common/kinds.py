@@ -1,4 +1,4 @@
-"""What each kind of artifact must contain: its exact tensors, and values that make sense."""
+"""The required content of each kind of artifact: its exact tensors, and valid values."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # whoever reads a header alone does not wait for torch
+if TYPE_CHECKING:  # reading only a header does not load torch
     from torch import Tensor
 
 Tensors = Mapping[str, "Tensor"]
-# Tensor name -> (dtype, shape). A size that is a word must be the same wherever the word stands.
+# Tensor name -> (dtype, shape). A size given as a word must be the same wherever the word appears.
 Layout = dict[str, tuple[str, tuple[int | str, ...]]]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What a kind of file holds.
+    """The content of a kind of file.
 
     Args:
         command: the command that writes it.
-        layout: its exact tensors; None where the model decides, and the header's own list counts.
-        domain: yields what is wrong with the values of tensors that fit the layout.
-        option: by which commands take it, where one option does.
+        layout: its exact tensors; None if the model decides and only the header's list counts.
+        domain: yields the problems of the values of tensors that fit the layout.
+        option: the option by which commands take it, if there is just one.
     """
 
     command: str
@@ -57,9 +57,9 @@ def _anchor_layout(tensors: Tensors) -> Layout:
 def _spectrum_layout(site: str, rank: int, vectors: bool, half: bool, rest: bool) -> Layout:
     """The layout of a spectrum's tensors.
 
-    A table has its values alone, a dense map k leading eigenvectors too, and a normalisation all of
-    each channel. Where only leading directions were resolved, there are as many values, and one for
-    the rest.
+    A table has only values, a dense map also k leading eigenvectors, and a normalisation all
+    eigenvectors of each channel. If only leading directions were resolved, there is one value for
+    each of them and one for the rest.
     """
     d, k, m = f"d of {site}", f"k of {site}", f"m of {site}"
     dtype = "float16" if half else "float32"
@@ -79,7 +79,7 @@ def _spectrum_layout(site: str, rank: int, vectors: bool, half: bool, rest: bool
 
 def _anchor_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     count = tensors.get("count")
-    # One of the two is 0 where a model was asked without images.
+    # One of the two is 0 if the questions had no images.
     if count is not None and not (count.sum() > 0 and (count >= 0).all()):
         yield f"count is {count.tolist()}: the anchor saw no tokens"
     for name, tensor in tensors.items():
@@ -114,7 +114,7 @@ _DEMOS: Layout = {
 def _demos_layout(tensors: Tensors) -> Layout:
     """The layout of demonstrations.
 
-    Episodes have returns, or targets with a colour, or the task of a set that they are of.
+    Episodes have returns, or targets with a colour, or their task within a set of tasks.
     """
     if "returns" in tensors:
         return _DEMOS | {"returns": ("float64", ("E",))}
@@ -124,7 +124,7 @@ def _demos_layout(tensors: Tensors) -> Layout:
 
 
 def _are_words(value: Any, name: str) -> bool:
-    """Whether a value in the metadata of demonstrations is of its type: mostly a list of texts."""
+    """Whether a value in the metadata of demonstrations has its type, mostly a list of strings."""
     if name == "control_hz":
         return isinstance(value, int | float) and value > 0
     if name == "task":
@@ -133,7 +133,7 @@ def _are_words(value: Any, name: str) -> bool:
 
 
 def _demos_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
-    # indices, and the list in meta that they point to
+    # tensors of indices, and the lists in meta that they point to
     lists = {"instruction": "instructions", "target_color": "colors", "task": "tasks"}
     pointers = {name: words for name, words in lists.items() if name in tensors}
     needed = {"task", "control_hz", "action_names", "proprio_names", *pointers.values()}
@@ -200,8 +200,8 @@ def _experts_domain(tensors: Tensors, meta: Mapping[str, Any]) -> Iterator[str]:
 def _routing_layout(tensors: Tensors) -> Layout:
     """The layout of the routers' tensors.
 
-    Each router has its experts' numbers with mean weight and load, its scale, and logits where it
-    has a choice.
+    Each router has its experts' numbers with mean weight and load, its scale, and the parameters of
+    its logits if it has a choice.
     """
     layout: Layout = {}
     found = (re.fullmatch(r"(.+\.routers\.\d+)\.\w+", name) for name in tensors)
@@ -229,7 +229,7 @@ def _routing_domain(tensors: Tensors, _: Mapping[str, Any]) -> Iterator[str]:
     for name, tensor in tensors.items():
         if name.endswith((".mass", ".load")) and (tensor < 0).any():
             yield f"'{name}' has a negative share"
-        # All 0 is right for a map that no loss reads.
+        # All 0 is valid for a map that no loss reads.
         if name.endswith(".mass") and tensor.any() and abs(float(tensor.sum()) - 1) > 1e-4:
             yield f"'{name}' sums to {float(tensor.sum()):g} instead of 1"
         if name.endswith(".experts"):
@@ -299,8 +299,8 @@ def is_finite(tensor: Tensor) -> bool:
     """Whether no value of a tensor is NaN or infinite."""
     if not tensor.is_floating_point():
         return True
-    # One such value makes the sum such a one, which is the faster to find. Others may have a sum
-    # past the largest number, too.
+    # One non-finite value makes the sum non-finite, which is faster to check. But the sum of finite
+    # values may overflow too.
     return math.isfinite(tensor.sum().item()) or bool(tensor.isfinite().all())
 
 
@@ -310,12 +310,12 @@ def quoted(names: Iterable[str]) -> str:
 
 
 def describe(dtype: object, shape: Iterable[int | str]) -> str:
-    """A tensor's type and shape: float32 [N, 3]."""
+    """A tensor's dtype and shape, such as float32 [N, 3]."""
     return f"{str(dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
 
 
 def _fits(found: tuple[int, ...], shape: tuple[int | str, ...], sizes: dict[str, int]) -> bool:
-    """Whether the sizes agree; a word met for the first time takes the size it meets."""
+    """Whether the sizes agree; a word that appears for the first time takes the size found."""
     if len(found) != len(shape):
         return False
     for number, size in zip(found, shape, strict=True):

@@ -1,6 +1,6 @@
-"""What a launcher such as torchrun says of this process in the environment.
+"""The environment variables by which a launcher such as torchrun describes this process.
 
-Nothing is imported here, so that a command knows its place before torch is loaded.
+Nothing is imported here, so that a command knows its rank before torch is loaded.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import os
 
 from aegis_cli.common.errors import AegisError
 
-_MEETING = ("RANK", "MASTER_ADDR", "MASTER_PORT")  # by which several processes find each other
+_MEETING = ("RANK", "MASTER_ADDR", "MASTER_PORT")  # needed for several processes to connect
 
 
 def world_size() -> int:
@@ -18,25 +18,25 @@ def world_size() -> int:
 
 
 def rank() -> int:
-    """Number of this process among them, from 0."""
+    """Number of this process among all, from 0."""
     return _number("RANK", 0)
 
 
 def local_rank() -> int:
-    """Number of this process among those of its machine, from 0."""
+    """Number of this process among those on its machine, from 0."""
     return _number("LOCAL_RANK", 0)
 
 
 def local_world_size() -> int:
-    """How many of these processes are on this machine; all of them, if nothing else is said."""
+    """How many of the processes are on this machine; by default all of them."""
     return _number("LOCAL_WORLD_SIZE", world_size())
 
 
 def check_one() -> None:
-    """Refuse to be one of several processes, for each would do it all.
+    """Refuse to be one of several processes, because each would do all the work.
 
     Raises:
-        AegisError: torchrun, or another launcher, says that there are more.
+        AegisError: torchrun or another launcher has started several.
     """
     if world_size() > 1:
         raise AegisError(
@@ -49,10 +49,10 @@ def check_one() -> None:
 
 
 def check_meeting() -> None:
-    """Refuse an environment by which this process could not meet the others.
+    """Refuse an environment in which this process could not connect to the others.
 
     Raises:
-        AegisError: something that a launcher says is missing, or contradicts the rest.
+        AegisError: a variable of the launcher is missing, or contradicts the others.
     """
     count = world_size()
     missing = [name for name in _MEETING if not os.environ.get(name)]

@@ -1,8 +1,8 @@
-"""One of several processes leads a job, and calls the others to those parts that all share.
+"""One of several processes leads a job, and calls the others for the parts that all share.
 
-A job such as `aegis run` has parts for one process, such as to record demonstrations, and others
-that several do together, such as a training. The first process goes through the whole job. The
-others wait, as long as it takes, until it names a function that all call.
+A job such as `aegis run` has parts for one process, such as recording demonstrations, and parts
+that several processes do together, such as training. The first process goes through the whole job.
+The others wait, as long as it takes, until it names a function that all of them call.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Call:
-    """A function of a module, which all processes are to call with these arguments."""
+    """A module-level function that all processes are to call with these arguments."""
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
@@ -30,14 +30,14 @@ class _Call:
 
 @dataclass(frozen=True)
 class _End(Generic[T]):
-    """What the job has led to."""
+    """The end of the job, with its report."""
 
     report: T
 
 
 @dataclass(frozen=True)
 class _Failure:
-    """What is wrong with the job."""
+    """The error that ended the job."""
 
     error: AegisError
 
@@ -47,37 +47,37 @@ class _Lead:
     """The first process's view of the others.
 
     Attributes:
-        listening: whether they wait for a word. While they call a function they do not; nor after
-            one has failed, for it may have failed in them too.
+        listening: whether they wait for a message. They do not while they call a function, nor
+            after one has failed, because it may have failed in them too.
     """
 
     ranks: Ranks
     listening: bool = True
 
     def tell(self, word: _Call | _End[Any] | _Failure) -> None:
-        """Say to the others what comes next."""
+        """Tell the others what comes next."""
         self.ranks.agree(word)
 
     @contextmanager
     def calling(self) -> Generator[None]:
-        """Do the block together with the others, which are called to it."""
+        """Run the block together with the others, which were called to it."""
         self.listening = False
         with among(self.ranks):
             yield
         self.listening = True
 
 
-_lead: _Lead | None = None  # of a job that this process leads
+_lead: _Lead | None = None  # for a job that this process leads
 
 
 def led(job: Callable[[], T]) -> T:
-    """Let the first process do the job, and the others what it calls them to.
+    """Let the first process do the job, and the others what it calls them for.
 
     Returns:
         The job's report, in every process.
 
     Raises:
-        AegisError: whatever is wrong, in every process; or another process has ended.
+        AegisError: the job's error, in every process; or another process has ended.
     """
     with joined() as ranks:
         if not ranks.several:
@@ -87,7 +87,7 @@ def led(job: Callable[[], T]) -> T:
 
 def _led(job: Callable[[], T], lead: _Lead) -> T:
     try:
-        # Alone, so that what the job does by itself asks nobody to take a share.
+        # Alone, so that what the job does by itself does not ask other processes for a share.
         with _leading(lead), among(ALONE):
             report = job()
     except AegisError as error:
@@ -110,7 +110,7 @@ def _leading(lead: _Lead) -> Generator[None]:
 
 
 def _follow(ranks: Ranks) -> Any:
-    """Do what the first process says, until the job ends."""
+    """Do what the first process asks for, until the job ends."""
     while True:
         word = ranks.agree(None)
         if isinstance(word, _Failure):
@@ -124,16 +124,15 @@ def _follow(ranks: Ranks) -> Any:
 def together(
     function: Callable[..., T], *arguments: Any, on_event: OnEvent = ignore, **options: Any
 ) -> T:
-    """Call a function, with all others where this process leads a job; each then takes its share.
+    """Call a function, in all processes if this one leads a job; each then takes its share.
 
     Args:
-        function: of a module, which finds the others by `joined`.
-        arguments, options: what it is called with. They travel, so they have to be such that they
-            can be pickled.
-        on_event: told by this process alone.
+        function: a module-level function, which finds the other processes by `joined`.
+        arguments, options: its arguments. They are sent, so they must be picklable.
+        on_event: called only in this process.
 
     Returns:
-        What it returns in this process.
+        The result in this process.
     """
     if _lead is None:
         return function(*arguments, on_event=on_event, **options)

@@ -1,7 +1,7 @@
-"""A folder that one process at a time writes to.
+"""A folder that only one process at a time writes to.
 
-The lock is the kernel's, on the folder itself: it leaves no file behind, and it is gone with the
-process that held it, however that ended.
+The lock is a kernel lock on the folder itself: it leaves no file behind, and it is released when
+the process that holds it ends, however that happens.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
-# What a file system says that locks no folders, such as NFS; there a file beside it is locked.
+# Errors of a file system that cannot lock folders, such as NFS; there a file beside it is locked.
 _NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOTSUP, errno.EISDIR)
 
 
@@ -25,12 +25,12 @@ _NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOTSUP, errn
 def alone(folder: Path) -> Generator[None]:
     """Be the only process that writes to `folder` inside the block.
 
-    The folder is made if it is not there. If it is empty at the end, as after a refusal, it is
-    removed again, with those above it that were made.
+    The folder is created if it does not exist. If it is empty at the end, as after a refusal, it is
+    removed again, with its parents that were created.
 
     Raises:
-        AegisError: another process is at it, the folder cannot be made, or nothing could be read
-            from it afterwards, because its path is no text.
+        AegisError: another process holds the lock, the folder cannot be created, or its path is not
+            text, so that nothing could be read from it afterwards.
     """
     folder = Path(folder)
     files.check_utf8(folder, "choose another --out, or rename the folder")
@@ -38,7 +38,7 @@ def alone(folder: Path) -> Generator[None]:
     try:
         yield
     finally:
-        # Those who wait for nothing need not see a lock's file or an empty folder go.
+        # Removed while the lock is held. No process waits for it: others are refused at once.
         with contextlib.suppress(OSError):
             if beside is not None:
                 beside.unlink()
@@ -52,21 +52,21 @@ def _locked(folder: Path) -> tuple[list[Path], int, Path | None]:
     """Lock the folder.
 
     Returns:
-        The folders that were made for it, innermost first, the descriptor that holds the lock, and
-        the file that is locked in the folder's place; None where it is the folder itself.
+        The folders that were created for it, innermost first, the descriptor that holds the lock,
+        and the file that is locked instead of the folder; None if it is the folder itself.
     """
     if folder.exists() and not folder.is_dir():
         raise AegisError(f"'{folder}' is no folder", "a new or empty one", "choose another --out")
     above = [folder, *folder.parents]
     made = [path for path in above if not path.exists()]
-    # Again and again, for between the making, the opening and the locking another process may
-    # remove the folder; then the lock is on one that no path leads to any more.
+    # Repeated, because another process may remove the folder between creating, opening and locking
+    # it; then the lock is on a folder that has no path any more.
     while True:
         files.make_folder(folder)
         try:
             descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         except FileNotFoundError:
-            continue  # it was removed since, by one who was refused
+            continue  # removed meanwhile by a process that was refused
         try:
             beside = _lock(descriptor, folder)
         except BaseException:
@@ -81,7 +81,7 @@ def _locked(folder: Path) -> tuple[list[Path], int, Path | None]:
 
 
 def _lock(descriptor: int, folder: Path) -> tuple[int, Path] | None:
-    """Lock the open folder; where its file system cannot, a file beside it, which is returned."""
+    """Lock the open folder; if its file system cannot, lock and return a file beside it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -103,11 +103,11 @@ def _lock(descriptor: int, folder: Path) -> tuple[int, Path] | None:
         if _is_still(beside, own):
             os.close(descriptor)
             return own, beside
-        os.close(own)  # its holder has ended and removed the file: another one is made
+        os.close(own)  # the holder has ended and removed the file: create another one
 
 
 def _is_still(path: Path, descriptor: int) -> bool:
-    """Whether the path leads to what is open, rather than to something made in its place."""
+    """Whether the path still refers to what is open, rather than to a replacement."""
     with contextlib.suppress(OSError):
         return os.path.samestat(os.stat(path), os.fstat(descriptor))
     return False
@@ -127,7 +127,7 @@ def _refusal(descriptor: int, folder: Path) -> AegisError:
 
 
 def _holder(locked: os.stat_result) -> int | None:
-    """Number of the process that holds the lock, as far as this machine's kernel tells."""
+    """Id of the process that holds the lock, if this machine's kernel knows it."""
     with contextlib.suppress(OSError, ValueError):
         for line in Path("/proc/locks").read_text(encoding="utf-8").splitlines():
             fields = line.split()  # 1: FLOCK ADVISORY WRITE 708 08:01:131105 0 EOF
@@ -138,11 +138,11 @@ def _holder(locked: os.stat_result) -> int | None:
 
 
 def _described(holder: int) -> str:
-    """A process in words: its number, this machine's name, and when it began."""
+    """A process in words: its id, this machine's name, and when it started."""
     where = f"process {holder} on {os.uname().nodename}"
     with contextlib.suppress(OSError, ValueError, StopIteration):
         stat = Path(f"/proc/{holder}/stat").read_text(encoding="utf-8", errors="replace")
-        fields = stat.rpartition(")")[2].split()  # what follows the name, which may be anything
+        fields = stat.rpartition(")")[2].split()  # after the name, which may contain anything
         boot = Path("/proc/stat").read_text(encoding="utf-8").splitlines()
         booted = int(next(line for line in boot if line.startswith("btime")).split()[1])
         began = booted + int(fields[19]) / os.sysconf("SC_CLK_TCK")

@@ -16,7 +16,7 @@ _PACKAGES = ("torch", "numpy", "mujoco", "dm-control", "transformers")
 
 
 def describe() -> dict[str, str | int]:
-    """What a reader has to know before comparing times or digits with those of another machine."""
+    """The facts needed to compare times or digits with those of another machine."""
     import torch
 
     found: dict[str, str | int] = {
@@ -27,7 +27,7 @@ def describe() -> dict[str, str | int]:
         "cores": os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
     }
-    from aegis_cli.common import devices  # with it comes torch
+    from aegis_cli.common import devices  # imports torch
 
     if devices.on_gpu():
         found["gpu"] = torch.cuda.get_device_name()
@@ -35,7 +35,7 @@ def describe() -> dict[str, str | int]:
 
 
 def name() -> str:
-    """The GPU's name, else the processor's and the cores used: times of two are not comparable."""
+    """The GPU's name, else the processor's and the cores used; times compare only if equal."""
     about = describe()
     if "gpu" in about:
         return str(about["gpu"])
@@ -46,7 +46,7 @@ def name() -> str:
 
 @cache
 def versions(packages: tuple[str, ...]) -> dict[str, str]:
-    """The versions of those that are installed; to find one, its whole description is parsed."""
+    """The versions of the installed packages; cached, as finding one parses all its metadata."""
     found: dict[str, str] = {}
     for package in packages:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -55,7 +55,7 @@ def versions(packages: tuple[str, ...]) -> dict[str, str]:
 
 
 def processor() -> str:
-    """The processor's model, where the system tells it."""
+    """The processor's model, if the system reports it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             name, _, value = line.partition(":")

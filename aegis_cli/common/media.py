@@ -1,4 +1,4 @@
-"""Pictures for people to look at: contact sheets, and episodes as one picture that moves."""
+"""Pictures for people to look at: contact sheets, and videos of episodes side by side."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aegis_cli.common.files import check_writable, write_atomically
 SHEET_EPISODES = 8  # on a contact sheet
 CLIPS = 8  # in a video, side by side
 FRAMES_PER_S = 10  # of a video
-_HOLD_FRAMES = 10  # how long a video shows the episodes' ends before it is over
+_HOLD_FRAMES = 10  # how long a video holds the last frames of the episodes
 
 # pixels
 _SHEET_TILE = 192
@@ -26,9 +26,9 @@ _CLIP_PICTURE, _BORDER = 256, 6
 _CLIP_TILE = _CLIP_PICTURE + 2 * _BORDER
 _CAPTION, _GAP, _BETWEEN_CELLS = 20, 4, 16
 _SHEET_TEXT, _CLIP_TEXT = 10, 13
-_RING_WIDTH, _SMOOTHING = 3, 4  # a ring is drawn so many times larger, then reduced
+_RING_WIDTH, _SMOOTHING = 3, 4  # a ring is drawn `_SMOOTHING` times larger, then reduced
 
-# Green and red that the commonest colour blindness tells apart by their brightness.
+# Green and red that people with the most common colour blindness can tell apart by brightness.
 UNDECIDED, SUCCESS, FAILURE = (150, 150, 150), (38, 166, 91), (200, 30, 45)
 
 
@@ -64,14 +64,14 @@ def save_sheet(path: Path, shown: Sequence[tuple[str, Sequence[np.ndarray]]]) ->
 def tiled(
     cells: Sequence[tuple[str, Sequence[np.ndarray]]], columns: int, tile: int, text: int
 ) -> Any:
-    """One picture of many: cells of a caption over frames [H, W, 3] uint8, `columns` cells a line.
+    """Cells of a caption over frames [H, W, 3] uint8 in one picture, `columns` cells per line.
 
-    Each frame is fitted into `tile` x `tile` pixels, its sides' ratio kept. With an even `tile`
-    the picture's sides are even, as H.264 wants them. Captions are `text` pixels high.
+    Each frame is fitted into `tile` x `tile` pixels, keeping its aspect ratio. With an even `tile`
+    the sides of the picture are even, as H.264 requires. Captions are `text` pixels high.
 
     Returns:
-        An image of Pillow. Frame k of cell i begins `_CAPTION` pixels under the cell's upper
-        corner and `_GAP` + k (`tile` + `_GAP`) to the right of it.
+        A Pillow image. Frame k of cell i begins `_CAPTION` pixels below the upper left corner of
+        the cell and `_GAP` + k (`tile` + `_GAP`) to the right of it.
     """
     from PIL import Image, ImageDraw
 
@@ -79,7 +79,7 @@ def tiled(
     height = _CAPTION + tile + 2 * _GAP
     sheet = Image.new("RGB", (columns * width, math.ceil(len(cells) / columns) * height), "white")
     draw = ImageDraw.Draw(sheet)
-    # One font for all: captions of a few languages would else be set in two.
+    # One font for all: otherwise captions in several languages would use two.
     draw.font = _font("".join(caption for caption, _ in cells), text)
     for i, (caption, frames) in enumerate(cells):
         x, y = i % columns * width, i // columns * height
@@ -91,7 +91,7 @@ def tiled(
 
 
 def _font(text: str, size: int) -> Any:
-    """Pillow's own font, or for letters beyond ASCII, which it has none of, that of matplotlib."""
+    """Pillow's own font, or matplotlib's for characters beyond ASCII, which Pillow's lacks."""
     from PIL import ImageFont
 
     if text.isascii():
@@ -102,7 +102,7 @@ def _font(text: str, size: int) -> Any:
 
 
 def _shortened(draw: Any, text: str, width: int) -> str:
-    """The text, cut where it would reach into the next cell."""
+    """The text, truncated if it would reach into the next cell."""
     if draw.textlength(text) <= width:
         return text
     while text and draw.textlength(text + "...") > width:
@@ -113,7 +113,7 @@ def _shortened(draw: Any, text: str, width: int) -> str:
 def _fitted(frame: np.ndarray, side: int) -> Any:
     from PIL import Image, ImageOps
 
-    # A small picture is shown by its own pixels, because these are what a policy sees.
+    # A small picture is enlarged pixel by pixel, because that is what a policy sees.
     larger = max(frame.shape[:2]) > side
     method = Image.Resampling.BILINEAR if larger else Image.Resampling.NEAREST
     return ImageOps.contain(Image.fromarray(frame), (side, side), method)
@@ -126,7 +126,7 @@ def _fitted(frame: np.ndarray, side: int) -> Any:
 class Moment:
     """A frame [H, W, 3] uint8, the note written on it, and whether the episode has succeeded.
 
-    The last is None while that is open, and always where nothing succeeds or fails.
+    The outcome is None while it is open, and always None if nothing succeeds or fails.
     """
 
     frame: np.ndarray
@@ -139,10 +139,10 @@ class Clip:
     """An episode as a video shows it.
 
     Attributes:
-        caption: written above it.
-        moments: `FRAMES_PER_S` of them a second.
-        ring: centre (right, down) and radius of what is ringed, in sides of the frame; None for
-            nothing.
+        caption: text above it.
+        moments: `FRAMES_PER_S` per second.
+        ring: centre (right, down) and radius of the object to ring, as fractions of the frame's
+            side; None for no ring.
     """
 
     caption: str
@@ -151,10 +151,10 @@ class Clip:
 
 
 def save_video(clips: Sequence[Clip], path: Path) -> None:
-    """Write the first `CLIPS` clips side by side, as H.264 or GIF by the path's suffix.
+    """Write the first `CLIPS` clips side by side, as H.264 or GIF depending on the path's suffix.
 
-    A clip that is over holds its last frame. The border of each is grey until its outcome is
-    known, then green for a success and red for a failure.
+    A finished clip holds its last frame. The border of each is grey until its outcome is known,
+    then green for a success and red for a failure.
     """
     pictures = list(_pictures(clips[:CLIPS]))
     encode = _write_gif if path.suffix == ".gif" else _write_mp4
@@ -165,7 +165,7 @@ def _pictures(clips: Sequence[Clip]) -> Iterator[Any]:
     columns = len(clips) if len(clips) <= 4 else math.ceil(len(clips) / 2)
     rings = [_ring(clip.ring) for clip in clips]
     first = [clip.moments[0] for clip in clips]
-    # Each clip's last moment with its tile, which is drawn anew only where the moment is another.
+    # Each clip's last moment with its tile, which is redrawn only when the moment changes.
     drawn = [(m, _framed(m, ring)) for m, ring in zip(first, rings, strict=True)]
     for t in range(max(len(clip.moments) for clip in clips) + _HOLD_FRAMES):
         for i, clip in enumerate(clips):
@@ -188,7 +188,7 @@ def _framed(moment: Moment, ring: Any) -> np.ndarray:
     left, top = (_CLIP_TILE - picture.width) // 2, (_CLIP_TILE - picture.height) // 2
     tile.paste(picture, (left, top))
     draw, font = ImageDraw.Draw(tile), _font(moment.note, _CLIP_TEXT)
-    # The note stands on a patch of the border's colour, so that it is read on any picture.
+    # The note is on a patch in the border's colour, so that it is legible on any picture.
     _, _, right, bottom = draw.textbbox((0, 0), moment.note, font=font)
     corner = (left + right + 12, top + bottom + 9)
     draw.rounded_rectangle((left - _BORDER, top - _BORDER, *corner), 5, fill=color)
@@ -197,7 +197,7 @@ def _framed(moment: Moment, ring: Any) -> np.ndarray:
 
 
 def _ring(circle: tuple[float, float, float] | None) -> Any:
-    """A white ring with dark edges on nothing [`_CLIP_PICTURE`, `_CLIP_PICTURE`, RGBA]."""
+    """A transparent image [`_CLIP_PICTURE`, `_CLIP_PICTURE`, RGBA] of a white, dark-edged ring."""
     if circle is None:
         return None
     from PIL import Image, ImageDraw
@@ -206,7 +206,7 @@ def _ring(circle: tuple[float, float, float] | None) -> Any:
     drawn = Image.new("RGBA", (side, side), (0, 0, 0, 0))
     draw = ImageDraw.Draw(drawn)
     x, y, radius = (side * value for value in circle)
-    inner = radius + 2 * _RING_WIDTH * _SMOOTHING  # the target itself stays as it is
+    inner = radius + 2 * _RING_WIDTH * _SMOOTHING  # does not cover the target itself
     for margin, color in ((1, (20, 20, 20, 255)), (0, (255, 255, 255, 255))):
         edge, width = inner + margin * _SMOOTHING, (_RING_WIDTH + 2 * margin) * _SMOOTHING
         reach = edge + _RING_WIDTH * _SMOOTHING
@@ -216,7 +216,7 @@ def _ring(circle: tuple[float, float, float] | None) -> Any:
 
 
 def as_gif(path: Path) -> tuple[bytes, int, int]:
-    """A video of `save_video` as a GIF that moves, with its width and height in pixels."""
+    """A video from `save_video` as an animated GIF, with its width and height in pixels."""
     from PIL import Image
 
     if path.suffix == ".gif":
@@ -247,14 +247,14 @@ def _write_mp4(pictures: Sequence[Any], file: BinaryIO) -> None:
 
 
 class Mp4Writer:
-    """An H.264 mp4 file that grows; the frames' sides must be even.
+    """An H.264 mp4 file that is written frame by frame; the sides of frames must be even.
 
     One thread encodes, so that the pictures do not depend on how many cores a machine has.
 
     Args:
         target: a path, or a file that is open for writing.
-        fps: frames a second.
-        keyframe_every: at most so many frames lie between two that are decoded on their own.
+        fps: frames per second.
+        keyframe_every: the largest distance between key frames.
     """
 
     def __init__(self, target: Path | BinaryIO, fps: float, keyframe_every: int) -> None:
@@ -263,11 +263,11 @@ class Mp4Writer:
         opened = str(target) if isinstance(target, Path) else target
         self._container = av.open(opened, "w", format="mp4")
         self._rate = Fraction(fps).limit_denominator(1_000_000)
-        # Without frames that lean on later ones ("bf"), so that they come out in their order.
+        # Without frames that depend on later ones ("bf"), so that frames come out in order.
         self._options = {"g": str(keyframe_every), "crf": "18", "bf": "0", "threads": "1"}
         self._stream: Any = None
         self._frames = self._bytes = 0
-        self._failed = False  # FFmpeg would use what it has freed once its first write has failed
+        self._failed = False  # after a failed first write, FFmpeg would use freed memory
 
     def write(self, frames: Sequence[np.ndarray] | np.ndarray) -> None:
         """Append T frames [H, W, 3] uint8; the first is a key frame."""
@@ -289,13 +289,13 @@ class Mp4Writer:
         return stream
 
     def size(self) -> int:
-        """Bytes of the frames that the encoder has let go of; it keeps some dozens back."""
+        """Bytes of the frames that the encoder has released; it holds back a few dozen."""
         return self._bytes
 
     def close(self) -> None:
-        """Write what the encoder has kept back, and end the file.
+        """Write the frames that the encoder holds back, and end the file.
 
-        After a write that failed nothing more is written.
+        After a failed write nothing more is written.
         """
         if self._stream is not None and not self._failed:
             self._mux(None)

@@ -1,4 +1,4 @@
-"""How much memory is free, how much a process has taken at most, and what it gives back."""
+"""Free memory, the peak memory of a process, and returning freed memory to the system."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import torch
 from aegis_cli.common.errors import AegisError
 
 _STATUS = Path("/proc/self/status")
-_RESTART = Path("/proc/self/clear_refs")  # a 5 in it: the peak begins anew
-# glibc's `mallopt`: from which size on a block is mapped by itself, and unmapped when it is freed;
-# and how much may be free at the heap's end before that is given back.
+_RESTART = Path("/proc/self/clear_refs")  # writing 5 to it resets the peak
+# Parameters of glibc's `mallopt`: the size from which a block gets its own mapping, which is
+# unmapped when it is freed; and how much may be free at the end of the heap before it is returned.
 _MAPPED_FROM, _FREE_AT_END = -3, -1
 _MAPPED, _USUAL = 2**20, 2**25  # bytes
 
 
 def free(device: torch.device) -> int | None:
-    """Bytes that a process may have beside those it has; None where that is not known."""
+    """Bytes that a process may still allocate; None if unknown."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
@@ -35,30 +35,28 @@ def free(device: torch.device) -> int | None:
 
 
 def restart_peak(device: torch.device) -> int:
-    """Let `peak` tell what comes from now on.
+    """Let `peak` cover only what comes from now on.
 
-    A CPU's goes on from the beginning of the process where the system cannot begin anew.
+    On a CPU it still covers the whole process if the system cannot reset it.
 
     Returns:
-        The bytes that this process has now.
+        The bytes that this process uses now.
     """
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         return torch.cuda.memory_allocated(device)
-    with contextlib.suppress(OSError):  # not Linux, or a container that may not
+    with contextlib.suppress(OSError):  # not Linux, or not permitted in a container
         _RESTART.write_text("5", encoding="utf-8")
     return peak(device)
 
 
 def peak(device: torch.device) -> int:
-    """Bytes that this process has needed at most on a device: its tensors' there, or on a CPU all
-    that is resident.
+    """Peak bytes of this process on a device: of its tensors, or on a CPU of its resident memory.
 
-    On Linux it is not `ru_maxrss`, which begins with the maximum of the process that started this
-    one.
+    On Linux this is not `ru_maxrss`, which starts from the maximum of the parent process.
 
     Raises:
-        AegisError: the kernel does not tell.
+        AegisError: the kernel does not report it.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
@@ -76,21 +74,21 @@ def peak(device: torch.device) -> int:
 
 @contextlib.contextmanager
 def returned() -> Generator[None]:
-    """Within the block, memory of a CPU that is freed goes back to the system, if 1 MB or more.
+    """Return freed CPU memory to the system inside the block, for blocks of 1 MB or more.
 
-    glibc raises that limit to 32 MB as it sees larger blocks freed, and keeps what is smaller:
-    holes between what stays. To map each block anew takes time, about a tenth of a forward pass.
-    Where the C library is another one, nothing changes.
+    glibc raises that limit to 32 MB when larger blocks are freed, and keeps smaller ones, which
+    leaves holes between live blocks. Mapping each block anew takes time, about a tenth of a forward
+    pass. With another C library, nothing changes.
     """
     library = ctypes.CDLL(None)
     if not hasattr(library, "mallopt"):
         yield
         return
     library.mallopt(_MAPPED_FROM, _MAPPED)
-    library.malloc_trim(0)  # else what it has kept until now is filled first
+    library.malloc_trim(0)  # otherwise the memory kept so far is filled first
     try:
         yield
     finally:
-        # What both would have risen to; glibc raises neither any more.
+        # The values that both would have reached; glibc no longer raises them by itself.
         library.mallopt(_MAPPED_FROM, _USUAL)
         library.mallopt(_FREE_AT_END, 2 * _USUAL)

@@ -1,4 +1,4 @@
-"""The eight colours that scenes and tasks share, by the word that names them."""
+"""The eight colours that scenes and tasks share, by name."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Pictures out of image files, and pictures of any size brought to one size.
+"""Decoding image files, and fitting pictures of any size to one size.
 
-Questions, streams and robot frames share them.
+Questions, streams and robot frames share these functions.
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ import numpy as np
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-GREY = 128  # what a backbone that scales pixels to [-1, 1] reads as nothing
+GREY = 128  # about 0 for a backbone that scales pixels to [-1, 1]
 FILTER = "bilinear, as wide as the reduction, grey borders"
 DECODER = "upright, on white where transparent, 16 bits of grey as 8"
-# What a picture's bytes may be, whatever its name says. Pillow knows others that are programs, such
-# as PostScript, which it has another program run.
+# Accepted formats of a picture's bytes, whatever its name. Pillow also reads formats that are
+# programs, such as PostScript, which it passes to an interpreter.
 RASTER = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "JPEG2000", "TGA")
 
 
 def decoded(data: bytes) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8 of an image file, upright as a viewer shows them.
 
-    What is transparent lies on white, as today's processors of transformers have it; those of 5.5
-    show what colour there is below, so that the rule is ours, whichever is installed.
+    Transparent pixels are composited on white, as current processors of transformers do. Those of
+    5.5 show the colour stored below, so we apply the rule ourselves, whichever is installed.
 
     Raises:
-        ValueError: no raster image or only a part of one, too many pixels, or grey of no known
-            range.
+        ValueError: it is not a raster image or truncated, has too many pixels, or is grey with an
+            unknown range.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
-            # They are about metadata; what makes pixels unreadable is raised.
+            # The other warnings are about metadata; unreadable pixels raise an exception.
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=_raster()) as image:
                 image.load()
-                # With damaged metadata, viewers show the picture as it lies.
+                # With damaged metadata, viewers show the picture as stored.
                 with contextlib.suppress(Exception):
                     ImageOps.exif_transpose(image, in_place=True)
                 return rgb(image)
-    except UnidentifiedImageError as error:  # whose text is where the bytes lay
+    except UnidentifiedImageError as error:  # its message is the address of the bytes
         raise ValueError("of no raster format that is known here") from error
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise ValueError(str(error) or type(error).__name__) from error
@@ -63,14 +63,14 @@ def _raster() -> list[str]:
 
 
 def rgb(image: Image) -> np.ndarray:
-    """Pixels [H, W, 3] uint8 of an image that Pillow has read; what is transparent lies on white.
+    """Pixels [H, W, 3] uint8 of an image that Pillow has read, with transparency on white.
 
     Raises:
-        ValueError: grey of no known range.
+        ValueError: it is grey with an unknown range.
     """
     from PIL import Image as pillow
 
-    if image.mode.startswith("I;16"):  # where Pillow's own conversion makes all above 255 white
+    if image.mode.startswith("I;16"):  # Pillow's own conversion makes everything above 255 white
         grey = (np.asarray(image) / 257).round().astype(np.uint8)  # 65535 becomes 255
         return np.repeat(grey[..., None], 3, axis=-1)
     if image.mode in ("I", "F"):
@@ -82,12 +82,12 @@ def rgb(image: Image) -> np.ndarray:
 
 
 def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The whole picture [H, W, 3] uint8 in the middle of [height, width, 3], grey around it.
+    """The whole picture [H, W, 3] uint8, centred in [height, width, 3] with grey around it.
 
-    The ratio of its sides is kept.
+    Its aspect ratio is kept.
 
-    The filter is Pillow's bilinear one, which averages over as many pixels as one new pixel covers;
-    a picture of that size already comes back as it is.
+    The filter is Pillow's bilinear one, which averages over all pixels that one new pixel covers. A
+    picture that already has that size is returned as it is.
     """
     if picture.shape[:2] == (height, width):
         return picture
@@ -95,7 +95,7 @@ def fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
     scale = min(height / picture.shape[0], width / picture.shape[1])
     rows, columns = [max(1, round(side * scale)) for side in picture.shape[:2]]
-    # Pillow has the width first.
+    # Pillow takes the width first.
     small = Image.fromarray(picture).resize((columns, rows), Image.Resampling.BILINEAR)
     out = np.full((height, width, 3), GREY, np.uint8)
     top, left = (height - rows) // 2, (width - columns) // 2

@@ -1,4 +1,4 @@
-"""Fetch what comes next while what came before is worked on."""
+"""Prefetching: fetch the next items while earlier ones are being processed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from aegis_cli.common import devices, launch, processes
 
 Item = TypeVar("Item")
 T = TypeVar("T")
-DEPTH = 3  # fetched ahead: one slow read from the disk does not stop a step
-_MOST_WORKERS = 4  # as many as LeRobot's loader has; a batch of split images takes gigabytes
+DEPTH = 3  # items fetched ahead, so that one slow disk read does not stall a step
+_MOST_WORKERS = 4  # as in LeRobot's loader; a batch of split images takes gigabytes
 
 
 def workers() -> int:
-    """Threads that prepare batches for a GPU: this process's share of the cores, but for one."""
+    """Number of threads that prepare batches for a GPU: this process's cores minus one."""
     cores = processes.threads_per_worker(launch.local_world_size())
     return min(max(1, cores - 1), _MOST_WORKERS)
 
@@ -28,10 +28,10 @@ def workers() -> int:
 def for_device(
     make: Callable[[Item], T], items: Iterable[Item], device: torch.device
 ) -> Generator[Iterator[T]]:
-    """`map(make, items)`, where `make` prepares on the CPU what the device is to work on.
+    """`map(make, items)`, where `make` prepares on the CPU what the device will process.
 
-    For a GPU several threads call `make`, as a model's own processor can take longer for a batch
-    than a GPU. A CPU has no time to spare, and takes one after the other.
+    For a GPU several threads call `make`, because a model's own processor can take longer for a
+    batch than the GPU. For a CPU, which has no time to spare, the calls are made one by one.
     """
     if not devices.reading_stalls(device):
         yield map(make, items)
@@ -45,32 +45,31 @@ def for_device(
 def ahead(
     fetch: Callable[[Item], T], items: Iterable[Item], depth: int = DEPTH, workers: int = 1
 ) -> Generator[Iterator[T]]:
-    """`map(fetch, items)`, up to `depth` calls ahead in threads of their own.
+    """`map(fetch, items)`, up to `depth` calls ahead in separate threads.
 
-    One thread makes the calls one after the other, so that `fetch` may keep state; with several
-    `workers` it may not. An exception comes out where its result would. The threads are gone when
-    the context is left.
+    A single worker makes the calls in order, so `fetch` may keep state; with several `workers` it
+    may not. An exception is raised where its result would be. The threads end with the context.
     """
     threads = torch.get_num_threads()
-    # On one core each: with a team of OpenMP threads of its own, the cores have more threads than
-    # they bear, and every parallel region of the work itself begins and ends more slowly (a
-    # training step on two cores took 1.3 times as long).
+    # One core each: if each had its own team of OpenMP threads, the cores would be oversubscribed,
+    # and every parallel region of the main work would start and end more slowly (a training step on
+    # two cores took 1.3 times as long).
     one_core = {"initializer": torch.set_num_threads, "initargs": (1,)}
     pool = ThreadPoolExecutor(workers, "prefetch", **one_core)
     try:
         yield _results(pool, fetch, items, depth)
     finally:
         pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads)  # what threads that begin later take
+        torch.set_num_threads(threads)  # the setting that threads started later inherit
 
 
 def one_ahead(make: Callable[[Item], T], following: Callable[[Item], Item]) -> Callable[[Item], T]:
-    """`make`, which has what follows an item ready when that is asked for.
+    """`make` with prefetching: the result for the following item is ready when it is requested.
 
-    One thread makes all, one after the other. It is gone when nobody has the function any more.
+    One thread makes all of them in order. It ends when the function is garbage-collected.
 
     Args:
-        following: the item that is asked for after this one, or after others between.
+        following: an item -> the one that will be requested after it, perhaps with others between.
     """
     pool = ThreadPoolExecutor(1, "prefetch")
     waiting: dict[Item, Future[T]] = {}

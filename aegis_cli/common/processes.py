@@ -1,7 +1,7 @@
-"""Worker processes: one pool for all who need several, its share of the cores, and its end.
+"""Worker processes: a pool for all who need several, their share of the cores, and their end.
 
-Every worker is spawned. A forked one would inherit this process's OpenGL context and torch's
-threads, and hang or crash at their first use.
+Every worker is spawned. A forked one would inherit this process's OpenGL context and torch threads,
+and hang or crash when it first uses them.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from aegis_cli.common.interrupts import deferred, stop
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# How a worker starts. Whatever is shared with the workers, a queue for one, is made by it too.
+# How a worker starts. Objects shared with workers, such as a queue, are created by it too.
 SPAWN = multiprocessing.get_context("spawn")
 
-# Chunks per worker that are computed, or wait for whoever takes the results. Without a limit they
-# would pile up in memory.
+# Chunks per worker that are being computed or wait for their results to be taken. Without a limit
+# they would pile up in memory.
 _AHEAD = 2
 
 _GRACE_S = 10  # how long a worker whose parent is gone may clean up
@@ -41,12 +41,12 @@ _ENDED = 128 + signal.SIGTERM  # its exit code
 class WorkerPool:
     """Spawned processes that work for the length of a `with` block, and never outlive it.
 
-    The processes that are still at work when the block ends with an exception are stopped, and
-    clean up; a block that ends well waits for them. They end by themselves when this process dies.
+    If the block ends with an exception, processes that are still working are stopped, and clean up;
+    otherwise the block waits for them. They end by themselves if this process dies.
 
     Args:
         workers: number of processes.
-        name: what one of them is, for the error of a process that dies: "a recording process".
+        name: name of one process, such as "a recording process", for the error if one dies.
         fix: what the user can do about it.
         begin: called once in each process before any work, with `arguments`.
 
@@ -85,7 +85,7 @@ class WorkerPool:
             raise self._died() from None
 
     def submit(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
-        """Have a process call `work`, a function that it can import by name."""
+        """Let a process call `work`, a function that it can import by name."""
         with interrupts_held():  # the call may start a process
             return self._executor.submit(_work, work, *arguments)
 
@@ -116,8 +116,8 @@ class WorkerPool:
         return AegisError(f"{self._name} died", f"{self.workers} {plural}", self._fix)
 
     def _stop(self) -> None:
-        """End the workers, and let the executor's thread notice it."""
-        # Not those of another pool, unless it was opened with this one.
+        """Stop the workers, and make the executor's thread notice it."""
+        # Not those of another pool, unless they started after this one was opened.
         own = set(multiprocessing.active_children()) - self._older
         for process in own:
             process.terminate()
@@ -125,8 +125,8 @@ class WorkerPool:
         for process in own:
             process.join(max(0.0, deadline - time.monotonic()))
             process.kill()
-        # A worker may have died while it wrote a result. The executor's thread waits for the rest
-        # of it as long as somebody could write it, and this process could.
+        # A worker may have died while writing a result. The executor's thread waits for the rest as
+        # long as some process could still write it, and this process could.
         self._executor._result_queue._writer.close()  # pyrefly: ignore[missing-attribute]: private
 
 
@@ -140,14 +140,14 @@ def _unguarded_script() -> str | None:
 
 
 def _begin(begin: Callable[..., None] | None, *arguments: Any) -> None:
-    """What a worker does first."""
+    """Start a worker."""
     threading.Thread(target=_watch_parent, daemon=True).start()
     if begin is not None:
         begin(*arguments)
 
 
 def _watch_parent() -> None:
-    """End this worker when its parent dies, by whatever signal: a pipe between them breaks."""
+    """End this worker when its parent dies, however that happens: a pipe between them breaks."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])
@@ -162,7 +162,7 @@ def _work(work: Callable[..., Result], *arguments: Any) -> Result:
     try:
         return work(*arguments)
     except KeyboardInterrupt:
-        # At once: the pool's own loop would send the exception as a result, and go on.
+        # At once: the pool's own loop would send the exception as a result and continue.
         os._exit(_ENDED)
     finally:
         signal.signal(signal.SIGTERM, idle)
@@ -181,9 +181,10 @@ def mapped(
     fix: str,
     chunk: int = 1,
 ) -> Generator[Iterator[Result]]:
-    """Give `map(work, items)`, from a pool if there is to be more than one worker.
+    """Yield `map(work, items)`, from a pool if there is more than one worker.
 
-    The results can be left early. For the arguments see `WorkerPool` and `WorkerPool.map`.
+    The results need not be consumed completely. For the arguments see `WorkerPool` and
+    `WorkerPool.map`.
     """
     if workers == 1:
         yield map(work, items)
@@ -196,12 +197,12 @@ def mapped(
 
 
 def worker_count(most: int) -> int:
-    """Number of workers for work that repays at most so many: one per core, at least one."""
+    """Number of workers: one per core, at most `most`, at least one."""
     return max(1, min(_cores(), most))
 
 
 def threads_per_worker(workers: int) -> int:
-    """Number of threads that each of the workers may use, so that together they fill the cores."""
+    """Number of threads per worker, so that together they fill the cores."""
     return max(1, _cores() // workers)
 
 
@@ -214,21 +215,22 @@ def _cores() -> int:
 
 @contextmanager
 def interrupts_held() -> Generator[None]:
-    """Hold signals back; processes started inside never see those of a terminal.
+    """Hold signals back; processes started inside never receive those from a terminal.
 
     A terminal sends Ctrl-C, and SIGHUP when it closes, to each of its processes. Workers leave them
-    to the process that started them, which receives one that came meanwhile when the block ends.
+    to the process that started them, which handles a signal that came meanwhile when the block
+    ends.
 
-    The mask is for the children, who inherit it. It does not hold this process back: the signal may
-    reach another thread of a library, and Python then interrupts the main thread all the same. So
-    the handlers wait too.
+    The mask is for the children, which inherit it. It does not protect this process: the signal may
+    reach another thread, of a library, and Python then interrupts the main thread anyway. So the
+    handlers are deferred too.
     """
-    # To start the tracker unblocks SIGINT, so it has to run before the mask is set.
+    # Starting the tracker unblocks SIGINT, so it has to run before the mask is set.
     resource_tracker.ensure_running()
     with deferred():
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
         try:
             yield
         finally:
-            # A signal that is pending now reaches the waiting handler, and is raised once after it.
+            # A signal that is pending now reaches the deferred handler, and is raised once.
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)

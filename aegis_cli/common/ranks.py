@@ -1,7 +1,7 @@
-"""Several processes that share one training: how they meet, and what they compute together.
+"""Several processes that share one training run: how they connect and what they compute together.
 
-Whatever is a sum over a batch is one over the processes' shares of it. So nothing is weighted: each
-process adds what its own frames contribute to the whole batch's mean, and contributions are summed.
+A sum over a batch is a sum over the processes' shares of it. So nothing is weighted: each process
+computes the contribution of its own frames to the mean of the whole batch, and these are summed.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _BUCKET = 1 << 23  # entries that are summed in one message, 32 MB of float32
-# How long a process may wait for what another does alone. Who has ended is noticed at once, because
-# its connections close.
+# How long a process may wait for what another does alone. A process that has ended is noticed at
+# once, because its connections close.
 _PATIENCE = timedelta(days=365)
 
 
@@ -34,11 +34,11 @@ class Ranks:
     """This process among those that share its work.
 
     Attributes:
-        rank: its number, from 0; number 0 alone writes and speaks.
-        count: how many there are.
-        group: where they are not all processes.
-        patient: all of them, by connections on which an answer may take as long as any work; None
-            where they are not all processes.
+        rank: number of this process, from 0; only number 0 writes and reports.
+        count: number of processes.
+        group: their group, if they are not all processes.
+        patient: a group of all processes whose connections wait for a reply as long as any work
+            takes; None if they are not all processes.
     """
 
     rank: int = 0
@@ -57,7 +57,7 @@ class Ranks:
         return self.count > 1
 
     def total(self, x: Tensor) -> Tensor:
-        """The sum of every process's x, whose gradient is that of this one's share."""
+        """The sum of x over all processes, whose gradient is that of this process's share."""
         return _Total.apply(x, self.group) if self.several else x
 
     @torch.no_grad()
@@ -73,15 +73,15 @@ class Ranks:
                 tensor.copy_(found.view_as(tensor))
 
     def rows(self, size: int) -> slice:
-        """Which of `size` rows of a sharded tensor are here: the first have more, the last fewer.
+        """The slice of `size` rows of a sharded tensor that is here; the last ranks have fewer.
 
-        `fully_shard` cuts as `torch.chunk` does.
+        `fully_shard` splits like `torch.chunk`.
         """
         most = -(-size // self.count)  # rounded up
         return slice(min(self.rank * most, size), min((self.rank + 1) * most, size))
 
     def any(self, *flags: bool) -> list[bool]:
-        """Which of these flags a process has set."""
+        """Which of these flags are set in any process."""
         if not self.several:
             return list(flags)
         counts = torch.tensor(flags, dtype=torch.int32, device=_device())
@@ -89,7 +89,7 @@ class Ranks:
         return [count > 0 for count in counts.tolist()]
 
     def gathered(self, value: T) -> list[T]:
-        """Every process's value, which has to be one that can be pickled."""
+        """The value of every process; it must be picklable."""
         if not self.several:
             return [value]
         found: list[Any] = [None] * self.count
@@ -97,41 +97,41 @@ class Ranks:
         return found
 
     def wait(self) -> None:
-        """Wait until every process is here, however long one of them takes."""
+        """Wait until every process has arrived here, however long one of them takes."""
         if self.several:
             dist.barrier(group=self.group if self.patient is None else self.patient)
 
     def agree(self, value: T) -> T:
-        """The first process's value, which has to be one that can be pickled.
+        """The value of the first process; it must be picklable.
 
-        The others wait for it, however long it takes to find.
+        The others wait for it, however long it takes.
         """
         return self._told([value]) if self.several else value
 
     def by_first(self, find: Callable[[], T]) -> T:
-        """What the first process finds, as `agree` does with a value; only it is asked."""
+        """The result of `find` in the first process, as in `agree`; only that process calls it."""
         return self.agree(find()) if self.first else self._told([None])
 
     def _told(self, box: list[Any]) -> Any:
-        """What is in the first process's box."""
-        # `patient` is gloo's, which sends from a CPU; NCCL's own sends from a GPU.
+        """The content of the first process's box."""
+        # `patient` uses gloo, which sends from a CPU; NCCL sends from a GPU.
         device = _device() if self.patient is None else torch.device("cpu")
         dist.broadcast_object_list(box, src=0, group=self.patient, device=device)
         return box[0]
 
 
 ALONE = Ranks()
-_met: Ranks | None = None  # whom `joined` has met, or who a block works among
+_met: Ranks | None = None  # the processes that `joined` has connected, or those given to `among`
 
 
 @contextlib.contextmanager
 def joined() -> Generator[Ranks]:
-    """Meet the other processes that the launcher has started, until the block ends.
+    """Connect to the other processes that the launcher has started, until the block ends.
 
-    Who is inside such a block already finds the same processes there.
+    A nested block yields the same processes.
 
     Raises:
-        AegisError: an environment by which they cannot be met.
+        AegisError: the environment does not allow it.
         PeerLost: one of them has ended.
     """
     if _met is not None or launch.world_size() == 1:
@@ -145,7 +145,7 @@ def joined() -> Generator[Ranks]:
         dist.init_process_group("nccl" if on_gpu else "gloo")
     try:
         patient = dist.new_group(backend="gloo", timeout=_PATIENCE)
-        assert isinstance(patient, dist.ProcessGroup)  # an int where this process is outside it
+        assert isinstance(patient, dist.ProcessGroup)  # an int if this process is not in it
         ranks = Ranks(dist.get_rank(), dist.get_world_size(), patient=patient)
         with among(ranks):
             yield ranks
@@ -164,7 +164,7 @@ def joined() -> Generator[Ranks]:
 
 @contextlib.contextmanager
 def among(ranks: Ranks) -> Generator[None]:
-    """Let `joined` find these processes inside the block, or none but this with `ALONE`."""
+    """Let `joined` yield these processes inside the block, or only this one with `ALONE`."""
     global _met
     before, _met = _met, ranks
     try:
@@ -175,34 +175,34 @@ def among(ranks: Ranks) -> Generator[None]:
 
 def is_sharded(x: Tensor) -> TypeGuard[DTensor]:
     """Whether each process has only some rows of a tensor."""
-    return hasattr(x, "to_local")  # as only a DTensor has, whose class takes long to import
+    return hasattr(x, "to_local")  # only a DTensor has it; importing its class is slow
 
 
 def rows_here(x: Tensor) -> Tensor:
-    """The rows that this process has of a tensor; all where it is not sharded.
+    """The rows of a tensor that this process has; all if it is not sharded.
 
-    Without gradients they are the tensor's own memory.
+    Without gradients they share the tensor's memory.
     """
     return x.to_local() if is_sharded(x) else x
 
 
 def whole(x: Tensor) -> Tensor:
-    """All rows of a tensor, which all processes have to ask for."""
+    """All rows of a tensor; every process has to call this."""
     return x.full_tensor() if is_sharded(x) else x
 
 
 def sharded_as(x: Tensor, like: Tensor) -> Tensor:
-    """A tensor that every process has whole, sharded as another one is."""
+    """A tensor that every process has in full, sharded like another one."""
     if not is_sharded(like):
         return x
     from torch.distributed.tensor import distribute_tensor
 
-    # Every process takes its own rows, so that nothing is sent.
+    # Every process takes its own rows, so nothing is sent.
     return distribute_tensor(x, like.device_mesh, like.placements, src_data_rank=None)
 
 
 def _is_lost(error: RuntimeError) -> bool:
-    """Whether a collective operation failed because somebody is gone; gloo says so in words."""
+    """Whether a collective operation failed because a process is gone; gloo says so in text."""
     said = str(error)
     return isinstance(error, dist.DistError) or "gloo" in said or "Connection" in said
 
@@ -212,7 +212,7 @@ def _device() -> torch.device:
 
 
 def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Tensors of one type, together not much larger than a message is to be."""
+    """Tensors of one dtype, together not much larger than a message should be."""
     for dtype in dict.fromkeys(t.dtype for t in tensors):
         bucket: list[Tensor] = []
         for tensor in tensors:
@@ -229,8 +229,8 @@ def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
 class _Total(torch.autograd.Function):
     """Sum over the processes.
 
-    Each process goes back from the same sum into its own share. Together they have the gradient of
-    the whole, once their gradients are summed too, so that nothing is summed on the way back.
+    Each process backpropagates from the same sum into its own share. Summing their parameter
+    gradients later gives the gradient of the whole, so nothing is summed in the backward pass.
     """
 
     @staticmethod

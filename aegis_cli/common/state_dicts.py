@@ -1,7 +1,7 @@
-"""Tensors that are to be copied into a model, compared with it as a whole before the first is.
+"""Checks of all tensors against a model before any of them is copied into it.
 
-Copying checks too little: a tensor of shape [1] is broadcast, a missing one leaves what was there,
-and an optimizer writes outside a state that is smaller than its parameter.
+Copying checks too little: a tensor of shape [1] is broadcast, a missing one leaves the old values,
+and an optimizer writes out of bounds if a state is smaller than its parameter.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from aegis_cli.common.kinds import describe, is_finite, quoted
 
 AS_WRITTEN = "bring back the file as Aegis wrote it, or make it again"
 _NAMED = 3  # problems that an error names
-_LARGEST = 2**20  # of a model's sizes
+_LARGEST = 2**20  # largest size that a model may have
 Shape = TypeVar("Shape")
 
 
 def check_state(
     source: str, found: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, exact: bool = True
 ) -> None:
-    """Raise AegisError unless `found` has exactly the tensors `wanted`, of their shapes and types.
+    """Raise AegisError unless `found` has exactly the tensors of `wanted`, in shape and dtype.
 
     Args:
-        source: what they were read from, for the error.
-        exact: whether types must be the same; else one of real numbers stands for another.
+        source: where they were read from, for the error.
+        exact: whether dtypes must be the same; otherwise any floating-point dtype is accepted for
+            another.
 
     Raises:
-        AegisError: a name, shape or type that differs, or numbers that are not finite.
+        AegisError: a name, shape or dtype differs, or values are not finite.
     """
     problems = []
     if missing := wanted.keys() - found.keys():
@@ -62,13 +63,13 @@ def check_state(
 
 
 def _quoted(names: set[str]) -> str:
-    """Some of the names in quotes, and how many they are."""
+    """The first few names in quotes, and the total count if there are more."""
     return few([f"'{name}'" for name in sorted(names)])
 
 
 @contextlib.contextmanager
 def reading_meta(path: Path) -> Generator[None]:
-    """Turn what wrong types, missing keys and impossible sizes in a header raise into one error."""
+    """Turn exceptions from wrong types, missing keys or impossible sizes into an AegisError."""
     try:
         yield
     except (
@@ -92,10 +93,10 @@ def shape_from(kind: type[Shape], raw: Any, path: Path, tensors: int) -> Shape:
     """A dataclass of a model's sizes, from a header.
 
     Args:
-        tensors: how many the file has, which a model has more of than layers.
+        tensors: number of tensors in the file, which bounds the number of layers.
 
     Raises:
-        AegisError: other keys than the dataclass has, or sizes that no model has.
+        AegisError: the keys differ from those of the dataclass, or a size is impossible.
     """
     with reading_meta(path):
         sizes = {str(name): value for name, value in raw.items()}
@@ -106,7 +107,7 @@ def shape_from(kind: type[Shape], raw: Any, path: Path, tensors: int) -> Shape:
         for name, value in sizes.items():
             absent = value is None and known[name].default is None
             whole = isinstance(value, int) and not isinstance(value, bool)
-            # A damaged depth could ask for a million layers, which take long to make.
+            # A damaged depth could ask for a million layers, which would take long to create.
             most = tensors if name.endswith("depth") else _LARGEST
             if not absent and not (whole and 1 <= value <= most):
                 raise ValueError(f"'{name}' is {value!r}")
@@ -114,15 +115,15 @@ def shape_from(kind: type[Shape], raw: Any, path: Path, tensors: int) -> Shape:
 
 
 def check_heads(width: int, heads: int) -> None:
-    """Raise ValueError unless a width can be shared out among the heads of attention."""
+    """Raise ValueError unless a width is divisible by the number of attention heads."""
     if width % heads:
         raise ValueError(f"a width of {width} for {heads} heads")
 
 
 class _NothingDrawn(TorchFunctionMode):
-    """Weights are left as they are: there is no memory to draw them in.
+    """Skips the initialisation of weights, which have no memory here.
 
-    It saves a third of the time, and torch would import its compiler to draw tables.
+    It saves a third of the time, and torch would import its compiler to initialise tables.
     """
 
     def __torch_function__(
@@ -140,10 +141,10 @@ class _NothingDrawn(TorchFunctionMode):
 
 @contextlib.contextmanager
 def outline(path: Path) -> Generator[None]:
-    """Make modules inside the block without memory, to compare a file with them before it is used.
+    """Create modules without memory inside the block, to check a file against them before use.
 
     Raises:
-        AegisError: the sizes make no model.
+        AegisError: no model has these sizes.
     """
     with reading_meta(path):
         try:

@@ -14,13 +14,13 @@ from typing import Any
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError, in_short
 
-# How the names of files end that hold a table.
+# Suffixes of files that hold a table.
 SUFFIXES = (".xlsx", ".tsv", ".csv", ".json")
 _FIX = "write it again, or take it out of the folder"
 
 
 def columns(path: Path) -> list[str]:
-    """The names of a table's columns, in order; none of a file that is no table.
+    """The names of a table's columns, in order; empty for a file that is not a table.
 
     Raises:
         AegisError: it cannot be read, or is damaged.
@@ -43,7 +43,7 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _lines(path: Path) -> Generator[list[Any]]:
-    """The names of the columns, then each row's cells, as many as there are names."""
+    """The names of the columns, then the cells of each row, as many as there are names."""
     reader = {".xlsx": _workbook, ".json": _records}.get(path.suffix, _text)
     with files.reading(path, "check the path"):
         lines = _checked(path, reader(path))
@@ -55,7 +55,7 @@ def _lines(path: Path) -> Generator[list[Any]]:
 
 
 def _fitted(path: Path, number: int, cells: Sequence[Any], width: int) -> list[Any]:
-    """A row's cells, of which a workbook may leave out the last ones where they are empty."""
+    """The cells of a row, padded, because a workbook may leave out empty cells at its end."""
     missing = width - len(cells) if path.suffix == ".xlsx" else 0
     fitted = [*cells, *[None] * missing]
     if len(fitted) != width:
@@ -65,14 +65,14 @@ def _fitted(path: Path, number: int, cells: Sequence[Any], width: int) -> list[A
 
 
 def _checked(path: Path, lines: Iterator[Sequence[Any]]) -> Iterator[Sequence[Any]]:
-    """The same lines; what a damaged file makes its reader raise becomes an AegisError."""
+    """The same lines, with exceptions from reading a damaged file turned into AegisError."""
     try:
         yield from lines
     except AegisError:
         raise
-    except Exception as error:  # a reader of archives and XML raises some dozen types
+    except Exception as error:  # readers of archives and XML raise a dozen types
         if isinstance(error, OSError) and error.errno is not None:
-            raise  # the system's; openpyxl has some of its own for what is no workbook
+            raise  # from the system; openpyxl raises OSErrors without errno for other files
         files.refuse_pointer(path)
         found = f"'{path}' is no table, or is damaged: {in_short(error)}"
         raise AegisError(found, f"a whole {path.suffix} file", _FIX) from error
@@ -89,7 +89,7 @@ def _workbook(path: Path) -> Iterator[Sequence[Any]]:
     import openpyxl
 
     with open(path, "rb") as file:
-        with warnings.catch_warnings():  # of styles and the like, which no cell's content needs
+        with warnings.catch_warnings():  # about styles and the like, which do not affect cells
             warnings.simplefilter("ignore")
             book = openpyxl.load_workbook(file, read_only=True, data_only=True)
         with contextlib.closing(book):
@@ -97,8 +97,8 @@ def _workbook(path: Path) -> Iterator[Sequence[Any]]:
 
 
 def _text(path: Path) -> Iterator[Sequence[Any]]:
-    """The rows of a text with commas or tabs."""
-    # An answer may be longer than what is taken for a field at most.
+    """The rows of a text file with commas or tabs."""
+    # An answer may be longer than the default limit of a field.
     limit = csv.field_size_limit(sys.maxsize)
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
@@ -108,7 +108,7 @@ def _text(path: Path) -> Iterator[Sequence[Any]]:
 
 
 def _records(path: Path) -> Iterator[Sequence[Any]]:
-    """The rows of a list of records; no line of any other JSON, such as a summary."""
+    """The rows of a list of records; nothing for any other JSON, such as a summary."""
     records = files.load_json(path)
     if not isinstance(records, list) or not records:
         return

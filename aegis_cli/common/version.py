@@ -1,4 +1,4 @@
-"""The version of the package, which artifacts and stage records carry."""
+"""The version of the package, which is stored in artifacts and stage records."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 
 @functools.cache
 def code() -> str:
-    """The version and a digest of the package's source files, which tell two editions apart."""
+    """The version and a digest of the package's source files, to tell modified copies apart."""
     root = Path(__file__).parent.parent
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Files that are read as long as the work lasts: memory-mapped ones, and ones opened on demand."""
+"""Files that are read throughout the work: memory-mapped ones, and ones opened on demand."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from aegis_cli.common.errors import AegisError
 
 
 class WatchedFiles:
-    """Tells when somebody writes into a file that is being read.
+    """Detects writes to a file that is being read.
 
-    What is mapped changes with the file, and the work would go on with other numbers under the
-    digest of the old ones. A file that is replaced as a whole is none of our concern: what is open
-    and mapped is still the old one.
+    A memory map changes with its file, so the work would continue with other numbers under the
+    digest of the old ones. A file that is replaced as a whole does no harm: the open and mapped one
+    is still the old one.
 
     Attributes:
         sha256: hex digest of each file's content; empty unless they are watched `by_content`.
     """
 
     def __init__(self, paths: Iterable[Path] = (), by_content: bool = True) -> None:
-        """Note size, time and content of each file as they are now.
+        """Record the current size, time and content of each file.
 
         Args:
-            by_content: whether a file whose time alone changes, as `touch` does it, counts as
+            by_content: whether a file of which only the time changes, as by `touch`, counts as
                 unchanged. For this every file is read once, here.
 
         Raises:
@@ -52,18 +52,18 @@ class WatchedFiles:
             same_size = stamp[0] == self._noted[path][0]
             if not same_size or self.sha256.get(path) != _digest(path, number):
                 raise _written_to(path)
-            self._noted[path] = stamp  # the same content: it need not be read again each time
+            self._noted[path] = stamp  # same content: do not read it again every time
 
 
 class WatchedPaths:
-    """Tells when a path has another file than at first, or a file that was written to.
+    """Detects paths whose file was replaced or written to.
 
-    It is for files that are opened on demand, of which there may be more than a process may have
-    open.
+    It is for files that are opened on demand, which may be more than a process can have open at
+    once.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
-        """Note which file each path has, its size and its time.
+        """Record the file at each path, its size and its time.
 
         Raises:
             AegisError: one cannot be read.
@@ -71,7 +71,7 @@ class WatchedPaths:
         self._noted = {Path(path): _stamp_of(path) for path in paths}
 
     def check(self) -> None:
-        """Raise AegisError if one of the paths has another file since, or a changed one."""
+        """Raise AegisError if the file at one of the paths has been replaced or changed since."""
         for path, stamp in self._noted.items():
             if _stamp_of(path) != stamp:
                 raise _written_to(path)
@@ -97,7 +97,7 @@ def _stamp(number: int) -> tuple[int, int]:
 
 
 def _digest(path: Path, number: int) -> str:
-    """sha256 of an open file's content, whatever lies at its path by now."""
+    """sha256 of an open file's content, whatever is at its path by now."""
     with files.reading(path, "check the path"), open(number, "rb", closefd=False) as file:
         file.seek(0)
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -2,7 +2,7 @@
 
 R [T, T] holds the accuracy R[t, i] on task i after learning tasks 0 to t. Transfer, Average and
 Last are defined as in ZSCL (arXiv 2303.06628). Forgetting has several definitions in the field.
-Here it is the best accuracy since the task was learned less the final one, averaged over all tasks
+Here it is the best accuracy since the task was learned minus the final one, averaged over all tasks
 but the last:
 
     Transfer   = mean over i >= 1 of mean over t < i of R[t, i]
@@ -21,7 +21,7 @@ Rows = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class StreamScores:
-    """Figures of a full matrix, shares in [0, 1].
+    """Figures of a full matrix, as fractions in [0, 1].
 
     A stream of one task has no transfer and no forgetting: both are None.
     """
@@ -34,9 +34,9 @@ class StreamScores:
 
 @dataclass(frozen=True)
 class SeenScores:
-    """Figures for tasks that cannot be tried before they are learned: shares in [0, 1], or errors.
+    """Figures for tasks that cannot be evaluated before they are learned.
 
-    They read the entries with t >= i alone.
+    They are fractions in [0, 1], or errors, and use only the entries with t >= i.
     """
 
     average: float
@@ -48,10 +48,10 @@ def scores(rows: Rows) -> StreamScores:
     """The figures of a full matrix: T rows of T accuracies."""
     before_learning = []
     for i in range(1, len(rows)):
-        # Above the diagonal of column i, task i is tried before it is learned.
+        # Above the diagonal of column i, task i is evaluated before it is learned.
         before_learning.append(_mean([rows[t][i] for t in range(i)]))
-    # The mean of the columns' means, not of all entries: else a task would weigh more the later it
-    # comes, since more entries of its column are above the diagonal.
+    # The mean of the columns' means, not of all entries: otherwise later tasks would weigh more,
+    # because more entries of their columns are above the diagonal.
     transfer = _mean(before_learning) if before_learning else None
     average = _mean([accuracy for row in rows for accuracy in row])
     return StreamScores(transfer, average, _mean(rows[-1]), _forgetting(rows))
@@ -64,9 +64,9 @@ def seen_scores(rows: Rows) -> SeenScores:
 
 
 def seen_error_scores(rows: Rows) -> SeenScores:
-    """The figures of a triangle of errors, of which less is better.
+    """The figures of a triangle of errors, where lower is better.
 
-    Forgetting is by how much the errors have grown: the final one less the smallest since the task
+    Forgetting is how much the errors have grown: the final one minus the smallest since the task
     was learned.
     """
     found = seen_scores([[-error for error in row] for row in rows])
@@ -87,12 +87,12 @@ def reuse_rate(masses: Sequence[Sequence[float]]) -> float | None:
     """Mean routing mass on experts of earlier tasks, over maps and over tasks after the first.
 
     Args:
-        masses: that mass in [0, 1], per task and per map.
+        masses: the routing mass on earlier tasks' experts, in [0, 1], per task and per map.
 
     Returns:
         The mean; None for a single task, or without maps.
     """
-    # The first task finds no expert of an earlier one.
+    # The first task has no earlier experts to reuse.
     later = [mass for task in masses[1:] for mass in task]
     return _mean(later) if later else None
 

@@ -35,9 +35,9 @@ class Rotation(NamedTuple):
 def rotate(x: Tensor, rotation: Rotation) -> Tensor:
     """Rotate channel i of x [B, h, N, S, d] with its channel i + d/2.
 
-    This is RoFormer's embedding (arXiv 2104.09864), its channels in GPT-NeoX's order.
+    This is RoFormer's embedding (arXiv 2104.09864) with channels in GPT-NeoX's order.
     """
-    # In x's type: a product with float32 tables would widen keys and queries in half precision.
+    # In x's dtype: multiplying by float32 tables would upcast half-precision keys and queries.
     cos, sin = (t[:, None, None].to(x.dtype) for t in rotation)  # [B, 1, 1, S, d]
     low, high = x.chunk(2, dim=-1)
     quarter_turn = torch.cat([-high, low], dim=-1)
@@ -56,7 +56,8 @@ def block_attention(
     Args:
         query: [B, h, N, S, d].
         own: keys and values of the same blocks, [B, h, N, S, d] each.
-        own_mask: additive, broadcastable to [B, 1, N, S, S]: who attends to whom inside a block.
+        own_mask: additive, broadcastable to [B, 1, N, S, S]: which tokens of a block attend to
+            which.
         prefix: keys and values shared by all blocks, [B, h, P, d] each.
         prefix_mask: additive, broadcastable to [B, 1, 1, 1, P].
 
@@ -64,7 +65,7 @@ def block_attention(
         [B, h, N, S, d].
     """
     batch, heads, blocks, length, width = query.shape
-    # The queries are scaled, because they have fewer entries than the scores.
+    # Scale the queries rather than the scores, because they have fewer entries.
     query = query * (1 / math.sqrt(width))
     own_scores = query @ own.key.transpose(-1, -2)  # [B, h, N, S, S]
     if own_mask is not None:
@@ -77,7 +78,7 @@ def block_attention(
     prefix_scores = prefix_scores.unflatten(2, (blocks, length))
     if prefix_mask is not None:
         prefix_scores = prefix_scores + prefix_mask
-    # One softmax over both: a token weighs the prefix against its own block.
+    # One softmax over both, so that a token weighs the prefix against its own block.
     weights = torch.cat([prefix_scores, own_scores], dim=-1).softmax(-1)
     to_prefix, to_own = weights.split([prefix.key.shape[2], length], dim=-1)
     from_prefix = to_prefix.flatten(2, 3) @ prefix.value  # [B, h, N*S, d]
@@ -91,5 +92,5 @@ def additive(mask: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     The negatives are finite: a row without any True stays free of NaN.
     """
     scores = torch.zeros(mask.shape, dtype=dtype, device=mask.device)
-    # float16 ends at 65,504, and exp(-1e4) is exactly 0 in every type.
+    # The largest float16 is 65,504, and exp(-1e4) is exactly 0 in every dtype.
     return scores.masked_fill(~mask, -1e4)

@@ -13,7 +13,7 @@ runs the other way) replaces the velocity by
     v - g(t) J^T W (y - a(x)),    g(t) = min(b, (t^2 + (1 - t)^2) / (t (1 - t))),
 
 where y is the old chunk, W has a weight for each of its steps, J is the derivative of a(x), and
-b = 5 bounds the pull where the noise is nearly all there is.
+b = 5 bounds the pull when x is almost pure noise.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Continued:
-    """What a chunk continues.
+    """The old chunk that a new one continues.
 
     Attributes:
-        actions: what is left of the old chunk [B, n, A] when the policy looks, n <= H.
-        delay: how many of them are executed before the new chunk is there, at most n.
+        actions: the rest of the old chunk [B, n, A] at the time of the observation, n <= H.
+        delay: how many of them are executed before the new chunk arrives, at most n.
     """
 
     actions: Tensor
@@ -47,20 +47,20 @@ def weights(left: int, delay: int, horizon: int) -> Tensor:
     """How strongly each step of a new chunk is held to the old one [horizon] float32, in [0, 1].
 
     Args:
-        left: n, the steps that the old chunk still has.
-        delay: d <= n; the steps that are executed before the new chunk is there.
+        left: n, the remaining steps of the old chunk.
+        delay: d <= n; the steps that are executed before the new chunk arrives.
         horizon: H >= n.
     """
     step = torch.arange(horizon, dtype=torch.float64, device="cpu")
-    # The paper's soft mask: c (e^c - 1) / (e - 1), where c falls linearly from 1 at the last step
-    # that is executed to 0 at the first that the old chunk lacks. Of the executed steps before, the
-    # quotient is above 1, and so their weight is 1.
+    # The paper's soft mask: c (e^c - 1) / (e - 1), where c falls linearly from 1 at the last
+    # executed step to 0 at the first step past the end of the old chunk. For earlier executed steps
+    # the quotient is above 1, so their weight is clamped to 1.
     share = ((left - step) / (left - delay + 1)).clamp(0, 1)
     return (share * torch.expm1(share) / (math.e - 1)).float()
 
 
 def strength(time: Tensor) -> Tensor:
-    """g(t) of flow times [B] in (0, 1]."""
+    """g(t) at flow times [B] in (0, 1]."""
     rest = 1 - time
     exact = (time.square() + rest.square()) / (time * rest)  # infinite at t = 1
     return exact.clamp(max=STRONGEST)
@@ -70,23 +70,23 @@ def guided(velocity: Velocity, continued: Continued, horizon: int) -> Velocity:
     """The velocity that leads to a chunk [B, H, A] which continues the old one.
 
     Args:
-        velocity: v(x, t) of chunks [B, H, A] and times [B]; PyTorch differentiates it.
-        continued: in the units of the flow.
+        velocity: v(x, t) for chunks [B, H, A] and times [B]; it is differentiated by autograd.
+        continued: the old chunk, in the units of the flow.
     """
     left = continued.actions.shape[1]
     each_step = weights(left, continued.delay, horizon)
     held = each_step.to(continued.actions.device)[:, None]  # W as a column [H, 1]
-    # Steps that the old chunk lacks have the weight 0, so it does not matter what stands there.
+    # Steps past the end of the old chunk have weight 0, so the padding value does not matter.
     target = torch.nn.functional.pad(continued.actions, (0, 0, 0, horizon - left))
 
     def pulled(x: Tensor, time: Tensor) -> Tensor:
-        # Actions are sampled without gradients, so that they are on for this derivative alone.
+        # Actions are sampled without gradients, so enable them for this derivative only.
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             moves = velocity(x, time)
             expected = x - time[:, None, None] * moves
             missing = held * (target - expected.detach())  # W (y - a(x)), [B, H, A]
-            # J^T times that, without J itself.
+            # J^T W (y - a(x)) as a vector-Jacobian product, without forming J.
             (pull,) = torch.autograd.grad(expected, x, missing.to(expected.dtype))
         return moves.detach() - strength(time)[:, None, None] * pull
 

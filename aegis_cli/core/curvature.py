@@ -1,10 +1,10 @@
-"""Kronecker-factored curvature of VQA's answers, and the proximal step that it gives.
+"""Kronecker-factored curvature of the answers to VQA, and the proximal step that follows from it.
 
 The Fisher information of a linear map's weights is close to a Kronecker product G (x) C (K-FAC,
 Martens & Grosse 2015, arXiv 1503.05671). C belongs to the map's inputs x, and G to the gradients g
-of log p(answer) at its outputs. K-FAC takes the means of x x^T and g g^T apart. But most tokens
-belong to an image, and no answer asks about most of those. So each token counts here by how
-strongly the answers depend on it. With x and g of one output token, the partial traces of
+of log p(answer) at its outputs. K-FAC averages x x^T and g g^T separately. But most tokens belong
+to an image, and no answer depends on most of those. So each token is weighted here by how strongly
+the answers depend on it. With x and g of one output token, the partial traces of
 E[(g g^T) (x) (x x^T)] give the factors
 
     C = E[|g|^2 x x^T],    G = E[|x|^2 g g^T]
@@ -14,17 +14,17 @@ In the eigenbases of both factors the product is diagonal, h_ij = g_i c_j. The p
 
     D_ij <- D_ij / (1 + w h_ij)
 
-in closed form. It is stable for any w. It comes after the optimizer's step, so Adam does not
-rescale it. Two choices are ours: g and c have mean 1, so that w depends neither on the loss's
-scale nor on the map's size, and the outputs are damped,
+in closed form. It is stable for any w, and Adam does not rescale it, because it follows the
+optimizer's step. Two choices are ours: g and c have mean 1, so that w depends neither on the scale
+of the loss nor on the size of the map, and the outputs are damped,
 
     h_ij = (g_i + damping) c_j
 
 Damping is needed because the Fisher information describes small steps only. An inactive unit has no
 gradient, but a large step can activate it. Without damping, the weights may move freely along
-outputs that no answer depends on yet, and that is where VQA was lost (recipes/results/LOG.md).
-Inputs are not damped: directions that VQA does not read may change. K-FAC damps both factors,
-because it inverts them.
+outputs that no answer depends on yet, and that is where VQA ability was lost
+(recipes/results/LOG.md). Inputs are not damped: weights may change along directions that VQA does
+not read. K-FAC damps both factors, because it inverts them.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ class Curvature:
     (core/stacking.py) every tensor, displacements included, has a leading dimension n.
 
     Attributes:
-        inputs: eigenvectors [d, k] of C; d counts the bias's 1 if there is one. They may be in half
-            precision, and are widened where they are used.
+        inputs: eigenvectors [d, k] of C; d includes the constant input of a bias, if there is one.
+            They may be in half precision, and are upcast when they are used.
         outputs: eigenvectors [o, m] of G; likewise.
-        c: relative eigenvalues of C [k]; their mean is 1 with those that were left out.
+        c: relative eigenvalues of C [k]; the mean over all of them, stored or not, is 1.
         g: relative eigenvalues of G [m]; likewise.
-        damping: what is added to each eigenvalue of G, also to those that were left out.
-        c_rest, g_rest: relative eigenvalue along the directions that were never resolved; 0 where
-            all were, and where those that were left out hold next to nothing. Of stacked maps
-            [n, 1], or 0 of all.
-        total: a tensor -> its sum over the processes, where each has some of the map's outputs;
-            None where it has all.
+        damping: added to each eigenvalue of G, including those that are not stored.
+        c_rest, g_rest: relative eigenvalue along the directions that were never resolved; 0 if all
+            were resolved, or if those left out hold next to nothing. For stacked maps [n, 1], or 0
+            for all.
+        total: sums a tensor over the processes, if each has some of the map's outputs; None if each
+            has all.
     """
 
     inputs: Tensor
@@ -78,24 +78,25 @@ class Curvature:
     total: Callable[[Tensor], Tensor] | None = None
 
     def of_rows(self, rows: slice, total: Callable[[Tensor], Tensor]) -> Curvature:
-        """The curvature where only these outputs of the map are here, and others elsewhere.
+        """The curvature for a process that has only these outputs of the map.
 
         The rows are copied, so that those of the other processes need not stay in memory.
         """
         return replace(self, outputs=self.outputs[rows].clone(), total=total)
 
     def excess(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
-        """The part of a displacement that a proximal step takes away.
+        """The part of a displacement that a proximal step removes.
 
         Args:
             weight: displacement of the map's weight, [o, ...].
             bias: displacement of its bias, [o].
-            strength: the penalty's weight w; a tensor [] is not read, which would force a GPU sync.
+            strength: the penalty's weight w; a tensor [] is never read on the host, which would
+                force a GPU sync.
         """
         return self._weighed(weight, bias, bounded(strength), taken)
 
     def gradient(self, weight: Tensor, bias: Tensor | None, strength: float | Tensor) -> Pair:
-        """The penalty's gradient at a displacement, w h_ij D_ij; the arguments are `excess`'s."""
+        """The penalty's gradient at a displacement, w h_ij D_ij; arguments as in `excess`."""
         return self._weighed(weight, bias, strength, lambda wh: wh)
 
     def _weighed(
@@ -105,8 +106,9 @@ class Curvature:
         strength: float | Tensor,
         factor: Callable[[Tensor], Tensor],
     ) -> Pair:
-        """A displacement whose entries in the eigenbases are multiplied by `factor` of w h_ij."""
-        flat = weight.flatten(self.c.ndim)  # [o, d]; c of stacked maps is [n, k]: [n, o, d]
+        """A displacement with its entries in the eigenbases multiplied by `factor(w h_ij)`."""
+        # [o, d], or [n, o, d] for stacked maps, whose c is [n, k].
+        flat = weight.flatten(self.c.ndim)
         width = flat.shape[-1]
         if bias is not None:
             # The bias is the weight of an input that is always 1.
@@ -116,14 +118,14 @@ class Curvature:
         floor, above = self._shares(strength, self.c, factor)
         rest, of_rest = self.c_rest, None
         if isinstance(rest, Tensor) or rest != 0:
-            # Every input direction gets the share of the unresolved ones; along the stored ones the
-            # difference to their own share is added below.
+            # Every input direction gets the share of the unresolved ones. Along the stored ones,
+            # the difference from their own share is added below.
             if not isinstance(rest, Tensor):
                 rest = self.c.new_full((1,), rest)
             of_rest = floor_rest, above_rest = self._shares(strength, rest, factor)
             floor, above = floor - floor_rest, above - above_rest
-        # Of what lies along input direction j, all outputs give up the share floor_j, and stored
-        # output i gives up above_ij more.
+        # Along input direction j, every output loses the share floor_j, and stored output i loses
+        # above_ij more.
         read = flat @ inputs  # [o, k]
         more = outputs @ (self._stored(outputs, read) * above)  # [o, k]
         found = (read * floor + more) @ inputs.mT  # [o, d]
@@ -140,31 +142,31 @@ class Curvature:
     ) -> tuple[Tensor, Tensor]:
         """Shares of a displacement along inputs of curvature c [k] or [1].
 
-        Outputs outside the stored eigenvectors are damped too, so all of them have one share at
-        least; along the stored ones more is added.
+        Outputs outside the stored eigenvectors are damped too, so there is a share that all outputs
+        have at least; the stored ones have more.
 
         Returns:
-            That of all outputs, [1, k]; and what is added along each stored one, [m, k].
+            The share of all outputs [1, k], and what each stored one has in addition [m, k].
         """
-        least = strength * (self.g_rest + self.damping) * c  # w h_j of an output never stored
+        least = strength * (self.g_rest + self.damping) * c  # w h_j of an output that is not stored
         floor = factor(least)[..., None, :]
         damped = self.g + self.damping
         h = damped[..., :, None] * c[..., None, :]  # (g_i + damping) c_j, [m, k]
         return floor, factor(strength * h) - floor
 
     def _stored(self, outputs: Tensor, read: Tensor) -> Tensor:
-        """A displacement [o, k] along the stored outputs, [m, k], of all processes."""
+        """A displacement [o, k] along the stored outputs [m, k], summed over all processes."""
         stored = outputs.mT @ read
-        # A process has some of the rows that this product sums over.
+        # Each process has only some of the rows that this product sums over.
         return stored if self.total is None else self.total(stored)
 
 
 def stacked(found: Sequence[Curvature]) -> Curvature:
-    """The curvature of several maps of one shape as one; a single one stays as it is."""
+    """The curvatures of several maps of one shape as one; a single one is returned as it is."""
     first = found[0]
     if len(found) == 1:
         return first
-    # Padded directions are columns of zeros: whatever share they get multiplies 0.
+    # Padded directions are columns of zeros, so the share they get has no effect.
     return Curvature(
         inputs=stacking.padded([one.inputs for one in found]),
         outputs=stacking.padded([one.outputs for one in found]),
@@ -193,8 +195,8 @@ def curvatures(
             "that of every map that learns",
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
-    # If some factors are sketched, the anchor's file stores all of them in half precision. Keeping
-    # that halves their memory and changes a proximal step by a thousandth of what it removes.
+    # If some factors are sketched, the anchor file stores all of them in half precision. Keeping
+    # them so halves their memory and changes a proximal step by a thousandth of what it removes.
     sketched = not all(spectrum.whole for spectrum in anchor.curvature.values())
     found = {}
     held: dict[tuple[int, torch.device], Tensor] = {}  # by the spectrum's id; the anchor keeps all
@@ -220,22 +222,22 @@ def curvatures(
 
 
 def _relative(spectrum: Spectrum) -> Tensor:
-    """Its values over the mean of all, as many as have an eigenvector; zeros stay zeros."""
+    """The eigenvalues that have an eigenvector, over the mean of all; zeros stay zeros."""
     assert spectrum.vectors is not None
     stored = spectrum.vectors.shape[1]
-    # The mean is over all directions, also those that have no eigenvector.
+    # The mean is over all directions, including those without an eigenvector.
     return ratio(spectrum.values, spectrum.values.mean())[:stored]
 
 
 def bounded(strength: float | Tensor) -> float | Tensor:
-    """A penalty's weight w, at most so large that a proximal step takes away all but rounding."""
+    """A penalty's weight w, capped where a proximal step already removes all but rounding."""
     if isinstance(strength, Tensor):
         return strength.clamp(max=_HEAVIEST)
     return min(strength, _HEAVIEST)
 
 
 def taken(wh: Tensor) -> Tensor:
-    """The share of a direction that a proximal step takes away: 1 - 1 / (1 + w h), of w h."""
+    """The share of a displacement that a proximal step removes: 1 - 1 / (1 + w h), from w h."""
     wh = wh.clamp(max=_HEAVIEST)  # infinity / infinity is NaN
-    # In the form 1 - 1 / (1 + w h), a small share would be 0: 1 + 1e-8 is 1 in float32.
+    # Computed as 1 - 1 / (1 + w h), a small share would be 0: 1 + 1e-8 is 1 in float32.
     return wh / (1 + wh)

@@ -1,4 +1,4 @@
-"""Temporal ensembling: an action as the mean of all chunks that have predicted it.
+"""Temporal ensembling: each action is a weighted mean over all chunks that have predicted it.
 
 Zhao, Kumar, Levine, Finn: Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware
 (arXiv 2304.13705), Algorithm 2. A chunk of H actions is predicted at every step. With the n <= H
@@ -33,7 +33,7 @@ class TemporalEnsemble:
     """The predictions of one episode, or of several in step with each other.
 
     Args:
-        decay: m; ACT has 0.01.
+        decay: m; ACT uses 0.01.
 
     Raises:
         AegisError: it is not finite.
@@ -49,22 +49,22 @@ class TemporalEnsemble:
         self._chunks.clear()
 
     def next(self, chunk: Tensor) -> Tensor:
-        """The action [..., A] of the present step.
+        """The action [..., A] of the current step.
 
         Args:
-            chunk: [..., H, A], predicted at this step; at each step of an episode there is one.
+            chunk: [..., H, A], predicted at this step; every step of an episode must pass one.
         """
-        # The oldest of H chunks has predicted up to the step before this one.
+        # The oldest of H chunks ends at the step before this one.
         if len(self._chunks) == chunk.shape[-2]:
             self._chunks.popleft()
         self._chunks.append(chunk)
-        # A chunk that was predicted `age` steps ago has this step's action in that place.
+        # A chunk that was predicted `age` steps ago has this step's action at index `age`.
         ages = range(len(self._chunks) - 1, -1, -1)
         found = []
         for age, predicted in zip(ages, self._chunks, strict=True):
             found.append(predicted[..., age, :])
         predictions = torch.stack(found)  # [n, ..., A], the oldest first
-        # softmax is the same quotient, and finite for any decay.
+        # The softmax is the same quotient, and stays finite for any decay.
         order = torch.arange(len(predictions), dtype=torch.float64, device=predictions.device)
         weights = torch.softmax(-self._decay * order, 0)
         return torch.tensordot(weights, predictions.double(), dims=1).to(chunk.dtype)

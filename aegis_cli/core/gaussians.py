@@ -1,10 +1,10 @@
 """Task inference: one Gaussian per task over frozen features, and a threshold for "no task".
 
-The features are those of the bare model, so that nothing learned later moves them. A task may bring
-fewer images than a covariance has entries. So it keeps the leading directions only, and all others
-share one variance (probabilistic principal components, Tipping & Bishop 1999):
+The features are those of the bare model, so nothing learned later changes them. A task may have
+fewer images than a covariance has entries. So only the leading directions are kept, and all others
+share one variance (probabilistic PCA, Tipping & Bishop 1999):
 
-    C = U diag(v) U^T + n (I - U U^T),    n the mean of the variances that are left
+    C = U diag(v) U^T + n (I - U U^T),    n the mean of the remaining variances
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-NONE = -1  # the inferred task of an image that belongs to none
+NONE = -1  # the inferred task of an image that belongs to no task
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Gaussian:
     Attributes:
         mean: [D] float64.
         directions: orthonormal columns U [D, r] float64.
-        variances: v [r] along these.
-        noise: variance n [] along every direction that is orthogonal to these.
-        threshold: log-density [] float64, in nats; an image below it is not the task's.
+        variances: v [r] along these directions.
+        noise: variance n [] along every direction orthogonal to them.
+        threshold: log-density [] float64, in nats; an image below it does not belong to the task.
     """
 
     mean: Tensor
@@ -45,7 +45,7 @@ class Gaussian:
         away = features.double() - self.mean  # [N, D]
         along = (away @ self.directions).square()  # [N, r]
         in_all = away.square().sum(-1)  # [N]
-        # What is left is a sum of squares too, but rounding could put it a little below 0.
+        # The rest is a sum of squares too, but rounding could put it slightly below 0.
         across = (in_all - along.sum(-1)).clamp(min=0)
         mahalanobis = (along / self.variances).sum(-1) + across / self.noise
         size, rank = self.directions.shape
@@ -62,9 +62,9 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     """A Gaussian of a task's training features [N, D], D >= 2.
 
     Args:
-        rank: directions with a variance of their own, at most D - 1 of which are taken.
-        shrinkage: share in [0, 1] of each variance that is replaced by the mean of all D.
-        quantile: share of the task's own training images that fall under the threshold.
+        rank: number of directions with a variance of their own, capped at D - 1.
+        shrinkage: fraction in [0, 1] of each variance that is replaced by the mean of all D.
+        quantile: fraction of the task's own training images that fall below the threshold.
     """
     wide = features.double()
     mean, size = wide.mean(0), wide.shape[1]
@@ -77,7 +77,7 @@ def fit(features: Tensor, rank: int, shrinkage: float, quantile: float) -> Gauss
     # A direction that never varies would make every other value infinitely unlikely.
     rounding = torch.finfo(torch.float32).eps * float(wide.square().mean())
     values = values.clamp(min=rounding)
-    taken = min(rank, size - 1)  # at least one is left, for the noise to be a mean of
+    taken = min(rank, size - 1)  # leave at least one direction for the noise
     directions = vectors[:, :taken].contiguous()
     variances, noise = values[:taken].clone(), values[taken:].mean()
     # The threshold is a quantile of the densities, which are computed with a placeholder for it.

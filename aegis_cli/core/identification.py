@@ -1,4 +1,4 @@
-"""What a router's weights tell about a new task: which experts it needs, and what is new in it.
+"""Which experts a new task needs, and what is new in it, as told by a router's weights.
 
 The rules here are our own: only the abstract of iGSP (arXiv 2605.19301) was available.
 """
@@ -16,13 +16,13 @@ from aegis_cli.core.routing import Expert, Traced
 
 @dataclass(frozen=True)
 class Flow:
-    """How a map's router shares a batch out among its experts.
+    """How a map's router distributes a batch among its experts.
 
     Attributes:
-        mass: mean weight of each expert [E] float64; it sums to 1, or is all 0 where there is no
-            position.
-        load: share of each expert in the sum of mean p_e ||B_e A_e x||, [E] float64; all 0 where
-            every expert's output is 0.
+        mass: mean weight of each expert [E] float64; it sums to 1, or is all 0 if there are no
+            positions.
+        load: share of each expert in the sum of mean p_e ||B_e A_e x||, [E] float64; all 0 if every
+            expert's output is 0.
     """
 
     mass: Tensor
@@ -50,7 +50,7 @@ def flow(passes: Sequence[Traced], experts: Sequence[Expert]) -> Flow:
 def _shares(parts: Tensor) -> Tensor:
     """Non-negative parts [E] divided by their sum; all 0 if that is 0.
 
-    Weights are divided too, because those of a pass in bfloat16 sum to 1 only roughly.
+    Weights need it too, because those of a bfloat16 pass sum to 1 only roughly.
     """
     total = parts.sum()
     shares = parts / total if total > 0 else parts
@@ -60,15 +60,16 @@ def _shares(parts: Tensor) -> Tensor:
 def where_read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str, list[Traced]]:
     """The passes of each map at the positions that the loss reads.
 
-    The loss reads the positions at whose output its gradient is not 0. All others say nothing about
-    what a task needs, and can be nearly all there are: padding, what follows a text's end, and in
-    the last layers everything but the token that becomes the feature.
+    The loss reads a position if its gradient at the map's output there is not 0. All other
+    positions say nothing about what a task needs, and they can be nearly all of them: padding, what
+    follows the end of a text, and in the last layers everything but the token that becomes the
+    feature.
 
     Returns:
         Passes with weights [n, E], codes [n, E, r] and outputs [n, d_out], by the map's name.
     """
     outputs = [p.outputs for name in passes for p in passes[name]]
-    # Materialized, the gradient is 0 instead of None where the loss does not read the map at all.
+    # Materialized, the gradient is 0 instead of None if the loss does not read the map at all.
     gradients = iter(torch.autograd.grad(loss, outputs, materialize_grads=True))
     found: dict[str, list[Traced]] = {}
     for name in passes:
@@ -80,7 +81,7 @@ def where_read(passes: Mapping[str, Sequence[Traced]], loss: Tensor) -> dict[str
 
 
 def _is_read(gradient: Tensor) -> Tensor:
-    """Whether a gradient [..., d_out] is not 0 at a position, [...] bool; NaN is not 0 either."""
+    """Whether a gradient [..., d_out] is nonzero at each position, [...] bool; NaN is nonzero."""
     return gradient.abs().amax(-1).ne(0)  # takes a quarter of the time of ne(0).any(-1)
 
 
@@ -89,20 +90,20 @@ def _at(positions: Tensor, passed: Traced) -> Traced:
 
 
 def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
-    """Add to a pass's gradient that of a price on the weight of some experts.
+    """Add the gradient of a price on the weights of some experts to that of a pass.
 
     The price is
 
         price * mean over positions of sum_{e in columns} p_e
 
     over the positions at which the loss reads the map. If all positions counted, the routers could
-    pay where nothing is read, and leave the weights elsewhere as they are. Which positions are read
-    is known during the backward pass only, from the gradient at the map's output. So hooks add the
-    gradient, and the loss has no such term.
+    save the price at positions that nothing reads, and leave the weights elsewhere as they are.
+    Which positions are read is known only during the backward pass, from the gradient at the map's
+    output. So hooks add the gradient, and the loss has no such term.
     """
     charged = passed.weights.new_zeros(passed.weights.shape[-1])
     charged[list(columns)] = price
-    # Holds gradients only: a hook that held a tensor of the graph would keep the graph alive.
+    # The hooks hold gradients only: holding a tensor of the graph would keep the graph alive.
     seen: list[Tensor] = []
 
     def see(gradient: Tensor) -> None:
@@ -110,17 +111,17 @@ def charge(passed: Traced, columns: Sequence[int], price: float) -> None:
 
     def pay(gradient: Tensor) -> Tensor:
         positions = seen.pop()
-        # The derivative by p_e is price / n at each of the n positions that are read.
+        # The derivative with respect to p_e is price / n at each of the n positions that are read.
         share = charged / positions.sum().clamp(min=1)  # [E]
         return gradient + positions.unsqueeze(-1) * share
 
-    # A backward pass comes to the outputs first: when `pay` is called, `see` has been.
+    # The backward pass reaches the outputs first, so `see` is called before `pay`.
     passed.outputs.register_hook(see)
     passed.weights.register_hook(pay)
 
 
 def squared_norm(expert: Expert) -> Tensor:
-    """||B A||_F^2 = tr((B^T B)(A A^T)), from two r x r matrices instead of one of d_out x d_in."""
+    """||B A||_F^2 = tr((B^T B)(A A^T)), from two r x r matrices instead of a d_out x d_in one."""
     columns = expert.b.T @ expert.b  # [r, r]
     rows = expert.a @ expert.a.T
     return (columns * rows).sum()  # the trace of a product of symmetric matrices
@@ -129,21 +130,21 @@ def squared_norm(expert: Expert) -> Tensor:
 def total_variation(before: Tensor, after: Tensor) -> float:
     """Total variation distance of two distributions over experts [E], in [0, 1]."""
     moved = (before.double() - after.double()).abs()
-    # Half of it: what leaves one expert arrives at another.
+    # Halved, because what leaves one expert arrives at another.
     return float(moved.sum() / 2)
 
 
 def needed(found: Flow, kappa: float, load: float) -> tuple[int, ...]:
     """Columns of the experts that stay.
 
-    An expert goes only if its mass is under kappa / E *and* its load under `load`. Mass alone
-    deceives: a router that is charged for an expert can give it little weight and let ||B A|| grow
-    instead, until the expert carries the fit at a weight near zero. All new experts may go, but
-    never all experts: weights that sum to 1 are not all below the limit.
+    An expert is dropped only if its mass is below kappa / E *and* its load below `load`. Mass alone
+    is misleading: a router that is charged for an expert can give it little weight and let ||B A||
+    grow instead, until the expert carries the fit at a weight near zero. All new experts may be
+    dropped, but never all experts, since weights that sum to 1 are not all below the limit.
 
     Args:
-        kappa: share of the uniform weight 1 / E.
-        load: share of the summed load.
+        kappa: fraction of the uniform weight 1 / E.
+        load: fraction of the summed load.
     """
     limit = kappa / len(found.mass)
     stay = (found.mass >= limit) | (found.load >= load)
@@ -151,17 +152,17 @@ def needed(found: Flow, kappa: float, load: float) -> tuple[int, ...]:
 
 
 def basis(matrices: Sequence[Tensor]) -> Tensor:
-    """Orthonormal columns [d, k] float64 that span what the columns of matrices [d, r] span."""
+    """Orthonormal columns [d, k] float64 with the span of the columns of matrices [d, r]."""
     joined = torch.cat([m.detach().double() for m in matrices], dim=1)
     left, values, _ = torch.linalg.svd(joined, full_matrices=False)
-    # Of matrices of zeros nothing is above the smallest number, and so they span nothing.
+    # With the clamp, matrices of zeros span nothing: no value exceeds the limit below.
     largest = values.max().clamp(min=torch.finfo(torch.float64).tiny)
     # A smaller value may be no more than the rounding of float32 experts.
     return left[:, values > 1e-6 * largest]
 
 
 def without_span(matrix: Tensor, columns: Tensor) -> Tensor:
-    """A matrix M [d, n] without its part in the span of `columns` Q: (I - Q Q^T) M, in M's type.
+    """A matrix M [d, n] without its part in the span of `columns` Q: (I - Q Q^T) M, in M's dtype.
 
     Args:
         columns: orthonormal, [d, k] float64.

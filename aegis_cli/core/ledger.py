@@ -1,4 +1,4 @@
-"""Per-step record of a training: inner products per parameter group and W2^2 per layer."""
+"""Per-step record of a training run: inner products per parameter group and W2^2 per layer."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class GroupSummary:
     """One parameter group over all steps.
 
     Attributes:
-        energy_shed_mean, energy_shed_max: share of the gradient's energy that the projection
-            removes, cos^2 in a conflict and else 0.
-        conflict: share of the steps in which the two gradients conflict.
+        energy_shed_mean, energy_shed_max: fraction of the gradient's energy that the projection
+            removes: cos^2 in a conflict, otherwise 0.
+        conflict: fraction of the steps in which the two gradients conflict.
     """
 
     name: str
@@ -34,8 +34,8 @@ class GroupSummary:
 class Ledger:
     """Rows of (step, tt [G], ta [G], aa [G], w2 [L]), kept in float64 in the order of the steps.
 
-    They lie in buffers that double when they are full: a tensor for each row would take ten times
-    the memory of its numbers, and a long run's ledger seconds to put together.
+    They are kept in buffers that double when full: one tensor per row would take ten times the
+    memory of its numbers, and the ledger of a long run would take seconds to assemble.
     """
 
     def __init__(self, groups: Sequence[str], layers: Sequence[str]) -> None:
@@ -93,7 +93,7 @@ class Ledger:
         """`step` [S] int64; `tt`, `ta`, `aa` [S, G] and `w2` [S, L] float64.
 
         Args:
-            after: leave out the rows of this step and of those before it.
+            after: leave out the rows up to and including this step.
         """
         first = 0 if after is None else self._rows_until(after)
         rows = slice(first, self._count)
@@ -108,8 +108,8 @@ class Ledger:
         return {name: len(self.layers if name == "w2" else self.groups) for name in COLUMNS}
 
     def _rows_until(self, step: int) -> int:
-        """How many rows are of `step` and of those before it."""
-        # The steps increase, so that a binary search finds the place.
+        """How many rows there are up to and including `step`."""
+        # The steps increase, so a binary search finds the place.
         return int(torch.searchsorted(self._steps[: self._count], step, right=True))
 
     def _grow(self) -> None:
@@ -139,7 +139,7 @@ def energy_shed_mean(tensors: Mapping[str, Tensor]) -> float:
 
 
 def conflict_share(tensors: Mapping[str, Tensor]) -> float:
-    """Share of all (step, group) pairs whose gradients conflict; 0 for a run without steps."""
+    """Fraction of (step, group) pairs whose gradients conflict; 0 for a run without steps."""
     return _mean(projection.conflict(tensors["ta"]))
 
 

@@ -1,9 +1,9 @@
 """Mean and variance of hidden states over valid tokens.
 
-masked_moments  of one batch, in float64, to be merged: an anchor is measured so
-batch_moments   of one batch, with its graph: a penalty is made of these
+masked_moments  of one batch, in float64, to be merged; for measuring an anchor
+batch_moments   of one batch, with its graph; for penalties
 padded_moments  the same by masking, without a GPU sync
-joint_moments   `padded_moments` of every layer, by few kernels
+joint_moments   `padded_moments` of every layer, in few kernels
 shared_moments  of a batch that several processes share
 """
 
@@ -38,7 +38,7 @@ class Moments:
     var: Tensor
 
     def to(self, like: Tensor | torch.device) -> Moments:
-        """The same on a device, or on a tensor's device and in its dtype."""
+        """The same moments on a device, or on the device and in the dtype of a tensor."""
         return Moments(self.count, self.mean.to(like), self.var.to(like))
 
 
@@ -57,13 +57,13 @@ def masked_moments(h: Tensor, mask: Tensor) -> Moments:
 
     Args:
         h: hidden states [B, T, D], any float dtype.
-        mask: [B, T] bool, true at valid tokens; whatever stands elsewhere (even NaN) never counts.
+        mask: [B, T] bool, true at valid tokens; values elsewhere (even NaN) never count.
     """
     x = _valid_rows(h, mask)  # [n, D]
     n = len(x)
     if n == 0:
         return empty(h.shape[-1])
-    shift = x.mean(0)  # need not be exact: `rest` corrects what it misses
+    shift = x.mean(0)  # need not be exact: `rest` corrects its error
     x = x - shift
     rest = _sum_rows(x) / n
     var = _sum_rows(x.square_()) / n - rest.square()
@@ -86,7 +86,7 @@ def merge(a: Moments, b: Moments) -> Moments:
 
 
 def add_moments(found: Sequence[Moments], hidden: Sequence[Tensor], mask: Tensor) -> list[Moments]:
-    """The moments found so far, merged layer by layer with those of one more batch.
+    """Moments merged, layer by layer, with those of one more batch.
 
     Args:
         found: moments so far, one per layer.
@@ -103,8 +103,8 @@ def batch_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Differentiable mean [D] and population variance [D] of a batch's valid tokens, two-pass.
 
     Args:
-        h: hidden states [B, T, D]; half precision is widened to float32.
-        mask: [B, T] bool with at least one true entry (of no tokens both results are NaN).
+        h: hidden states [B, T, D]; half precision is upcast to float32.
+        mask: [B, T] bool with at least one true entry (without any, both results are NaN).
     """
     x = _valid_rows(h, mask)
     mean = x.mean(0)
@@ -115,12 +115,12 @@ def padded_moments(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """`batch_moments` by masking instead of selecting rows, which avoids a GPU sync.
 
     Args:
-        h: hidden states [B, T, D], or [n, B, T, D] of n layers, whose results are [n, D].
+        h: hidden states [B, T, D], or [n, B, T, D] of n layers, with results [n, D].
         mask: [B, T] bool.
     """
     x, valid = _all_rows(h, mask)
     count = valid.sum()
-    # Filled, not multiplied by 0: what stands at padding may be NaN.
+    # Filled, not multiplied by 0: values at padding may be NaN.
     mean = x.masked_fill(~valid, 0).sum(-2) / count
     deviations = (x - mean.unsqueeze(-2)).masked_fill(~valid, 0)
     return mean, deviations.square().sum(-2) / count
@@ -146,23 +146,23 @@ def shared_moments(
     total: Callable[[Tensor], Tensor],
     reads: bool = True,
 ) -> list[tuple[Tensor, Tensor]]:
-    """Each layer's mean [D] and variance [D] of a batch that several processes share.
+    """Each layer's mean [D] and variance [D] over a batch that several processes share.
 
-    Mean and variance are those of all shares. Their gradients reach this process's tokens alone, so
-    that the processes' gradients add up to that of the batch.
+    Mean and variance are those of all shares. Their gradients reach only the tokens of this
+    process, so the gradients of all processes add up to that of the batch.
 
     Args:
         hidden: each layer's output, L tensors [B, T, D].
         mask: [B, T] bool.
-        total: a tensor -> its sum over the processes.
+        total: sums a tensor over the processes.
         reads: whether the number of valid tokens may be read, which forces a GPU sync.
     """
     rows, masks, here = _selected(hidden, mask) if reads else _zeroed(hidden, mask)
     count = total(here)
-    # Both sums are of all layers at once, since each call of `total` is a message.
+    # Each sum covers all layers at once, because each call of `total` is a message.
     means = total(torch.cat([x.sum(1) for x in rows])) / count  # [L, D]
     squares = []
-    # The centre's gradient is left out: over all tokens it is 0, but not over a share of them.
+    # The centre is detached: its gradient is 0 over all tokens, but not over a share of them.
     centres = means.detach().split([len(x) for x in rows])
     for x, centre, valid in zip(rows, centres, masks, strict=True):
         deviations = x - centre.unsqueeze(1)
@@ -173,18 +173,18 @@ def shared_moments(
     return list(zip(means, variances, strict=True))
 
 
-# The rows of some layers [n, rows, D], which of them are valid [rows, 1] (None: all), and how many.
+# The rows of some layers [n, rows, D], which rows are valid [rows, 1] (None: all), and how many.
 _LayerRows = tuple[list[Tensor], Sequence[Tensor | None], Tensor]
 
 
 def _selected(hidden: Sequence[Tensor], mask: Tensor) -> _LayerRows:
-    """The valid rows alone, of one layer after the other."""
+    """Only the valid rows, layer by layer."""
     rows = [_valid_rows(h, mask).unsqueeze(0) for h in hidden]
     return rows, [None] * len(rows), rows[0].new_tensor(rows[0].shape[1])
 
 
 def _zeroed(hidden: Sequence[Tensor], mask: Tensor) -> _LayerRows:
-    """All rows, with zeros in the place of those that are not valid; nothing is read."""
+    """All rows, with invalid ones set to zero; nothing is read from the device."""
     rows, valids = list[Tensor](), list[Tensor]()
     for layers in _together(hidden):
         x, valid = _all_rows(layers, mask)
@@ -194,7 +194,7 @@ def _zeroed(hidden: Sequence[Tensor], mask: Tensor) -> _LayerRows:
 
 
 def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
-    """Layers that follow each other, stacked [n, B, T, D] while their shapes are alike.
+    """Consecutive layers, stacked [n, B, T, D] as long as their shapes are equal.
 
     A stack has at most `stacking.MOST` entries: larger layers keep a GPU busy by themselves.
     """
@@ -209,7 +209,7 @@ def _together(hidden: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _kind(h: Tensor) -> tuple[torch.Size, torch.dtype, torch.device]:
-    """What hidden states have in common that can be stacked; a model may lie on several GPUs."""
+    """What hidden states must have in common to be stacked; a model may span several GPUs."""
     return h.shape, h.dtype, h.device
 
 
@@ -225,7 +225,7 @@ def _all_rows(h: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 def _valid_rows(h: Tensor, mask: Tensor) -> Tensor:
     """The valid rows [n, D] of hidden states [B, T, D], in float32, or float64 if h is."""
-    # The backward pass of index_select takes half the time of that of h[mask] on a CPU.
+    # On a CPU, the backward pass of index_select takes half as long as that of h[mask].
     index = mask.flatten().nonzero().squeeze(1).to(h.device)
     return widened(h.flatten(0, 1).index_select(0, index))
 

@@ -1,9 +1,9 @@
 """The part of a parameter's update that changes outputs on VQA, and the update without it.
 
-For inputs x in the span of U, (W + D) x = W x whenever D U = 0, whatever the optimizer did to get
-D. So the *applied* update is projected, weight decay included: D <- D - D A with A = U U^T. A soft
-threshold has A = C (C + s)^-1 instead, with C in shares of its trace. What it leaves is the X that
-minimises |X - D|^2 + E|X x|^2 / s: a proximal step, as that of core/curvature.py is.
+For inputs x in the span of U, (W + D) x = W x whenever D U = 0, however the optimizer arrived at D.
+So the *applied* update is projected, weight decay included: D <- D - D A with A = U U^T. A soft
+threshold has A = C (C + s)^-1 instead, with C as fractions of its trace. It leaves the X that
+minimises |X - D|^2 + E|X x|^2 / s, so it is a proximal step, like that of core/curvature.py.
 """
 
 from __future__ import annotations
@@ -23,36 +23,37 @@ from aegis_cli.core.numerics import ratio, wide_type
 from aegis_cli.core.pairs import Pair, copied, minus
 from aegis_cli.core.spectrum import Spectrum, rank
 
-Remembered = tuple[Tensor | None, ...]  # what a protection keeps of a map's values
+Remembered = tuple[Tensor | None, ...]  # what a protection remembers about a map's values
 
 
 class Protection(Protocol):
     """How the updates of one map are protected."""
 
     def removed(self, weight: Tensor, bias: Tensor | None) -> Pair:
-        """The protected part of an update of the map's weight and bias, in their shapes."""
+        """The protected part of an update to the map's weight and bias, in their shapes."""
 
     def of_rows(self, rows: slice) -> Protection:
         """The protection of these rows alone; each row is protected independently of the others."""
 
     def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
-        """What `hold` has to know of the values before an update."""
+        """What `hold` needs to know about the values before an update."""
 
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
-        """Take the protected part of their change since then out of the values, in place."""
+        """Remove the protected part of the change since `remember` from the values, in place."""
 
 
 @dataclass(frozen=True)
 class Dense:
     """Protection of a linear map or convolution: A = U f U^T + r (1 - U U^T).
 
-    A itself [d, d] is never made. Of n maps that are stacked (core/stacking.py) every tensor has a
-    first dimension n more.
+    A itself [d, d] is never made. For n stacked maps (core/stacking.py) every tensor has a leading
+    dimension n.
 
     Attributes:
-        basis: U [d, k], orthonormal columns; d counts the bias's 1 if there is one.
-        factor: f [k], what is removed along each of them, from 0 to 1.
-        rest: r, what is removed along every other direction; of stacked maps [n, 1], or 0 of all.
+        basis: U [d, k], orthonormal columns; d includes the constant input of a bias, if any.
+        factor: f [k], the fraction removed along each of them, from 0 to 1.
+        rest: r, the fraction removed along every other direction; for stacked maps [n, 1], or 0 for
+            all.
     """
 
     basis: Tensor
@@ -65,7 +66,7 @@ class Dense:
         along = self._along(weight, bias) * above_rest
         protected, shifted = self._back(along, weight, bias)
         if isinstance(self.rest, Tensor) or self.rest:
-            # Of stacked maps [n, 1, 1], against their weights [n, o, d].
+            # For stacked maps [n, 1, 1], to match their weights [n, o, d].
             of_weight = self.rest[..., None] if isinstance(self.rest, Tensor) else self.rest
             protected = protected + of_weight * weight
             if bias is not None and shifted is not None:
@@ -73,7 +74,7 @@ class Dense:
         return protected, shifted
 
     def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
-        """What `hold` takes out of the values, in their shapes."""
+        """What `hold` removes from the values, in their shapes."""
         return self._back(self._lost(weight, bias, before), weight, bias)
 
     def of_rows(self, rows: slice) -> Dense:
@@ -85,13 +86,13 @@ class Dense:
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
         """See `Protection.hold`; directions that were never resolved are left as they are.
 
-        To know what changed along them would take a full copy of the old values.
+        Finding what changed along them would take a full copy of the old values.
         """
         removed = self._lost(weight, bias, before)  # [o, k]
         width = weight.flatten(1).shape[1]
         directions = self.basis[:width].T  # [k, d]
         if weight.is_contiguous():
-            # In one product, without a copy [o, d] of what is subtracted.
+            # A fused product, without an [o, d] copy of what is subtracted.
             weight.view(len(weight), -1).addmm_(removed, directions, alpha=-1)
         else:
             weight.sub_((removed @ directions).view(weight.shape))
@@ -105,7 +106,7 @@ class Dense:
         along = flat @ self.basis[..., :width, :]  # [o, k]
         if bias is None:
             return along
-        # The bias is the weight of an input that is always 1, whose row of U is the last.
+        # The bias is the weight of an input that is always 1; its row of U is the last.
         if along.ndim == 2:
             return along.addr(bias, self.basis[width])
         return along.addcmul(bias[..., None], self.basis[..., width:, :])
@@ -117,7 +118,7 @@ class Dense:
         return (self._along(weight, bias) - known) * self.factor[..., None, :]
 
     def _back(self, along: Tensor, weight: Tensor, bias: Tensor | None) -> Pair:
-        """Coordinates [o, k] as a weight and a bias, in the shapes of these."""
+        """Coordinates [o, k] as a weight and a bias, in the shapes of those given."""
         found = along @ self.basis.mT  # [o, d]
         if bias is None:
             return found.reshape(weight.shape), None
@@ -129,7 +130,7 @@ class Elementwise:
     """Protection of a normalisation, channel by channel.
 
     Attributes:
-        inside: [D, m, m], A of each channel's (scale, shift) for m = 2, or scale for m = 1; of n
+        inside: [D, m, m], A of each channel's (scale, shift) for m = 2, or scale for m = 1; for n
             stacked normalisations [n, D, m, m].
     """
 
@@ -142,7 +143,7 @@ class Elementwise:
         return found[..., 0], None if bias is None else found[..., 1]
 
     def changed(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> Pair:
-        """What `hold` takes out of the values, in their shapes."""
+        """What `hold` removes from the values, in their shapes."""
         old_weight, old_bias = before
         assert old_weight is not None
         return self.removed(*minus((weight, bias), (old_weight, old_bias)))
@@ -165,9 +166,9 @@ class TableRows:
     """Protection of a table: no row that VQA reads may change.
 
     Attributes:
-        used: which rows VQA reads, [N] bool; for a lone row [1], which stands for all of the
+        used: which rows VQA reads, [N] bool; [1] for a lone row, where it stands for the whole
             weight, whatever its shape.
-        scores: protection of the head that a table is tied to; it holds for the other rows.
+        scores: protection of the head that the table is tied to; it applies to the other rows.
     """
 
     used: Tensor
@@ -178,12 +179,12 @@ class TableRows:
         read = (weight * used).view_as(weight)
         if self.scores is None:
             return read, bias
-        # Rows that are read are held already; the head protects what is left.
+        # Rows that are read are held already; the head protects the rest.
         scored, _ = self.scores.removed(weight - read, None)
         return read + scored, bias
 
     def of_rows(self, rows: slice) -> TableRows:
-        # A lone row's flag stands for all of it, however it is cut.
+        # The flag of a lone row stands for all of it, however it is sliced.
         return self if len(self.used) == 1 else TableRows(self.used[rows], self.scores)
 
     def remember(self, weight: Tensor, bias: Tensor | None) -> Remembered:
@@ -194,24 +195,24 @@ class TableRows:
     def hold(self, weight: Tensor, bias: Tensor | None, before: Remembered) -> None:
         read, *along = before
         assert read is not None
-        # Copied back, not subtracted: these rows stay bit for bit what they were.
+        # Copied back, not subtracted, so that these rows stay bit for bit the same.
         if len(self.used) > 1:
             weight.index_copy_(0, self._places, read)
         elif len(self._places):
             weight.copy_(read)
         if self.scores is not None:
-            # Rows that are read have not changed any more; the head protects the others.
+            # The rows that are read are unchanged again; the head protects the others.
             self.scores.hold(weight, None, tuple(along))
 
     def _read(self, weight: Tensor) -> Tensor:
-        """A copy of the rows that VQA reads; of a lone row, its whole weight if it is read."""
+        """The rows that VQA reads; for a lone row, its whole weight if it is read."""
         if len(self.used) == 1:
             return weight if len(self._places) else weight.flatten()[:0]
         return weight.index_select(0, self._places)
 
     @cached_property
     def _places(self) -> Tensor:
-        """Indices [n] of the rows that VQA reads; cached, since finding them forces a GPU sync."""
+        """Indices [n] of the rows that VQA reads; cached, as finding them forces a GPU sync."""
         return self.used.nonzero().squeeze(1)
 
 
@@ -220,9 +221,9 @@ class Strength:
     """How much is protected.
 
     Attributes:
-        energy: share of the input energy whose leading directions are protected, in (0, 1].
+        energy: fraction of the input energy whose leading directions are protected, in (0, 1].
         soft: if above 0, every stored direction is protected instead, by c / (c + soft), where c is
-            its share of the energy.
+            its fraction of the energy.
     """
 
     energy: float = 1.0
@@ -238,12 +239,12 @@ def protect(
         read: spectrum of the map's inputs on VQA. A table has no directions to weigh: every row
             that was read is protected.
         strength: how much is protected.
-        like: gives dtype and device of the parameters; a narrower dtype than float32 is protected
+        like: gives dtype and device of the parameters; a dtype narrower than float32 is protected
             in float32.
         scores: spectrum of the head's inputs, for a table that is tied to a head.
 
     Raises:
-        AegisError: a spectrum holds too few eigenvectors for that share.
+        AegisError: a spectrum holds too few eigenvectors for that fraction of the energy.
     """
     like = like.new_empty(0, dtype=wide_type(like.dtype))
     if read.kind == "rows":
@@ -257,15 +258,15 @@ def protect(
 
 
 def _dense(spectrum: Spectrum, strength: Strength, like: Tensor) -> Dense:
-    """f is 1 (or soft) along what is protected; what was never resolved is one scalar."""
+    """f is 1 (or soft) along protected directions; unresolved ones share one scalar."""
     assert spectrum.vectors is not None
     stored = spectrum.vectors.shape[1]
     if strength.soft > 0:
-        # Shares are of the whole energy, also where only the leading directions are stored.
+        # Fractions of the total energy, even if only the leading directions are stored.
         energy = spectrum.values.sum()
         factor = _soft(spectrum.values[:stored], energy, strength.soft)
         rest = float(_soft(spectrum.rest, energy, strength.soft))
-        # If device and dtype match already, `to` copies nothing, and U is shared with the anchor.
+        # If device and dtype match, `to` copies nothing, and U is shared with the anchor.
         return Dense(spectrum.vectors.to(like), factor.to(like), rest)
     count = rank(spectrum.values, strength.energy)
     if count > stored and not spectrum.whole:
@@ -283,7 +284,7 @@ def _dense(spectrum: Spectrum, strength: Strength, like: Tensor) -> Dense:
 
 
 def _channels(read: Spectrum, strength: Strength) -> Tensor:
-    """U f U^T of each channel [D, m, m]; the share of the energy is that over all channels."""
+    """U f U^T of each channel [D, m, m]; energy fractions are taken over all channels."""
     assert read.vectors is not None
     if strength.soft > 0:
         factor = _soft(read.values, read.values.sum(), strength.soft)
@@ -295,26 +296,26 @@ def _channels(read: Spectrum, strength: Strength) -> Tensor:
 
 
 def _soft(values: Tensor, energy: Tensor, soft: float) -> Tensor:
-    """c / (c + soft) along each direction, c being its share of the energy."""
+    """c / (c + soft) along each direction, where c is its fraction of the energy."""
     shares = ratio(values, energy)
     return shares / (shares + soft)
 
 
 def _leading(values: Tensor, energy: float) -> Tensor:
-    """1 at the leading directions that hold `energy`, 0 elsewhere; equal values get the same."""
+    """1 at the leading directions that hold `energy`, 0 elsewhere; ties are treated alike."""
     count = rank(values, energy)
     if count == 0:
         return torch.zeros_like(values)
-    # By value, not by place, which would part values that are equal.
+    # By value, not by index, which would separate equal values.
     last = values.flatten().sort(descending=True).values[count - 1]
     return (values >= last).to(values.dtype)
 
 
 def stacked(found: Sequence[Protection]) -> Protection:
-    """The protection of several maps, or normalisations, of one shape; a single one stays as it is.
+    """The protection of several maps, or normalisations, of one shape; a single one is unchanged.
 
     Raises:
-        TypeError: tables; each has another set of rows that are read.
+        TypeError: tables, because each has a different set of rows that are read.
     """
     if len(found) == 1:
         return found[0]

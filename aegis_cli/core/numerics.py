@@ -7,8 +7,8 @@ from torch import Tensor
 
 
 def ratio(x: Tensor, y: Tensor) -> Tensor:
-    """x / y, and 0 where y is exactly 0, whatever x is."""
-    # Filled twice: inside, so that no backward pass meets x / 0; outside, for the result.
+    """x / y, or 0 where y is exactly 0, whatever x is."""
+    # Filled twice: inside, so that no backward pass sees x / 0; outside, for the result.
     zero = y == 0
     return (x / y.masked_fill(zero, 1)).masked_fill(zero, 0)
 
@@ -19,5 +19,5 @@ def wide_type(dtype: torch.dtype) -> torch.dtype:
 
 
 def widened(x: Tensor) -> Tensor:
-    """The tensor in float32, or in float64 if it is; itself where that is its type already."""
+    """The tensor upcast to float32; a float32 or float64 tensor is returned as it is."""
     return x.to(wide_type(x.dtype))

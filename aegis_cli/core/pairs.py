@@ -1,4 +1,4 @@
-"""A map's weight and bias as one value, and what is computed of two of them."""
+"""A map's weight and bias as one value, and operations on such pairs."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Pair = tuple[Tensor, Tensor | None]  # a map's weight [out, ...] and bias [out]
 
 
 def present(pair: Pair) -> Sequence[Tensor]:
-    """The weight, and the bias where there is one."""
+    """The weight, and the bias if there is one."""
     weight, bias = pair
     return (weight,) if bias is None else (weight, bias)
 
 
 def copied(pair: Pair) -> Pair:
-    """A copy of the values, which later changes of the parameters do not reach."""
+    """A copy of the values, unaffected by later changes to the parameters."""
     weight, bias = pair
     copied_bias = None if bias is None else bias.detach().clone()
     return weight.detach().clone(), copied_bias
 
 
 def copied_small(pair: Pair) -> Pair:
-    """A copy; in bfloat16 if that loses nothing, as for weights that were stored in it."""
+    """A copy; in bfloat16 if that is lossless, as for weights that were stored in it."""
     weight, bias = pair
     return _small(weight), None if bias is None else _small(bias)
 
@@ -46,7 +46,7 @@ def minus(a: Pair, b: Pair) -> Pair:
 
 
 def _difference(a: Tensor, b: Tensor) -> Tensor:
-    # In half precision the difference itself would be rounded. b is widened by type promotion.
+    # In half precision the difference itself would be rounded. b is upcast by type promotion.
     return widened(a) - b
 
 
@@ -58,7 +58,7 @@ def matrix(pair: Pair) -> Tensor:
 
 
 def from_matrix(flat: Tensor, pair: Pair) -> Pair:
-    """A matrix [o, d] as a weight and a bias, in the shapes, type and device of the pair."""
+    """A matrix [o, d] as a weight and a bias, in the shapes, dtype and device of the pair."""
     weight, bias = pair
     width = weight[0].numel()
     flat = flat.to(weight)

@@ -1,9 +1,8 @@
 """Projection of a group's task gradient g against its anchor gradient a, by three inner products.
 
 Two gradients give three inner products tt, ta and aa (t and a stand for task and anchor), these
-give two weights, and the weights give one gradient. The inner products add over parameters and
-ranks, so sharded training needs one all-reduce of three numbers per group, and nothing else from
-this file.
+give two weights, and the weights give one gradient. The inner products add up over parameters and
+ranks, so sharded training needs only one all-reduce of three numbers per group.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from aegis_cli.core.numerics import ratio
 Gradients = Sequence[Tensor | None]
 # (tt, ta, aa) [G] -> weights (wg, wa) [G] of the task and the anchor gradient
 Combine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-# How many entries are widened at a time. On a CPU they stay in a core's cache; on a GPU the copies
-# take 0.4 GB, and the kernels remain few.
+# How many entries are upcast at a time. On a CPU they stay in a core's cache; on a GPU the copies
+# take 0.4 GB and few kernels are launched.
 _BLOCK, _GPU_BLOCK = 1 << 16, 1 << 24
 
 
@@ -34,7 +33,7 @@ def inner(
     gradient of 1e-25 is 0, and the projection would silently vanish with it.
 
     Args:
-        device: where the result is to be; None: where the gradients are.
+        device: device of the result; None: that of the gradients.
     """
     device = device or _device((*gs, *as_))
     if device is not None and device.type != "cpu":
@@ -54,7 +53,7 @@ def inner(
 def _inner_by_few_kernels(
     gs: Gradients, as_: Gradients, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same on a GPU, which takes longer to start a kernel than to run it on one bias."""
+    """The same on a GPU, where launching a kernel takes longer than running it on one bias."""
     ta = torch.zeros((), dtype=torch.float64, device=device)
     for u, v in _joined(gs, as_):
         ta = ta + u.double().dot(v.double()).to(device)
@@ -67,12 +66,12 @@ def _energy(gradients: Gradients, device: torch.device) -> Tensor:
     if not there:
         return torch.zeros((), dtype=torch.float64, device=device)
     norms = torch._foreach_norm(there, dtype=torch.float64)
-    # In a user's own loop, the layers may be on several GPUs.
+    # In a user's own loop, the layers may be spread over several GPUs.
     return torch.stack([norm.to(device) for norm in norms]).square().sum()
 
 
 def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
-    """The entries of all pairs, small tensors put together, in blocks [n] of bounded size."""
+    """The entries of all pairs in blocks [n] of bounded size, with small tensors joined."""
     waiting, size = list[tuple[Tensor, Tensor]](), 0
     for g, a in zip(gs, as_, strict=True):
         if g is None or a is None:
@@ -89,7 +88,7 @@ def _joined(gs: Gradients, as_: Gradients) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def _concatenated(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Pairs of blocks as one; a single one is not copied."""
+    """Pairs of blocks joined into one; a single one is not copied."""
     if len(pairs) == 1:
         return pairs[0]
     left, right = zip(*pairs, strict=True)
@@ -121,13 +120,13 @@ def _blocks(x: Tensor | None) -> Sequence[Tensor]:
 
 
 def _device(tensors: Iterable[Tensor | None]) -> torch.device | None:
-    """The device of the first tensor that is there."""
+    """The device of the first tensor that is not None."""
     return next((x.device for x in tensors if x is not None), None)
 
 
 def gram(groups: Sequence[tuple[Gradients, Gradients]]) -> tuple[Tensor, Tensor, Tensor]:
     """The inner products of every group, stacked: tt, ta, aa [G]."""
-    # A group without gradients has no device of its own: the first gradient of any group tells.
+    # A group without gradients has no device: take that of the first gradient of any group.
     device = _device(x for gs, as_ in groups for x in (*gs, *as_))
     rows = [torch.stack(inner(gs, as_, device)) for gs, as_ in groups]
     tt, ta, aa = torch.stack(rows).unbind(1)  # of [G, 3]
@@ -142,9 +141,9 @@ def naive(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
 def aegis(tt: Tensor, ta: Tensor, aa: Tensor) -> tuple[Tensor, Tensor]:
     """Gram-Schmidt against the anchor gradient where the two conflict: weights (1, relu(-ta) / aa).
 
-    The result is orthogonal to a where ta < 0, and the task gradient itself elsewhere. The
-    denominator has no epsilon: with one, the result would not be orthogonal. Where aa = 0 there is
-    no projection.
+    If ta < 0, the result is orthogonal to a; otherwise it is the task gradient itself. The
+    denominator has no epsilon: with one, the result would not be orthogonal. If aa = 0, there is no
+    projection.
     """
     # With d = ta < 0, g - (d / <a, a>) a is g + (-d / <a, a>) a; relu leaves out d > 0.
     return torch.ones_like(tt), ratio(torch.relu(-ta), aa)
@@ -156,9 +155,9 @@ def apply(
 ) -> list[Tensor | None]:
     """g <- wg g + wa a for one group, in place where g exists; returns the group's gradients.
 
-    With weights (1, 0) nothing changes, bit for bit. Where g is None and a is not, the result is a
-    new tensor: the projection moves parameters that the task does not. Weights that are tensors []
-    are not read (no GPU sync), so they do not take the shortcuts at (1, 0).
+    With weights (1, 0) nothing changes, bit for bit. If g is None and a is not, the result is a new
+    tensor: the projection moves parameters that the task does not. Weights that are tensors [] are
+    not read (no GPU sync), so the shortcuts for (1, 0) do not apply to them.
     """
     there = [g for g in gs if g is not None]
     if there and (isinstance(wg, Tensor) or wg != 1):
@@ -181,12 +180,12 @@ def apply(
 
 
 def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor) -> None:
-    """x <- x + scale y in place, for each; a scale that is a tensor [] is not read."""
+    """x <- x + scale y in place, for each pair; a scale that is a tensor [] is not read."""
     if not all(_holds(y.dtype, scale) for y in ys):
         for x, y in zip(xs, ys, strict=True):
-            x.add_(y.double() * scale)  # the product is small again when it is rounded to x's type
+            x.add_(y.double() * scale)  # the product fits again when it is rounded to x's dtype
     elif isinstance(scale, Tensor):
-        # `alpha` takes numbers only, and to make one of a tensor would be to read it.
+        # `alpha` takes numbers only, and converting a tensor to one would read it.
         added = torch._foreach_mul(list(ys), _like(scale, ys[0]))
         torch._foreach_add_(list(xs), added)
     else:
@@ -194,18 +193,18 @@ def add_scaled(xs: Sequence[Tensor], ys: Sequence[Tensor], scale: float | Tensor
 
 
 def scaled(y: Tensor, scale: float | Tensor) -> Tensor:
-    """scale y, a new tensor of y's type."""
+    """scale y, a new tensor of y's dtype."""
     if _holds(y.dtype, scale):
         return y * scale
     return (y.double() * scale).to(y.dtype)
 
 
 def _holds(dtype: torch.dtype, scale: float | Tensor) -> bool:
-    """Whether a finite scale fits into a type without overflow.
+    """Whether a finite scale fits into a dtype without overflow.
 
     A tiny anchor gradient gets a huge weight, which easily overflows float16, although their
     product is no larger than the task gradient. A tensor is not read, so for float16 it counts as
-    too large. Wider types overflow only if the gradients differ by 38 orders of magnitude.
+    too large. Wider dtypes overflow only if the gradients differ by 38 orders of magnitude.
     """
     if isinstance(scale, Tensor):
         return dtype != torch.float16
@@ -218,12 +217,12 @@ def _like(scale: float | Tensor, x: Tensor) -> float | Tensor:
 
 def removed_energy(ta: Tensor, aa: Tensor) -> Tensor:
     """The energy |g|^2 - |projected g|^2 that each group loses: relu(-ta)^2 / aa."""
-    # |g|^2 - |g - (ta / aa) a|^2 = ta^2 / aa, where ta < 0.
+    # If ta < 0: |g|^2 - |g - (ta / aa) a|^2 = ta^2 / aa.
     return ratio(torch.relu(-ta).square(), aa)
 
 
 def energy_shed(tt: Tensor, ta: Tensor, aa: Tensor) -> Tensor:
-    """Share of each group's energy that the projection removes: relu(-cos)^2, in [0, 1]."""
+    """Fraction of each group's energy that the projection removes: relu(-cos)^2, in [0, 1]."""
     # ta^2 / (aa tt) is the squared cosine of g and a.
     return ratio(removed_energy(ta, aa), tt)
 

@@ -1,25 +1,26 @@
 """Routed low-rank experts beside a frozen linear map:
 
-    y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    A_e [r, d_in] drawn, B_e [d_out, r] zero
+    y = W x + s_t sum_e p_{t,e}(x) B_e A_e x,    with A_e [r, d_in] random, B_e [d_out, r] zero
 
 Each task t has one router per map: the experts that it may use, in a fixed order, a softmax p over
-these alone, and a scale s. A task computes with its own router's experts and nothing else, so what
-later tasks add changes no bit of its outputs.
+only these, and a scale s. A task computes only with the experts of its own router, so later
+additions change no bit of its outputs.
 
 Why routing is a projection. With f(x) = s sum_e p_e(x) B_e A_e x and the loss's gradient g at y,
 
     dL/dB_e = s p_e(x) g (A_e x)^T,    dL/dp_e = s <g, B_e A_e x>
 
-A small p_e scales the gradient that reaches B_e, and at p_e = 0 the expert does not learn. A router
-over frozen experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}: whatever the
-gradient g is, the descent follows only its part inside the span of the experts. Pushing p towards
-old experts thus projects a new task's gradient on what they span, and that span is never computed.
+A small p_e scales down the gradient that reaches B_e, and at p_e = 0 the expert does not learn. A
+router over frozen experts moves f by s sum_e dp_e B_e A_e x, which lies in span{B_e A_e x}:
+whatever the gradient g is, the descent follows only its part inside the span of the experts.
+Pushing p towards old experts thus projects a new task's gradient onto their span, which is never
+computed.
 
-Which logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, with r + 1 numbers
-per expert. At a map with d_in inputs that is d_in / r times less than a linear router on x, which
-would cost about as much as the experts that it saves. The code as a router's input is a choice of
-this package. `top` selects the usual linear router instead, with one gate per sequence, or a
-`constant` one, which reads nothing.
+The logits: logit_e = <u_e, A_e x> + b_e reads what the expert itself reads, with r + 1 numbers per
+expert. At a map with d_in inputs that is d_in / r times less than a linear router on x, which would
+cost about as much as the experts that it saves. Using the codes A_e x as the router's input is our
+choice. `top` selects the usual linear router instead, with one gate per sequence, or a `constant`
+one, which reads nothing.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 class Traced(NamedTuple):
-    """One pass of a map over positions [...].
+    """One forward pass of a map over positions [...].
 
     Attributes:
         weights: p [..., E].
@@ -50,11 +51,11 @@ class Traced(NamedTuple):
 
 
 class Expert(nn.Module):
-    """A low-rank map B A, at first zero.
+    """A low-rank map B A, initially zero.
 
     Attributes:
         owner: number of the task that added it, or took it over.
-        frozen: whether no later task trains it.
+        frozen: True if no later task trains it.
     """
 
     def __init__(self, base: nn.Linear, rank: int, owner: int) -> None:
@@ -67,7 +68,7 @@ class Expert(nn.Module):
     def draw(self, generator: torch.Generator) -> None:
         """Draw A uniformly in +-1/sqrt(d_in), as LoRA does (arXiv 2106.09685).
 
-        The numbers are drawn on the CPU, so that they are the same whatever the device.
+        The numbers are drawn on the CPU, so that they are the same on every device.
         """
         bound = 1 / math.sqrt(self.a.shape[1])
         self.a.copy_(torch.empty(self.a.shape).uniform_(-bound, bound, generator=generator))
@@ -77,9 +78,9 @@ class Router(nn.Module):
     """Softmax weights over the experts of one task at one map, and the scale of their sum.
 
     Its weights start equal, unless `top` is set: the top k of equal logits would always be the same
-    experts, so these logits are drawn. A router with `top` reads the mean of a sequence and gives
-    all its positions the same weights; a `constant` one gives them to all sequences too. A single
-    expert has weight 1, and its router has no parameters but the scale.
+    experts, so these logits are drawn at random. A router with `top` reads the mean of a sequence
+    and gives all its positions the same weights; a `constant` one gives all sequences the same
+    weights too. A single expert has weight 1, and its router has no parameters but the scale.
     """
 
     def __init__(
@@ -106,17 +107,17 @@ class Router(nn.Module):
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
-        """Draw the parameters behind the logits, if there is a `top` to choose."""
+        """Draw the parameters behind the logits at random, if `top` is set."""
         if self.top is None or len(self.experts) == 1:
             return
         drawn = self.bias if self.constant else self.read
         assert drawn is not None
         width = 1 if self.constant else drawn.shape[1]
-        # A sum over `width` inputs has a spread of 1 then, whatever the width.
+        # Scaled so that a sum over `width` inputs has standard deviation 1, whatever the width.
         drawn.copy_(torch.randn(drawn.shape, generator=generator) / math.sqrt(width))
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
-        """Weights of the experts at each position, [..., T, E]; they sum to 1.
+        """Weights of the experts at each position [..., T, E]; they sum to 1.
 
         Args:
             x: the map's inputs, [..., T, d_in].
@@ -137,7 +138,7 @@ class Router(nn.Module):
             logits = nn.functional.linear(mean, self.read).float()  # [..., 1, E]
         chosen = logits.topk(min(self.top, logits.shape[-1]), dim=-1).indices
         outside = torch.ones_like(logits, dtype=torch.bool).scatter(-1, chosen, False)
-        # Minus infinity gives a weight of exactly 0, so that the expert does not learn.
+        # Minus infinity gives a weight of exactly 0, so the expert does not learn.
         weights = logits.masked_fill(outside, -math.inf).softmax(-1).to(codes.dtype)
         return weights.expand(codes.shape[:-1])  # [..., T, E], the same at each position
 
@@ -148,7 +149,7 @@ class Router(nn.Module):
     def restrict(self, kept: Sequence[int]) -> None:
         """Forget all experts but `kept`, a subset in the router's order.
 
-        The logits of those that stay do not change.
+        The logits of the remaining ones do not change.
         """
         rows = [self.experts.index(e) for e in kept]
         self.experts = tuple(kept)
@@ -163,7 +164,7 @@ class Router(nn.Module):
 
 
 class _Modules(nn.ModuleDict, Generic[M]):
-    """Modules of one class by name."""
+    """Modules of one class, by name."""
 
     if TYPE_CHECKING:
 
@@ -173,15 +174,15 @@ class _Modules(nn.ModuleDict, Generic[M]):
 
 
 class RoutedLinear(nn.Module):
-    """A frozen map, the experts beside it, and a router for each task that has some.
+    """A frozen map, the experts beside it, and a router for each task that uses some of them.
 
     Attributes:
         experts: by number.
         routers: by task.
-        active: number of the task whose router is used. With None, or a task that has no router
-            here, the map is bare.
-        born: how many experts were ever created, which is the next one's number.
-        trace: where passes are noted while `traced` is on.
+        active: number of the task whose router is used. With None, or a task without a router here,
+            the map is bare.
+        born: how many experts were ever created, which is the number of the next one.
+        trace: where passes are recorded inside `traced`.
     """
 
     experts: _Modules[Expert]
@@ -202,12 +203,12 @@ class RoutedLinear(nn.Module):
             return y
         experts = self.of(router.experts)
         rows = torch.cat([e.a for e in experts])  # [E*r, d_in]
-        # A router's experts have one rank, so that one product gives all their codes.
+        # All experts of a router have the same rank, so one product gives all their codes.
         joined = nn.functional.linear(x, rows)  # [..., E*r]
         codes = joined.unflatten(-1, (len(experts), -1))  # [..., E, r]
         weights = router(x, codes)  # [..., E]
-        # The scale multiplies the codes, which are smaller than y, and one product over all
-        # experts' columns takes the sum along.
+        # The scale multiplies the codes, which are smaller than y, and one product over the columns
+        # of all experts also computes the sum.
         strengths = (router.scale * weights).unsqueeze(-1)  # s p_e, [..., E, 1]
         mixed = (strengths * codes).flatten(-2)  # [..., E*r]
         columns = torch.cat([e.b for e in experts], dim=1)  # [d_out, E*r]
@@ -230,12 +231,12 @@ class RoutedLinear(nn.Module):
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Numbers of all experts, in the order in which they came; none is given twice."""
+        """Numbers of all experts, in order of creation; no number is used twice."""
         return tuple(int(n) for n in self.experts)
 
     def add_expert(self, rank: int, owner: int, generator: torch.Generator) -> int:
-        """Draw a new expert and return its number."""
-        # Numbers of deleted experts are not given again: routers and files name experts by them.
+        """Create a new expert with a random A and return its number."""
+        # Numbers of deleted experts are not reused: routers and files name experts by them.
         number = self.born
         expert = Expert(self.base, rank, owner)
         expert.draw(generator)
@@ -251,7 +252,7 @@ class RoutedLinear(nn.Module):
         top: int | None = None,
         constant: bool = False,
     ) -> Router:
-        """Draw a router of `task` over `experts`, one at least, and return it."""
+        """Create a router of `task` over `experts` (at least one) and return it."""
         rank = self.experts[str(experts[0])].a.shape[0]
         router = Router(self.base, experts, rank, top, constant)
         router.draw(generator)
@@ -259,7 +260,7 @@ class RoutedLinear(nn.Module):
         return router
 
     def restrict(self, task: int, kept: Sequence[int]) -> None:
-        """Let the task's router forget all experts but `kept`; delete experts in no router."""
+        """Let the task's router forget all experts but `kept`; delete experts without a router."""
         router = self.routers[str(task)]
         router.restrict(kept)
         if not kept:
@@ -272,17 +273,17 @@ class RoutedLinear(nn.Module):
 
     @torch.no_grad()
     def merged(self, task: int) -> nn.Linear:
-        """The map with the task's only expert in its weights; bare where the task has no router.
+        """The map with the task's only expert merged; bare if the task has no router.
 
         Raises:
-            ValueError: the router weighs several, each by what is read, as no weights do.
+            ValueError: the router has several experts, whose weights depend on the input.
         """
         router = self.router(task)
         if router is None:
             return self.base
         if len(router.experts) > 1:
             raise ValueError(f"a router over {len(router.experts)} experts")
-        (expert,) = self.of(router.experts)  # whose weight is 1
+        (expert,) = self.of(router.experts)  # its routing weight is 1
         self.base.weight.addmm_(expert.b, expert.a, alpha=float(router.scale))
         return self.base
 
@@ -307,7 +308,7 @@ class RoutedLinear(nn.Module):
     def rebuild(self, structure: Mapping[str, Any]) -> None:
         """Recreate the modules of `structure`, frozen; their tensors are still to be loaded."""
         self.experts, self.routers, self.born = _Modules(), _Modules(), structure["born"]
-        # JSON sorts its keys as text, 10 before 2; `numbers` promises the order of coming.
+        # JSON keys are sorted as text, 10 before 2; `numbers` promises the order of creation.
         for number in sorted(structure["experts"], key=int):
             said = structure["experts"][number]
             expert = Expert(self.base, said["rank"], said["owner"])
@@ -326,7 +327,7 @@ Routed = Mapping[str, RoutedLinear]
 
 
 def route(root: nn.Module, sites: Mapping[str, nn.Linear]) -> dict[str, RoutedLinear]:
-    """Put a `RoutedLinear` in the place of each linear map; the outputs do not change yet.
+    """Replace each linear map by a `RoutedLinear`; the outputs do not change yet.
 
     Args:
         sites: the maps, by their dotted names in `root`.
@@ -340,15 +341,15 @@ def route(root: nn.Module, sites: Mapping[str, nn.Linear]) -> dict[str, RoutedLi
 
 
 def merge(root: nn.Module, sites: Routed, task: int) -> None:
-    """Put a plain map in the place of each routed one, which computes what the task has there.
+    """Replace each routed map by a plain one that computes the same for the task.
 
-    The routed maps are of no use afterwards.
+    The routed maps must not be used afterwards.
 
     Args:
-        sites: by their dotted names in `root`, as `route` gave them.
+        sites: by their dotted names in `root`, as `route` returned them.
 
     Raises:
-        ValueError: as `RoutedLinear.merged`; the weights of other maps may have changed by then.
+        ValueError: as in `RoutedLinear.merged`; the weights of other maps may have changed by then.
     """
     plain = {name: site.merged(task) for name, site in sites.items()}
     for name, linear in plain.items():
@@ -357,14 +358,14 @@ def merge(root: nn.Module, sites: Routed, task: int) -> None:
 
 
 def activate(sites: Routed, task: int | None) -> None:
-    """Let every map compute for `task`; None: the bare maps."""
+    """Let every map compute for `task`; with None, the maps are bare."""
     for site in sites.values():
         site.active = task
 
 
 @contextmanager
 def traced(sites: Routed) -> Generator[dict[str, list[Traced]]]:
-    """Note the passes of each map inside the block, with their graphs."""
+    """Record the passes of each map inside the block, with their graphs."""
     found: dict[str, list[Traced]] = {name: [] for name in sites}
     for name, site in sites.items():
         site.trace = found[name]
@@ -376,7 +377,7 @@ def traced(sites: Routed) -> Generator[dict[str, list[Traced]]]:
 
 
 def named_parameters(sites: Routed) -> dict[str, nn.Parameter]:
-    """Parameters of experts, routers and scales by `{site}.{name}`, without the maps' own."""
+    """Parameters of experts, routers and scales by `{site}.{name}`, without those of the maps."""
     found = {}
     for site, routed in sites.items():
         for name, parameter in routed.named_parameters():

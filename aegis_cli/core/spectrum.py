@@ -1,6 +1,6 @@
-"""What a map's inputs span on VQA: eigenvectors of their uncentred second moment C = E[x x^T].
+"""The span of a map's inputs on VQA: eigenvectors of their uncentred second moment C = E[x x^T].
 
-Everything that maps tokens to tokens is linear in its own parameters, so one rule serves all of
+Everything that maps tokens to tokens is linear in its own parameters, so one rule covers all of
 them. A linear map with a bias reads (x, 1). A convolution reads the unfolded patch and 1. A
 normalisation's scale and shift read (x^_c, 1) in each channel c, where x^ is the normalised input.
 A table (word embeddings, positions) reads one-hot rows. A *lone row*, a parameter outside any such
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from aegis_cli.core.numerics import widened
 
-# Maps that mix their inputs; the others read each channel for itself.
+# Maps that mix their inputs; the others read each channel separately.
 DENSE = (nn.Linear, nn.Conv2d, nn.Conv3d)
 _BLOCK = 4096  # rows multiplied in float32 before the product is added in float64
 
@@ -26,12 +26,12 @@ class Spectrum:
     """Eigenvalues and leading eigenvectors of one map's inputs.
 
     Attributes:
-        values: energy along each direction, float64. Dense maps: [d], falling. Elementwise: [D, m],
-            m = 2 (scale and shift) or 1 (scale alone). Tables: [N], 1 where a row is read.
+        values: energy along each direction, float64. Dense maps: [d], descending. Elementwise:
+            [D, m], m = 2 (scale and shift) or 1 (scale alone). Tables: [N], 1 where a row is read.
         vectors: orthonormal columns. Dense: [d, k], k <= d. Elementwise: [D, m, m]. Tables: None
             (one-hot).
-        whole: whether every value is known. Otherwise those without an eigenvector share evenly
-            what energy is left: they are one scalar.
+        whole: whether every value is known. If not, those without an eigenvector share the
+            remaining energy evenly: they are one scalar.
     """
 
     values: Tensor
@@ -47,12 +47,12 @@ class Spectrum:
 
     @property
     def rest(self) -> Tensor:
-        """The energy along each direction that was never resolved, [] float64; 0 if all were."""
+        """The energy along each unresolved direction, [] float64; 0 if all were resolved."""
         if self.whole or self.vectors is None:
             return self.values.new_zeros(())
         if self.vectors.shape[1] == len(self.values):
             return self.values.new_zeros(())
-        return self.values[-1]  # those without an eigenvector come last, and are equal
+        return self.values[-1]  # values without an eigenvector come last and are equal
 
 
 def lone_row() -> Spectrum:
@@ -61,10 +61,10 @@ def lone_row() -> Spectrum:
 
 
 def with_rest(found: Tensor, vectors: Tensor, rest: Tensor) -> Spectrum:
-    """The spectrum of a dense map of which only leading directions were resolved.
+    """The spectrum of a dense map for which only the leading directions were resolved.
 
     Args:
-        found: energy along each of them [k], float64, falling.
+        found: energy along each of them [k], float64, descending.
         vectors: their eigenvectors [d, k].
         rest: energy along each other direction, [] or [1] float64.
     """
@@ -78,8 +78,8 @@ def second_moment(rows: Tensor) -> Tensor:
     """Sum over rows [n, d] of x x^T: [d, d] float64. The rows of a map with a bias end with a 1.
 
     C is uncentred by definition, and its diagonal is a sum of squares, so nothing cancels. Rows
-    narrower than float32 are widened first, also under autocast: eight bits would hide the smaller
-    directions. Some processors' products are not symmetric bit by bit, so the lower triangle is
+    narrower than float32 are upcast first, even under autocast: eight bits would hide the smaller
+    directions. On some processors the products are not exactly symmetric, so the lower triangle is
     mirrored.
     """
     x = widened(rows)
@@ -112,10 +112,10 @@ def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
     """Eigenvalues and leading eigenvectors of a second moment [d, d] or [D, m, m].
 
     Args:
-        energy: share of the eigenvalues' sum that the kept eigenvectors of [d, d] hold.
+        energy: fraction of the sum of eigenvalues that the kept eigenvectors of [d, d] hold.
     """
     rising, vectors = torch.linalg.eigh(moment.double())
-    # No second moment has a negative eigenvalue, but the solver's rounding may give one.
+    # A second moment has no negative eigenvalues, but the solver's rounding may produce one.
     values, vectors = rising.flip(-1).clamp(min=0), vectors.flip(-1)
     if moment.ndim == 2:
         kept = vectors[:, : rank(values, energy)]
@@ -124,22 +124,22 @@ def decompose(moment: Tensor, energy: float = 1.0) -> Spectrum:
 
 
 def orthonormal(vectors: Tensor) -> Tensor:
-    """Columns [d, k] that are nearly orthonormal, such as rounded ones, made so.
+    """Orthonormalise columns [d, k] that are nearly orthonormal, such as rounded ones.
 
-    It takes one Newton-Schulz step U (3 - U^T U) / 2, which squares the error.
+    One Newton-Schulz step U (3 - U^T U) / 2 squares the error.
     """
     gram = vectors.T @ vectors
     return 1.5 * vectors - 0.5 * (vectors @ gram)
 
 
 def rank(values: Tensor, energy: float) -> int:
-    """How many of the largest values it takes to hold the share `energy` of their sum.
+    """How many of the largest values hold the fraction `energy` of their sum.
 
     Energy 0 takes none. A value below the float32 rounding of the largest never counts, because it
-    is what the measurement's own arithmetic left. So energy 1 takes every value above that, and no
-    smaller share takes more.
+    comes from the arithmetic of the measurement. So energy 1 takes every value above that, and no
+    smaller fraction takes more.
     """
-    # Values of elementwise maps [D, m] compete over all channels.
+    # Values of elementwise maps [D, m] are ranked over all channels.
     falling = values.flatten().sort(descending=True).values
     if energy <= 0 or falling[0] == 0:
         return 0
@@ -147,6 +147,6 @@ def rank(values: Tensor, energy: float) -> int:
     resolved = int((falling > rounding).sum())
     if energy >= 1:
         return resolved
-    # As many leading values fall short of the share; one more reaches it.
+    # This many leading values fall short of the fraction; one more reaches it.
     short_of_it = int((falling.cumsum(0) < energy * falling.sum()).sum())
     return min(resolved, short_of_it + 1)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aegis_cli.core.pairs import Pair
 
-# Weights that are stacked at once. Larger ones keep a GPU busy by themselves.
+# Most weight entries in one stack. Larger weights keep a GPU busy by themselves.
 MOST = 2**24
 
 
@@ -26,9 +26,9 @@ def groups(
     """The sites in groups of one kind, each of at most `most` entries or alone.
 
     Args:
-        kind: what has to be equal within a group.
-        size: a site -> the entries of its weight, and how many directions it has; sites
-            with similar counts are grouped, which keeps the padding small.
+        kind: a site -> what must be equal within a group.
+        size: a site -> the number of entries of its weight and of its directions; sites with
+            similar numbers of directions are grouped, which keeps the padding small.
     """
     by_kind: dict[Hashable, list[str]] = {}
     for site in sites:
@@ -42,20 +42,20 @@ def groups(
                 found.append([])
                 room = most
             found[-1].append(site)
-            room -= entries  # below 0 after a site larger than `most`, which so stays alone
+            room -= entries  # negative after a site larger than `most`, which thus stays alone
     return found
 
 
 def kind_of(pair: Pair) -> Hashable:
-    """What maps have in common that can be stacked."""
+    """What maps must have in common to be stacked."""
     weight, bias = pair
     of_bias = None if bias is None else bias.dtype
-    # In a user's own loop, the layers may be on several GPUs.
+    # In a user's own loop, the layers may be spread over several GPUs.
     return _flat(weight).shape, weight.dtype, weight.device, of_bias
 
 
 def stacked(pairs: Sequence[Pair]) -> Pair:
-    """Maps of one shape as one, [n, o, d] and [n, o]; a single one stays as it is."""
+    """Maps of one shape as one, [n, o, d] and [n, o]; a single one is returned as it is."""
     if len(pairs) == 1:
         return pairs[0]
     weights = torch.stack([_flat(weight) for weight, _ in pairs])
@@ -64,7 +64,7 @@ def stacked(pairs: Sequence[Pair]) -> Pair:
 
 
 def apart(pair: Pair, like: Sequence[Pair]) -> list[Pair]:
-    """Split what was computed for stacked maps: one pair per map, in the map's own shape."""
+    """Split a result for stacked maps into one pair per map, in the map's own shape."""
     if len(like) == 1:
         return [pair]
     weights, biases = pair
@@ -83,7 +83,7 @@ def _flat(weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def subtract(pairs: Sequence[Pair], taken: Pair) -> None:
-    """Subtract from each map its part of what was computed for the stack, in place."""
+    """Subtract from each map its part of a result for the stack, in place."""
     values, by = [], []
     for own, part in zip(pairs, apart(taken, pairs), strict=True):
         for value, difference in zip(own, part, strict=True):
@@ -94,7 +94,7 @@ def subtract(pairs: Sequence[Pair], taken: Pair) -> None:
 
 
 def padded(matrices: Sequence[Tensor]) -> Tensor:
-    """Matrices [d, k] or rows [k] stacked; the narrower ones end with zeros."""
+    """Matrices [d, k] or rows [k] stacked; narrower ones are padded with zeros at the end."""
     width = max(matrix.shape[-1] for matrix in matrices)
     wide = matrices[0].new_zeros(len(matrices), *matrices[0].shape[:-1], width)
     for into, matrix in zip(wide, matrices, strict=True):
@@ -103,5 +103,5 @@ def padded(matrices: Sequence[Tensor]) -> Tensor:
 
 
 def rests(values: Sequence[float], like: Tensor) -> float | Tensor:
-    """A number of each stacked map, [n, 1]; 0 where all are 0."""
+    """One number per stacked map, [n, 1]; 0 if all are 0."""
     return like.new_tensor(values)[:, None] if any(values) else 0.0

@@ -18,7 +18,7 @@ def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
 
     For diagonal covariances this is the general formula |mu1 - mu2|^2
     + tr(S1 + S2 - 2 (S2^1/2 S1 S2^1/2)^1/2) (Dowson & Landau 1982). The gradient is finite
-    everywhere, also where a variance is 0.
+    everywhere, even where a variance is 0.
     """
     between_means = (mean1 - mean2).square().sum(-1)
     between_deviations = (_std(var1) - _std(var2)).square().sum(-1)
@@ -28,11 +28,11 @@ def w2_diag(mean1: Tensor, var1: Tensor, mean2: Tensor, var2: Tensor) -> Tensor:
 def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
     """Weight of each layer's W2^2 [L]: 1 (`none`, the paper's plain mean) or 1 / tr var_l.
 
-    Residual streams grow by orders of magnitude with depth. The second, `variance`, keeps the last
-    layers from drowning the first.
+    Residual streams grow by orders of magnitude with depth. The second weighting, `variance`, keeps
+    the last layers from dominating the first.
 
     Raises:
-        AegisError: an unknown weighting, or `variance` with a layer that has none.
+        AegisError: an unknown weighting, or `variance` with a layer that has no variance.
     """
     if weighting not in WEIGHTINGS:
         raise AegisError(
@@ -60,14 +60,14 @@ def transport_penalty(
     Args:
         moments: (mean [D], var [D]) of the current batch, one pair per layer, with their graph.
         anchor: the pre-trained moments, one per layer.
-        weights: what `layer_weights` has made of the anchor, [L].
+        weights: the result of `layer_weights` for the anchor, [L].
 
     Returns:
         The penalty to differentiate (mean over layers of the weighted W2^2), and the unweighted
         W2^2 of each layer [L], detached.
     """
     w2 = _of_each_layer(moments, anchor)  # [L]
-    # The paper's mean over layers, of which the weighting `none` is the plain one.
+    # With the weighting `none` this is the paper's plain mean over layers.
     return (w2 * weights).mean(), w2.detach()
 
 
@@ -77,7 +77,7 @@ def _of_each_layer(moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Mo
     for (mean, var), measured in zip(moments, anchor, strict=True):
         each.append((mean, var, measured.mean, measured.var))
     if len({mean.shape for mean, *_ in each}) == 1:
-        # One computation for all layers, where a GPU would start dozens for each.
+        # One computation for all layers instead of dozens of kernel launches for each.
         means, variances, *measured = (torch.stack(part) for part in zip(*each, strict=True))
         return w2_diag(means, variances, *measured)  # each is [L, D]
     return torch.stack([w2_diag(*layer) for layer in each])
@@ -86,10 +86,10 @@ def _of_each_layer(moments: Sequence[tuple[Tensor, Tensor]], anchor: Sequence[Mo
 def _std(var: Tensor) -> Tensor:
     """sqrt(var), with gradient 0 instead of infinity where var is exactly 0.
 
-    Where var > 0, value and gradient are those of sqrt: no epsilon is added. At 0 every activation
+    If var > 0, value and gradient are those of sqrt: no epsilon is added. At 0 every activation
     equals the mean, d sigma/dh is 0/0, and 0 is a subgradient, because sigma is a norm of the
     deviations. Both fills are needed: the inner one keeps sqrt'(0) = inf out of the backward pass,
-    where it would meet the outer one's 0 and become NaN.
+    where it would be multiplied by the 0 of the outer one and become NaN.
     """
     zero = var == 0
     return var.masked_fill(zero, 1).sqrt().masked_fill(zero, 0)

@@ -1,1 +1,1 @@
-"""What is read: demonstrations, questions, LeRobot datasets, streams."""
+"""Data: demonstrations, questions, LeRobot datasets, streams."""

@@ -1,9 +1,9 @@
 """Augmentation of training frames, with the transformations and ranges of LeRobot.
 
 LeRobot (`ImageTransformsConfig`) draws three of six transformations for each picture and applies
-them in their order. They are computed here as torchvision's `transforms.v2.functional` computes
-them, without torchvision: where that is installed, transformers prefers other image processors, and
-a model would read other pixels than its anchor did.
+them in a fixed order. They are computed here as in torchvision's `transforms.v2.functional`, but
+without torchvision: if that is installed, transformers prefers other image processors, and a model
+would read other pixels than its anchor did.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 from aegis_cli.data.batch import Images
 
 _GREY = (0.2989, 0.587, 0.114)  # of red, green and blue, as Pillow has it
-_DEGREES, _SHIFT = 5.0, 0.05  # at most; the shift is a share of the side
+_DEGREES, _SHIFT = 5.0, 0.05  # the largest; the shift is a share of the side
 
 Draw = np.random.Generator
 
@@ -34,24 +34,25 @@ def augmented(
     step: int,
     repeats: Sequence[int] | None = None,
 ) -> Images:
-    """The images of a batch, each changed by transformations of its own.
+    """The images of a batch, each changed by its own random transformations.
 
-    What is drawn depends on the seed, the step, the frame, its camera and its repeat alone: neither
-    a resumed run nor the number of processes changes it.
+    The draws depend only on the seed, the step, the frame, its camera and its repeat: neither
+    resuming nor the number of processes changes them.
 
     Args:
         images: [B, H, W, 3] uint8, or B tuples of one [H, W, 3] per camera.
         frames: their B numbers in the demonstrations.
-        names: keys of `TRANSFORMATIONS` that are drawn from.
-        count: how many of them change one image; all of them if there are fewer.
+        names: keys of `TRANSFORMATIONS` to draw from.
+        count: how many of them are applied to one image; all if there are fewer.
         step: number of steps before this one.
-        repeats: how often each of the B frames has come before in this step, as `earlier` counts
-            it; None where none comes twice.
+        repeats: how often each of the B frames has already occurred in this step, as counted by
+            `earlier`; None if none occurs twice.
     """
 
     def changed(image: Tensor, place: int, camera: int) -> Tensor:
         again = 0 if repeats is None else repeats[place]
-        # Earlier versions drew nothing for a repeat, and what they drew for a frame stays.
+        # Earlier versions did not distinguish repeats; the draws for a first occurrence stay the
+        # same.
         key = [seed, step, frames[place], camera, *([again] if again else [])]
         return _augmented(image, names, count, np.random.default_rng(key))
 
@@ -59,13 +60,13 @@ def augmented(
         return torch.stack([changed(image, place, 0) for place, image in enumerate(images)])
     found = []
     for place, several in enumerate(images):
-        # Each camera draws for itself, as LeRobot's do.
+        # Each camera has its own draw, as in LeRobot.
         found.append(tuple(changed(image, place, n) for n, image in enumerate(several)))
     return found
 
 
 def earlier(frames: Sequence[int]) -> list[int]:
-    """How often each frame comes before its place: a batch may be larger than the dataset."""
+    """How often each frame occurs earlier in the list: a batch may be larger than the dataset."""
     seen = Counter[int]()
     found = []
     for frame in frames:
@@ -77,7 +78,7 @@ def earlier(frames: Sequence[int]) -> list[int]:
 def _augmented(image: Tensor, names: Sequence[str], count: int, draw: Draw) -> Tensor:
     """One image [H, W, 3] uint8; it is rounded once, after the last transformation."""
     count = min(count, len(names))
-    # Sorted, because they do not commute, and LeRobot applies them in their order.
+    # Sorted, because they do not commute and LeRobot applies them in a fixed order.
     drawn = sorted(draw.choice(len(names), count, replace=False).tolist())
     changed = image.permute(2, 0, 1).float() / 255
     for number in drawn:
@@ -103,24 +104,24 @@ def saturation(image: Tensor, factor: float) -> Tensor:
 
 
 def sharpness(image: Tensor, factor: float) -> Tensor:
-    """Blend with the smoothed image, whose outermost pixels stay as they are."""
+    """Blend with the smoothed image, whose border pixels stay as they are."""
     if min(image.shape[1:]) <= 2:
         return image
     kernel = torch.ones(3, 3)
     kernel[1, 1] = 5
-    kernel = (kernel / kernel.sum()).expand(3, 1, 3, 3)  # one for each channel by itself
+    kernel = (kernel / kernel.sum()).expand(3, 1, 3, 3)  # one for each channel
     smooth = image.clone()
     smooth[:, 1:-1, 1:-1] = F.conv2d(image[None], kernel, groups=3)[0]
     return _blend(image, smooth, factor)
 
 
 def hue(image: Tensor, turn: float) -> Tensor:
-    """Turn the colour wheel by a share of its circle."""
+    """Rotate the hue by a share of the colour circle."""
     red, green, blue = image
     high, low = image.max(0).values, image.min(0).values
     spread = high - low
-    divisor = torch.where(spread == 0, 1.0, spread)  # greys have no hue, and any will do
-    # Which colour is strongest says in which third of the circle the hue lies.
+    divisor = torch.where(spread == 0, 1.0, spread)  # greys have no hue; any value will do
+    # The strongest colour determines in which third of the circle the hue lies.
     by_red = (green - blue) / divisor
     by_green = (blue - red) / divisor + 2
     by_blue = (red - green) / divisor + 4
@@ -129,16 +130,16 @@ def hue(image: Tensor, turn: float) -> Tensor:
 
 
 def affine(image: Tensor, degrees: float, right: int, down: int) -> Tensor:
-    """Turn the image about its centre, then shift it by pixels; what comes in is black.
+    """Rotate the image about its centre, then shift it by pixels; uncovered areas are black.
 
-    Each pixel takes the nearest one's value.
+    Interpolation is nearest-neighbour.
     """
     _, height, width = image.shape
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    # Where each new pixel comes from, in pixels from the centre: the inverse of the movement.
+    # The source of each new pixel, in pixels from the centre: the inverse of the movement.
     x = torch.arange(width) - (width - 1) / 2 - right
     y = (torch.arange(height) - (height - 1) / 2 - down)[:, None]
-    # `grid_sample` wants both from -1 to 1, from one border of the image to the other.
+    # `grid_sample` expects both from -1 to 1, from one border of the image to the other.
     across, along = (cos * x + sin * y) * 2 / width, (cos * y - sin * x) * 2 / height
     source = torch.stack([across, along], -1)  # [H, W, 2]
     return F.grid_sample(image[None], source[None], "nearest", "zeros", align_corners=False)[0]

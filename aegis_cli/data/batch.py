@@ -1,4 +1,4 @@
-"""A batch of robot frames, and the normalizers of what goes into a policy and comes out of it."""
+"""A batch of robot frames, and the normalizers of a policy's inputs and outputs."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from torch import Tensor, nn
 # [H, W, 3] of any sizes. One that `reads_several` images per row, a robot's cameras, also takes B
 # sequences of them.
 Images = Tensor | Sequence[Tensor] | Sequence[Sequence[Tensor]]
-# Some images, a question about each, and the reference answers.
+# Images, a question about each, and the reference answers.
 Asked = tuple[Images, Sequence[str], Sequence[str]]
 
 # A dimension that varies less than this share of its own magnitude is left unscaled: dividing by a
-# deviation of almost nothing would turn sensor noise into the largest input. Around zero there is
-# no magnitude, and units may be large: slow motions in metres a frame deviate by 1e-5.
+# tiny deviation would turn sensor noise into the largest input. The second value is an absolute
+# bound for means near zero; units may be large: slow motions in metres per frame deviate by 1e-5.
 _NEAR_CONSTANT, _LEAST = 1e-4, 1e-6
 
 
 def least_spread(middle: Tensor) -> Tensor:
-    """Deviations [D] above which dimensions with these means [D] count as varying."""
+    """The deviations [D] above which dimensions with these means [D] count as varying."""
     return (_NEAR_CONSTANT * middle.abs()).clamp(min=_LEAST)
 
 
 class Normalizer(nn.Module):
     """(x - mean) / std over the last dimension [..., D]; near-constant dimensions are only centred.
 
-    A dimension that never varied has the scale 0. It is centred too, and what is behind any value
-    of it is its mean: an action that nobody has shown is not to be predicted as noise.
+    A dimension that never varied has the scale 0. It is centred too, and `invert` always gives its
+    mean: an action that was never demonstrated must not be predicted as noise.
 
-    A normalizer by quantiles has the middle between the 1 % and the 99 % quantile for `mean`, and
-    half their distance for `std`. So the two become -1 and 1: 2 (x - q01) / (q99 - q01) - 1, which
-    is LeRobot's QUANTILES.
+    A quantile normalizer has the midpoint of the 1 % and the 99 % quantile as `mean`, and half
+    their distance as `std`. So the two become -1 and 1: 2 (x - q01) / (q99 - q01) - 1, which is
+    LeRobot's QUANTILES.
     """
 
     def __init__(self, mean: Tensor, std: Tensor) -> None:
@@ -48,20 +48,20 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(cls, rows: Tensor) -> Normalizer:
-        """Mean and standard deviation of rows [N, D]."""
+        """Normalize by mean and standard deviation of rows [N, D]."""
         middle = _by_dimension(rows, torch.mean)
         return cls.scaled(middle, deviations(rows), _by_dimension(rows, _never_varies))
 
     @classmethod
     def fit_quantiles(cls, rows: Tensor) -> Normalizer:
-        """Let the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, become -1 and 1."""
+        """Map the 1 % and 99 % quantiles of rows [N, D], interpolated linearly, to -1 and 1."""
         low, high = _by_dimension(rows, _outer_quantiles).unbind(1)
         still = _by_dimension(rows, _never_varies)
         return cls.scaled((low + high) / 2, (high - low) / 2, still)
 
     @classmethod
     def scaled(cls, middle: Tensor, scale: Tensor, still: Tensor | None = None) -> Normalizer:
-        """Let `middle` [D] become 0 and what is `scale` [D] above it 1.
+        """Map `middle` [D] to 0 and `middle + scale` [D] to 1.
 
         Args:
             still: [D] bool, the dimensions that are known never to vary.
@@ -74,7 +74,7 @@ class Normalizer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalised values of raw x [..., D]."""
-        scale = torch.where(self.std == 0, 1.0, self.std)  # a fixed dimension is centred alone
+        scale = torch.where(self.std == 0, 1.0, self.std)  # a fixed dimension is only centred
         return (x - self.mean) / scale
 
     def invert(self, x: Tensor) -> Tensor:
@@ -83,12 +83,12 @@ class Normalizer(nn.Module):
 
 
 def deviations(rows: Tensor) -> Tensor:
-    """Standard deviations [D] float64 of rows [N, D]; 0 of a dimension that never varies."""
+    """Standard deviations [D] float64 of rows [N, D]; 0 for a dimension that never varies."""
     return _by_dimension(rows, _deviation)
 
 
 def _by_dimension(rows: Tensor, measure: Callable[[Tensor], Tensor]) -> Tensor:
-    """What a function of a column [N] float64 gives of each column of rows [N, D], stacked.
+    """Apply a function of a column [N] float64 to each column of rows [N, D], and stack.
 
     One column at a time: float64 copies of millions of rows would take gigabytes.
     """
@@ -98,7 +98,7 @@ def _by_dimension(rows: Tensor, measure: Callable[[Tensor], Tensor]) -> Tensor:
 def _deviation(column: Tensor) -> Tensor:
     """The standard deviation [] of a column [N]; 0 if it never varies.
 
-    Two passes in float64: E[x^2] - E[x]^2 would cancel where the mean is large.
+    Two passes in float64: E[x^2] - E[x]^2 would cancel if the mean is large.
     """
     spread = (column - column.mean()).square_().mean().sqrt()
     return torch.where(_never_varies(column), 0.0, spread)
@@ -111,9 +111,9 @@ def _outer_quantiles(column: Tensor) -> Tensor:
 
 
 def _never_varies(column: Tensor) -> Tensor:
-    """Whether a column [N] has one value, but for sensor noise.
+    """Whether a column [N] is constant except for sensor noise.
 
-    Its quantiles do not tell: a gripper that closes in one frame of two hundred has equal ones.
+    Quantiles do not show it: for a gripper that closes in one frame of two hundred they are equal.
     """
     low, high = column.aminmax()
     return high - low <= least_spread(column.mean())
@@ -121,13 +121,13 @@ def _never_varies(column: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PreparedPass:
-    """What was made on the CPU, ahead of a step, for one of its passes.
+    """What was prepared on the CPU, ahead of a step, for one of its passes.
 
     Attributes:
-        inputs: what the backbone has made of the pass's frames.
-        anchor_inputs: the same of the first of them, where the anchor gradient is taken on these
-            alone; else None.
-        by_method: what the method's own `prepare` has made of the frames, if it has one.
+        inputs: the backbone's inputs made from the pass's frames.
+        anchor_inputs: the same for the first of them, if the anchor gradient is taken on these
+            only; else None.
+        by_method: the result of the method's own `prepare` for the frames, if it has one.
     """
 
     inputs: Any
@@ -142,7 +142,7 @@ class PreparedPass:
 
 @dataclass(frozen=True)
 class RobotBatch:
-    """Demonstration frames with what to do next.
+    """Demonstration frames with the actions that follow.
 
     Attributes:
         images: [B, H, W, 3] uint8; with several cameras, B tuples of [H, W, 3].
@@ -150,9 +150,9 @@ class RobotBatch:
         proprio: [B, P] float32, raw units.
         actions: [B, H, A] float32, raw units.
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
-        of_step: frames of the step that these are a share of, and how many steps of its chunks are
-            no padding; None where nobody has counted.
-        prepared: one per pass of the step, in their order; empty where nothing was made ahead.
+        of_step: number of frames in the step that these are a share of, and of valid (unpadded)
+            actions in its chunks; None if not counted.
+        prepared: one per pass of the step, in order; empty if nothing was prepared ahead.
     """
 
     images: Images
@@ -167,11 +167,11 @@ class RobotBatch:
         return len(self.instructions)
 
     def with_prepared_on(self, device: torch.device) -> RobotBatch:
-        """The batch with what is prepared on that device."""
+        """The batch with its prepared inputs on that device."""
         return replace(self, prepared=[each.to(device) for each in self.prepared])
 
     def rows(self, chosen: slice) -> RobotBatch:
-        """The frames of these rows, of whose step and preparation nothing is known."""
+        """The frames of these rows, without `of_step` and `prepared`."""
         return RobotBatch(
             self.images[chosen],
             self.instructions[chosen],
@@ -183,28 +183,28 @@ class RobotBatch:
 
 @dataclass(frozen=True)
 class Share:
-    """One of `count` equal parts of a step's rows, in their order.
+    """One of `count` equal, consecutive parts of a step's rows.
 
-    Several processes share a step, and gradient accumulation cuts it further: part i of a step that
-    n processes take in k passes belongs to pass i // n and to process i % n.
+    Several processes share a step, and gradient accumulation divides it further: part i of a step
+    that n processes take in k passes belongs to pass i // n and to process i % n.
     """
 
     index: int = 0
     count: int = 1
 
     def rows(self, size: int) -> slice:
-        """Its places among `size` rows; two shares differ by one row at most."""
+        """Its slice of `size` rows; shares differ by at most one row."""
         return slice(size * self.index // self.count, size * (self.index + 1) // self.count)
 
 
 @dataclass(frozen=True)
 class WholeBatch:
-    """The batch that a smaller one is a share of; it has its noise, and counts in its mean.
+    """The batch that a smaller one is a share of, which determines its noise and its mean.
 
     Attributes:
         frames: how many it has.
-        shown: steps of all its chunks that are no padding.
-        share: which part of it the smaller one is.
+        shown: number of valid (unpadded) actions in all its chunks.
+        share: the part that the smaller batch is.
     """
 
     frames: int

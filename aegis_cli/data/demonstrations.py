@@ -31,7 +31,7 @@ from aegis_cli.data.lerobot.source import Source
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.data.selection import ALL, Selection, listed
 
-# The scale of relative actions is fitted to so many at most: each frame has a chunk of them.
+# The most relative actions that their scale is fitted to: each frame has a chunk of them.
 _MOST_ROWS = 2**20
 
 # The share of the episodes that is held out, the seed of their choice, and `demos.only`.
@@ -42,11 +42,11 @@ Frames = Tensor | FramesOnDemand | FittedFrames | JoinedFrames
 
 @dataclass(frozen=True)
 class Member:
-    """One of several sets that are learned from together.
+    """One of several sets of demonstrations that a policy is trained on together.
 
     Attributes:
         name: its path, or its id on the hub.
-        sha256: digest of everything that it was read from.
+        sha256: digest of everything it was read from.
         train: frames to train on.
     """
 
@@ -63,20 +63,22 @@ class Demonstrations:
 
     Attributes:
         task: the simulated task's name; None for a dataset of any other robot.
-        frames: of each camera, in its order.
+        frames: one entry per camera, in order.
         tensors: `proprio` [N, P] and `actions` [N, A] float32, `episode_starts` [E + 1] int64.
         instructions: the instruction texts.
         instruction_of: [N] int64, the text of each frame.
         episode_of: [N] int64, the episode of each frame.
         train, validation: [*] int64 frame numbers, split by episode.
-        sha256: digest of everything that these were read from.
-        cameras: names of the LeRobot folder's cameras that these frames come from.
+        sha256: digest of everything they were read from.
+        cameras: names of the LeRobot folder's cameras that the frames come from.
         watched: the files that frames are read from.
-        action_names, proprio_names: of their A and P numbers; empty where the data names none.
-        fps: frames per second, which is the rate at which the robot was controlled; None where the
-            data does not say.
-        datasets: ids on the hub, where that is what was asked for.
-        members: the sets that these were joined of, in the order of their frames; none of one set.
+        action_names, proprio_names: names of the A actions and P positions; empty if the data has
+            none.
+        fps: frames per second, which is the control rate of the robot; None if the data does not
+            say.
+        datasets: ids on the hub, if the demonstrations were given by id.
+        members: the sets that these were joined from, in the order of their frames; empty for one
+            set.
     """
 
     task: str | None
@@ -98,9 +100,9 @@ class Demonstrations:
 
     @property
     def recorded(self) -> dict[str, Any]:
-        """What a policy's meta says of the robot: `action_names`, `proprio_names` and `fps`.
+        """The robot's entries in a policy's meta: `action_names`, `proprio_names` and `fps`.
 
-        Names are left out unless each number has one, and so is a rate that is not known.
+        Names are left out unless each number has one; an unknown rate is left out too.
         """
         told = {
             "action_names": (self.action_names, self.tensors["actions"]),
@@ -108,7 +110,7 @@ class Demonstrations:
         }
         found: dict[str, Any] = {}
         for key, (names, values) in told.items():
-            # Datasets may leave single numbers without a name, which is then an empty text.
+            # Datasets may leave single numbers unnamed; the name is then an empty string.
             if all(names) and len(names) == values.shape[1] > 0:
                 found[key] = list(names)
         if self.fps is not None:
@@ -116,18 +118,18 @@ class Demonstrations:
         return found
 
     def fitted(self, sizes: Sequence[tuple[int, int]]) -> Demonstrations:
-        """The same demonstrations, whose frames are shown in one (height, width) per camera."""
+        """The same demonstrations with each camera's frames resized to a (height, width)."""
         shown = (_fitted(*each) for each in zip(self.frames, sizes, strict=True))
         return replace(self, frames=tuple(shown))
 
     @property
     def held(self) -> list[Tensor]:
-        """Every tensor that these are kept in; frames that stay in a file are mapped ones."""
+        """All tensors that hold the data; frames that stay in a file are memory-mapped."""
         own = [value for value in vars(self).values() if isinstance(value, Tensor)]
         return [*own, *self.tensors.values(), *itertools.chain(*map(_held, self.frames))]
 
     def check_files(self) -> None:
-        """Raise AegisError if somebody has written to what the frames are read from."""
+        """Raise AegisError if the files that frames are read from have changed."""
         for watched in self.watched:
             watched.check()
 
@@ -138,12 +140,12 @@ class Demonstrations:
 
     @cached_property
     def texts(self) -> list[str]:
-        """The instructions of these frames, each once."""
+        """The distinct instructions of these frames."""
         return [self.instructions[i] for i in self.instruction_of[self.read].unique().tolist()]
 
     @cached_property
     def without_instruction(self) -> Tensor:
-        """Numbers of the episodes that were read in which an instruction is empty or blank."""
+        """Numbers of the episodes read that have an empty or blank instruction."""
         is_blank = torch.tensor([not text.strip() for text in self.instructions])
         without = self.read[is_blank[self.instruction_of[self.read]]]  # frame numbers
         return self.episode_of[without].unique()
@@ -153,13 +155,13 @@ class Demonstrations:
         seen = [frames[frame] for frames in self.frames]  # [B, H, W, 3] of each camera
         if len(seen) == 1:
             return seen[0]
-        # Cameras may have different sizes, so that their images cannot be one tensor.
+        # Cameras may have different sizes, so their images cannot be one tensor.
         return list(zip(*seen, strict=True))
 
     def batch(self, frames: np.ndarray | Tensor, chunk: int) -> RobotBatch:
-        """Frames [B] with the `chunk` actions of the expert that begin there.
+        """Frames [B] with the `chunk` expert actions that start there.
 
-        A chunk that runs past its episode repeats the last action there, marked as padding.
+        A chunk that runs past its episode repeats the last action, marked as padding.
         """
         frame = torch.as_tensor(frames)
         actions, is_pad = self.chunks(frame, chunk)
@@ -175,12 +177,12 @@ class Demonstrations:
         """The actions [B, chunk, A] of `batch` at frames [B], and what is padding [B, chunk]."""
         end = self.tensors["episode_starts"][self.episode_of[frame] + 1][:, None]  # [B, 1]
         ahead = frame[:, None] + torch.arange(chunk)  # [B, chunk]
-        # Beyond the end lies the next episode, of another instruction and another start.
+        # After the end comes the next episode, with another instruction and start.
         within = torch.minimum(ahead, end - 1)
         return self.tensors["actions"][within], ahead >= end
 
     def size(self, frame: Tensor, chunk: int) -> tuple[int, int]:
-        """How many frames [B] there are, and how many of their chunks' actions are no padding."""
+        """The number of frames [B], and of actions in their chunks that are not padding."""
         _, is_pad = self.chunks(frame, chunk)
         return len(frame), int((~is_pad).sum())
 
@@ -192,12 +194,12 @@ class Demonstrations:
     def scales(
         self, normalization: str = "mean_std", chunk: int = 1, places: relative.Places = ()
     ) -> tuple[Normalizer, Normalizer]:
-        """Normalizers of proprioception and actions, from the training episodes alone.
+        """Normalizers of proprioception and actions, fitted to the training episodes only.
 
         Args:
             chunk: how many actions are predicted at once.
-            places: what each action is relative to; then its statistics are over all steps of the
-                chunks, since it grows along them.
+            places: what each action is relative to; statistics are then over all steps of the
+                chunks, since relative actions grow along them.
         """
         fit = {"mean_std": Normalizer.fit, "quantiles": Normalizer.fit_quantiles}[normalization]
         actions = self.tensors["actions"][self.train]
@@ -207,29 +209,29 @@ class Demonstrations:
 
     @property
     def action_std(self) -> list[float]:
-        """Standard deviations of the A actions over the training frames; 0 of one that is fixed."""
+        """Standard deviations of the A actions over the training frames; 0 for a fixed one."""
         return deviations(self.tensors["actions"][self.train]).tolist()
 
     def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
-        """Actions [N, A] of the training frames' chunks, less their origins.
+        """Actions [N, A] of the training frames' chunks minus their origins.
 
-        Beyond `_MOST_ROWS` they are of evenly spaced frames alone.
+        If there are more than `_MOST_ROWS`, only evenly spaced frames are used.
         """
         every = -(-len(self.train) * chunk // _MOST_ROWS)  # rounded up
         frames = self.train[:: max(1, every)]
         actions, is_pad = self.chunks(frames, chunk)
         origins = relative.Origins(places)(self.tensors["proprio"][frames])
-        # Padding repeats an episode's last action, which nobody has to predict there.
+        # Padding repeats an episode's last action, and is never a target.
         return (actions - origins)[~is_pad]
 
 
 def _fitted(frames: Frames, size: tuple[int, int]) -> Frames:
-    """A camera's frames in that size; themselves, where they have it already."""
+    """A camera's frames in this size; unchanged if they already have it."""
     return frames if tuple(frames.shape[1:3]) == size else FittedFrames(frames, size)
 
 
 def _held(frames: Frames) -> Iterator[Tensor]:
-    """The tensors that a camera's frames are kept in."""
+    """The tensors that hold a camera's frames."""
     if isinstance(frames, Tensor):
         yield frames
     elif isinstance(frames, FittedFrames):
@@ -237,15 +239,15 @@ def _held(frames: Frames) -> Iterator[Tensor]:
     elif isinstance(frames, JoinedFrames):
         for part in frames.parts:
             yield from _held(part)
-    # `FramesOnDemand` holds no tensor: its frames are decoded anew each time.
+    # `FramesOnDemand` holds no tensor: its frames are decoded each time.
 
 
 def at(path: str | Path) -> Path:
-    """A path of demonstrations as somebody wrote it, or the id of a dataset on the hub.
+    """The path of demonstrations as the user wrote it, or the id of a dataset on the hub.
 
     Raises:
-        AegisError: nothing is there, and it can be no id, as './a/b'; or a file of a LeRobot
-            dataset, instead of its folder.
+        AegisError: nothing is there and it cannot be an id, such as './a/b'; or it is a file of a
+            LeRobot dataset instead of its folder.
     """
     if not Path(path).exists() and hub.is_local(str(path)):
         raise AegisError(
@@ -259,7 +261,7 @@ def at(path: str | Path) -> Path:
 
 def _refuse_inside(path: Path) -> None:
     """Raise AegisError for one of the files that a LeRobot dataset consists of."""
-    # A file of `aegis demos` may well have been put into a dataset's folder.
+    # A file of `aegis demos` may have been put into a dataset's folder.
     if path.is_dir() or path.suffix == ".safetensors":
         return
     folder = next(filter(layout.is_dataset, path.absolute().parents), None)
@@ -270,21 +272,20 @@ def _refuse_inside(path: Path) -> None:
 
 
 def locate(path: Path, selection: Selection | None = None) -> Path:
-    """The file or folder of demonstrations; for a dataset on the hub, that of its copy here.
+    """The file or folder of demonstrations; for a dataset on the hub, its local copy.
 
     Args:
-        selection: what is to be read of such a dataset, which is downloaded; None: the meta folder
-            alone.
+        selection: the part of a dataset on the hub to download; None: only the meta folder.
 
     Raises:
-        AegisError: nothing of that name, neither here nor on the hub, or no such features.
+        AegisError: there is nothing of that name, here or on the hub, or it lacks the features.
     """
     if at(path).exists():
         return Path(path)
     folder = download.meta(str(path))
     if selection is None:
         return folder
-    # What cannot be learned from is found before anything large is downloaded.
+    # Unsuitable datasets are found before anything large is downloaded.
     found = dataset.load(folder, selection.rename)
     for feature in selection.vectors:
         found.size(feature)
@@ -305,22 +306,22 @@ def load(
 ) -> Demonstrations:
     """Read demonstrations, a file of `aegis demos` or a LeRobot dataset, and split them by episode.
 
-    Nothing of a LeRobot folder's other episodes is read. All frames and episodes keep their numbers
+    Other episodes of a LeRobot folder are not read. All frames and episodes keep their numbers,
     whatever is selected.
 
     Args:
-        validation_share: share of the episodes that is held out; None: no episode is trained on.
+        validation_share: share of the episodes that is held out; None: all of them.
         image_size: side in pixels of the squares that a LeRobot folder's frames are fitted into;
-            None: as they are.
+            None: they keep their size.
         workers: processes that decode a LeRobot folder's frames; the result does not depend on it.
-        cache: whether all frames of a LeRobot folder's videos are decoded first, into a cache.
-            Otherwise each is decoded when it is asked for, unless the cache has them already. None:
-            where the disk has room enough.
-        check_text: is called with each instruction of a LeRobot folder before its videos are
-            decoded, which may take hours, and raises AegisError for one that cannot be read.
+        cache: whether all frames of a LeRobot folder's videos are first decoded into a cache.
+            Otherwise each is decoded when needed, unless the cache already has them. None: if the
+            disk has enough room.
+        check_text: called with each instruction of a LeRobot folder before its videos are decoded,
+            which may take hours; raises AegisError for one that cannot be read.
 
     Raises:
-        AegisError: demonstrations that are not sound, or too few episodes to hold one out.
+        AegisError: the demonstrations are not valid, or there are too few episodes to hold one out.
     """
     here = locate(path, selection)
     split = (validation_share, seed, selection.only)
@@ -330,9 +331,9 @@ def load(
         )
         if here == path:
             return found
-        # The copy lies in the hub's cache, whose path says nothing to somebody else.
+        # The copy lies in the hub's cache, whose path means nothing to others.
         return replace(found, datasets=(str(path),))
-    artifacts.read_header(here, "demos")  # of another kind, it has no option to leave out
+    artifacts.read_header(here, "demos")  # a file of another kind is refused first
     selection.check_file(here)
     return _load_file(here, split, selection.rename)
 
@@ -353,7 +354,7 @@ def _source(found: dataset.Dataset, only: str | None) -> Source:
 
 
 def _episodes(found: dataset.Dataset, only: str | None) -> list[int] | None:
-    """The numbers of the episodes that `demos.only` names; None where it chooses none."""
+    """The numbers of the episodes that `demos.only` selects; None if it is not set."""
     if only is None:
         return None
     if task_episodes.is_task(only, found.info.splits):
@@ -362,15 +363,15 @@ def _episodes(found: dataset.Dataset, only: str | None) -> list[int] | None:
 
 
 def part_of(path: Path, task: str, shared: bool) -> str | None:
-    """What `demos.only` has to be for a task to learn its own episodes alone; None: all are.
+    """The value of `demos.only` that selects a task's own episodes; None: all are its own.
 
-    Only data sets of LIBERO's hold those of several tasks.
+    Only LIBERO's datasets hold several tasks' episodes.
 
     Args:
-        shared: whether other tasks learn from the demonstrations as well.
+        shared: whether other tasks are trained on the demonstrations as well.
 
     Raises:
-        AegisError: it cannot be told which are its own.
+        AegisError: its own episodes cannot be determined.
     """
     if sim.of_datasets(task) is None:
         return None
@@ -380,11 +381,11 @@ def part_of(path: Path, task: str, shared: bool) -> str | None:
 
 
 def is_one_of(path: Path, selection: Selection, sha256: Collection[str]) -> bool:
-    """Whether these have one of the digests, of which `selection` was read."""
+    """Whether the selected part of these demonstrations has one of the digests."""
     here = locate(path)
     if here.is_dir() and selection.only is not None:
         found = dataset.load(here, selection.rename)
-        # Other data may have fewer episodes or no such split, which is no error here.
+        # Other data may have fewer episodes or lack the split, which is no error here.
         try:
             _episodes(found, selection.only)
         except AegisError:
@@ -403,12 +404,12 @@ def count_episodes(path: Path) -> int:
 def playable_task(
     path: Path, camera: str | tuple[str, ...] | None, named: str, rename: Renaming = ()
 ) -> str | None:
-    """The simulated task that a policy of these demonstrations can act in.
+    """The simulated task that a policy trained on these demonstrations can act in.
 
-    It is None where another robot was recorded, or by cameras that the task does not have.
+    It is None if another robot was recorded, or cameras that the task does not have.
 
     Args:
-        named: the task that a recipe names. Data sets of LIBERO's do not say that they are.
+        named: the task that a recipe names. LIBERO's datasets do not identify themselves.
     """
     path = locate(path)
     if not path.is_dir():
@@ -425,12 +426,12 @@ def playable_task(
 
 
 def _load_file(path: Path, split: Split, rename: Renaming) -> Demonstrations:
-    # Watched from before it is read, so that nobody writes into it unnoticed meanwhile.
+    # Watched before it is read, so that changes in the meantime are noticed.
     watched = WatchedFiles([path])
     artifact = artifacts.load(path, "demos")
     tensors, meta = dict(artifact.tensors), artifact.header.meta
     count = len(tensors["episode_starts"]) - 1
-    # What has a field of its own below is popped: `tensors` keeps what has none.
+    # Tensors with their own field below are popped; `tensors` keeps the rest.
     episode_of, train, validation = _split(
         path, tensors["episode_starts"], split, learned_from(path, count, split[2])
     )
@@ -461,8 +462,8 @@ def _load_folder(
     on_event: OnEvent,
     check_text: Callable[[str], None] | None,
 ) -> Demonstrations:
-    # What is wrong with the dataset is found in the order of what it costs: the meta folder, the
-    # rows and the instructions are read before any video is decoded.
+    # Errors in the dataset are found in order of cost: the meta folder, the rows and the
+    # instructions are read before any video is decoded.
     found = dataset.load(path, selection.rename)
     cameras = found.cameras(selection.camera)
     lengths = [episode.length for episode in found.episodes]
@@ -476,7 +477,7 @@ def _load_folder(
     actions, action_names = _vectors(source, selection.action)
     digests = sources.digests(source, cameras, on_event)
     if check_text is not None:
-        # Frames that are not read have the task 0, whose text may be another episode's.
+        # Frames that are not read have task 0, whose text may be another episode's.
         read = torch.cat([train, validation]).numpy()
         for number in np.unique(index.task[read]).tolist():
             check_text(found.tasks[number])
@@ -488,7 +489,7 @@ def _load_folder(
     mapped, videos = list[Path](), set[Path]()
     for name, own in zip(cameras, digests, strict=True):
         is_video = found.info.features[name].dtype != "image"
-        # Frames that an earlier run has decoded are read faster than they are decoded anew.
+        # Reading frames that an earlier run has decoded is faster than decoding them again.
         if is_video and not cache and not camera_frames.are_kept(source, name, image_size, own):
             parts = list(camera_frames.video_parts(source, index, name))
             frames.append(FramesOnDemand(parts, found.info.frames, image_size))
@@ -508,7 +509,7 @@ def _load_folder(
         validation=validation,
         sha256=sources.joined_digest(digests, "cameras"),
         cameras=tuple(map(found.called, cameras)),
-        # Nobody but Aegis touches its cache, which can be too large to be read for a digest.
+        # Only Aegis writes to its cache, which may be too large to read for a digest.
         watched=(WatchedFiles(mapped, by_content=False), WatchedPaths(videos)),
         action_names=action_names,
         proprio_names=proprio_names,
@@ -517,9 +518,9 @@ def _load_folder(
 
 
 def _vectors(source: Source, features: str | tuple[str, ...]) -> tuple[Tensor, tuple[str, ...]]:
-    """Features side by side [N, D] float32, and the names of their D numbers.
+    """Features concatenated to [N, D] float32, and the names of their D numbers.
 
-    The names are empty where none of the features has any.
+    There are no names if none of the features has any.
     """
     chosen = listed(features)
     read = [rows.read_vectors(source, name) for name in chosen]
@@ -534,7 +535,7 @@ def _split(
     """The episode of each frame [N], and the frames to train and to validate on.
 
     Args:
-        episodes: numbers [*] int64 of those that are chosen.
+        episodes: numbers [*] int64 of the chosen episodes.
     """
     validation_share, seed, only = split
     needed = 1 if validation_share is None else 2  # one is held out
@@ -546,7 +547,7 @@ def _split(
             "at least one" if needed == 1 else "2 or more: one is held out",
             "choose more with demos.only" if only else record,
         )
-    # `held_out` counts the chosen episodes alone, so that each choice has some to validate on.
+    # `held_out` counts only the chosen episodes, so every choice has some to validate on.
     validated = episodes[held_out(len(episodes), validation_share, seed)]
     episode_of = torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff())  # [N]
     is_chosen = torch.isin(episode_of, torch.from_numpy(episodes))
@@ -556,14 +557,14 @@ def _split(
 
 
 def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
-    """The numbers of the episodes that a training takes, in their order.
+    """The numbers of the episodes that training uses, in order.
 
     Args:
         count: how many there are.
-        only: as `demos.only` says.
+        only: as in `demos.only`.
 
     Raises:
-        AegisError: episodes that are not there.
+        AegisError: some episodes do not exist.
     """
     if only is None:
         return np.arange(count)
@@ -576,13 +577,13 @@ def learned_from(path: Path, count: int, only: str | None) -> np.ndarray:
 
 
 def held_out_of(path: Path, only: str | None, validation_share: float, seed: int) -> list[int]:
-    """The numbers of the episodes of these that a training of this seed is validated on.
+    """The numbers of the episodes that a training with this seed holds out.
 
     Args:
-        only: as `demos.only` says.
+        only: as in `demos.only`.
 
     Raises:
-        AegisError: episodes that are not there.
+        AegisError: some episodes do not exist.
     """
     own = learned_from(path, count_episodes(path), only)
     numbers: list[int] = own[held_out(len(own), validation_share, seed)].tolist()
@@ -590,9 +591,9 @@ def held_out_of(path: Path, only: str | None, validation_share: float, seed: int
 
 
 def held_out(episodes: int, validation_share: float | None, seed: int) -> np.ndarray:
-    """The numbers of the episodes that a training with this share and seed is validated on.
+    """The numbers of the episodes that a training with this share and seed holds out.
 
-    It is at least one and never all, but with a share of None, which holds all of them out.
+    At least one is held out and never all, except with a share of None, which holds out all.
     """
     if validation_share is None:
         return np.arange(episodes)

@@ -1,4 +1,4 @@
-"""Which episodes of a data set are meant: by their numbers, or by a split's name."""
+"""Selection of a dataset's episodes, by numbers or by the name of a split."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def listed(text: str) -> list[int]:
     """The numbers of a list such as `0,4,7-9`.
 
     Raises:
-        ValueError: something else, a range that runs backwards or one of a million numbers.
+        ValueError: it is no such list, or a range runs backwards or has over a million numbers.
     """
     found: list[int] = []
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
-        last = last or first  # a number alone is a range of one
+        last = last or first  # a single number is a range of one
         if not (first.isdecimal() and last.isdecimal()):
             raise ValueError(part)
         start, end = int(first), int(last)
@@ -31,8 +31,8 @@ def listed(text: str) -> list[int]:
 
 
 def as_text(numbers: Sequence[int]) -> str:
-    """The list that `listed` reads as these rising numbers: `0,4,7-9`."""
-    parts = list[list[int]]()  # a number alone, or the first and last of a range
+    """The text that `listed` reads as these ascending numbers: `0,4,7-9`."""
+    parts = list[list[int]]()  # a single number, or the first and last of a range
     for number in numbers:
         if parts and number == parts[-1][-1] + 1:
             parts[-1] = [parts[-1][0], number]
@@ -47,10 +47,11 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
     Args:
         text: numbers from 0 and ranges of them, or the name of a split.
         count: how many episodes there are.
-        splits: names of splits and their episodes as LeRobot has them, `0:40` for the first forty.
+        splits: names of splits -> their episodes as LeRobot writes them, `0:40` for the first
+            forty.
 
     Raises:
-        AegisError: neither, or episodes that are not there.
+        AegisError: it is neither, or some episodes do not exist.
     """
     try:
         numbers = _named(text, splits)
@@ -78,20 +79,20 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
 
 
 def _named(text: str, splits: Mapping[str, str]) -> list[int]:
-    """The numbers that a list of them or a split's name stands for.
+    """The numbers that a list or the name of a split stands for.
 
     Raises:
         ValueError: it is neither.
     """
-    # A split comes first, whose name may be a number as well.
+    # Splits come first, since the name of a split may be a number.
     return _of_split(splits[text]) if text in splits else listed(text)
 
 
 def _of_split(said: str) -> list[int]:
-    """The numbers of `FIRST:END`, which ends before END.
+    """The numbers of `FIRST:END`, without END.
 
     Raises:
-        ValueError: something else, which other tools than LeRobot may have written.
+        ValueError: it is something else, which another tool may have written.
     """
     first, colon, end = said.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal()):

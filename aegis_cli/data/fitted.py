@@ -1,4 +1,4 @@
-"""A camera's frames in another size than they were recorded in."""
+"""A camera's frames in another size than they were recorded with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class FittedFrames:
-    """Frames [N, H, W, 3] uint8 that are fitted to a size as they are asked for.
+    """Frames [N, H, W, 3] uint8 that are resized when they are read.
 
     Attributes:
         frames: as they were recorded.
@@ -26,7 +26,7 @@ class FittedFrames:
     def __init__(
         self, frames: Tensor | FramesOnDemand | FittedFrames | JoinedFrames, size: tuple[int, int]
     ) -> None:
-        """Take the frames of one camera, of any size, and the (height, width) to show them in."""
+        """Take the frames of one camera, of any size, and the (height, width) to fit them to."""
         self.frames = frames
         self.shape = (len(frames), *size, 3)
 

@@ -1,4 +1,4 @@
-"""A camera's frames of several sets of demonstrations, one set after the other."""
+"""A camera's frames from several sets of demonstrations, one set after the other."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from aegis_cli.data.lerobot.on_demand import FramesOnDemand
 
 
 class JoinedFrames:
-    """Frames [N, H, W, 3] uint8 that stay where each set has them until they are asked for.
+    """Frames [N, H, W, 3] uint8 that stay in their sets until they are read.
 
-    Several threads may ask.
+    Several threads may read them.
 
     Attributes:
         parts: each set's own frames [n, H, W, 3], all of one size.
@@ -23,7 +23,7 @@ class JoinedFrames:
     """
 
     def __init__(self, parts: Sequence[Tensor | FramesOnDemand | FittedFrames]) -> None:
-        """Number the frames through, in the order of the sets."""
+        """Number all frames consecutively, in the order of the sets."""
         self.parts = tuple(parts)
         self._ends = np.cumsum([len(part) for part in self.parts])
         self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
@@ -34,9 +34,9 @@ class JoinedFrames:
     def __getitem__(self, numbers: Tensor) -> Tensor:
         """Frames [B, H, W, 3] by their numbers [B] int64."""
         found = torch.empty((len(numbers), *self.shape[1:]), dtype=torch.uint8)
-        # "right", since a number that equals the end of one part is the first of the next.
+        # "right", since the end of one part is the first number of the next.
         of_part = np.searchsorted(self._ends, numbers.numpy(), side="right")
-        for index in np.unique(of_part).tolist():  # each part is asked once, for all of its frames
+        for index in np.unique(of_part).tolist():  # each part is read once, for all of its frames
             part, own = self.parts[index], torch.from_numpy(of_part == index)
             begins_at = int(self._ends[index]) - len(part)
             found[own] = part[numbers[own] - begins_at]

@@ -1,4 +1,4 @@
-"""The names of positions and actions: whether two recordings are of the same joints, in order."""
+"""Compare the names of positions and actions: do two recordings have the same joints, in order?"""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _TOLD = {"action_names": "actions", "proprio_names": "positions"}
 
 @dataclass(frozen=True)
 class Difference:
-    """Names that are not the same.
+    """Two lists of names that differ.
 
     Attributes:
         what: 'actions' or 'positions'.
-        known: names that a policy was trained on.
-        found: names of other demonstrations.
+        known: the names that a policy was trained on.
+        found: the names in other demonstrations.
     """
 
     what: str
@@ -25,9 +25,9 @@ class Difference:
 
     @property
     def moved(self) -> str | None:
-        """The first joint that has another place; None where the others have other names at most.
+        """The first joint that has another index; None if names differ but no known name has moved.
 
-        The same joint may be called otherwise.
+        The same joint may have another name.
         """
         for place, name in enumerate(self.known):
             if name in self.found and self.found.index(name) != place:
@@ -36,23 +36,23 @@ class Difference:
 
 
 def differences(known: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[Difference]:
-    """What differs, of what both have names for.
+    """The differences in what both have names for.
 
     Args:
-        known: `action_names` and `proprio_names` of a policy's meta, each as far as it is known.
+        known: `action_names` and `proprio_names` of a policy's meta, each if it is known.
         found: those of `Demonstrations.recorded`.
     """
     for key, what in _TOLD.items():
         one, other = known.get(key), found.get(key)
-        # Lists, since a file's header has lists where the demonstrations have tuples.
+        # Lists, since a file's header has lists but the demonstrations have tuples.
         if one is not None and other is not None and list(one) != list(other):
             yield Difference(what, one, other)
 
 
 def told_apart(known: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    """Which joints are missing and which are more, for an error of how many there are.
+    """Which joints are missing or additional, for an error about their number.
 
-    It reads as ", without the actions pan"; '' where a name is not known, or none differs.
+    For example ", without the actions pan"; '' if names are unknown or do not differ.
     """
     said = list[str]()
     for other in differences(known, found):

@@ -1,4 +1,4 @@
-"""Which recorded episodes become demonstrations: the successes, or those of the highest return."""
+"""Which recorded episodes become demonstrations: the successes, or those of highest return."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.processes import mapped
 from aegis_cli.sim.recording import RecordedEpisode
 
-# Share of the episodes, those of the lowest return, that is dropped by default.
+# The share of the episodes, those with the lowest return, that is dropped by default.
 DROP_BELOW = 0.25
 _QUANTILES = {"min": 0.0, "q25": 0.25, "median": 0.5, "q75": 0.75, "max": 1.0}
 _FIX = "free some memory, or ask for fewer episodes"
@@ -27,8 +27,8 @@ _FIX = "free some memory, or ask for fewer episodes"
 class Seen:
     """What was recorded so far.
 
-    `attempts` and `returns` count every episode that was tried; `frames`, `kept_returns` and the
-    `first` few are of the episodes that were kept. `failures` counts those of each task of a set.
+    `attempts` and `returns` cover every episode; `frames`, `kept_returns` and the `first` few only
+    the kept ones. `failures` counts the failures of each task of a set.
     """
 
     attempts: int = 0
@@ -44,7 +44,7 @@ class Seen:
         return (self.attempts - self.failures.total()) / self.attempts
 
     def keep(self, episode: RecordedEpisode) -> RecordedEpisode:
-        """Count an episode as kept, and hand it on."""
+        """Count an episode as kept, and return it."""
         self.frames += len(episode.actions)
         if len(self.first) < media.SHEET_EPISODES:  # more would hold all pictures in memory
             self.first.append(episode)
@@ -66,16 +66,15 @@ def successes(
     on_event: OnEvent,
     tasks: Sequence[str],
 ) -> Generator[RecordedEpisode, None, None]:
-    """The first `episodes` successes in the order of their numbers, shared out among `tasks`.
+    """The first `episodes` successes in the order of their numbers, divided among `tasks`.
 
-    A task whose expert fails gets later numbers in place of the failures, so that every task has
-    its share in the end.
+    Failures of a task are replaced by later numbers, so that every task gets its share in the end.
 
     Raises:
-        AegisError: an expert that keeps failing.
+        AegisError: the expert keeps failing.
     """
     left = shares(tasks, episodes)
-    # An expert may fail half of the time, and a few episodes may have worse luck than that.
+    # An expert may fail half of the time, and a few episodes even more often by chance.
     limit = 2 * episodes + 20 * len(tasks)
     with mapped(record, range(limit), workers, "a recording process", _FIX, chunk=4) as results:
         for number, episode in enumerate(results):
@@ -83,7 +82,7 @@ def successes(
             seen.attempts = number + 1
             if not episode.success:
                 seen.failures[task] += 1
-            elif left[task]:  # else the task has its share, and this is one too many
+            elif left[task]:  # otherwise the task already has its share
                 left[task] -= 1
                 kept = episodes - sum(left.values())
                 figures = {"success": seen.success}
@@ -100,7 +99,7 @@ def successes(
 
 
 def attempts(episodes: int, drop_below: float) -> int:
-    """How many to record so that `episodes` are left when that share of them is dropped."""
+    """How many episodes to record so that `episodes` are left after dropping that share."""
     exact = episodes / (1 - drop_below)
     return math.ceil(exact - 1e-9)  # 3 / (1 - 0.25) is 4, whatever a float says
 
@@ -113,12 +112,12 @@ def best(
     seen: Seen,
     on_event: OnEvent,
 ) -> Generator[RecordedEpisode, None, None]:
-    """The `episodes` highest returns among the first `total` episodes, by rising number.
+    """The `episodes` highest returns among the first `total` episodes, in order of their numbers.
 
     Among equal returns the earlier ones are kept. No more than `episodes` + 1 episodes are held in
     memory.
     """
-    # A heap: the lowest return comes first, and among equal ones the latest number.
+    # A heap: the lowest return comes first, and among equal ones the highest number.
     kept: list[tuple[float, int, RecordedEpisode]] = []
     with mapped(record, range(total), workers, "a recording process", _FIX) as results:
         for number, episode in enumerate(results):
@@ -131,7 +130,7 @@ def best(
             figures = {"return": float(np.mean(seen.returns))}
             on_event(Progress("demos", seen.attempts, total, "episodes", figures))
     kept.sort(key=lambda entry: entry[1])  # numbers are negative: the first one is the last entry
-    while kept:  # popped, so that what was written away is held no longer
+    while kept:  # popped, so that episodes are freed once they are written
         yield seen.keep(kept.pop()[2])
 
 

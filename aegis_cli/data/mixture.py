@@ -1,8 +1,8 @@
-"""Several sets of demonstrations that one policy learns from together.
+"""Several sets of demonstrations that one policy is trained on together.
 
 They are of one robot: cameras, positions, actions and control rate have to agree. Each set holds
-out episodes of its own, as it would alone. One after the other they are one set, whose scale is
-that of all training frames.
+out its own episodes, as it would alone. They are concatenated to one set, whose scale is that of
+all training frames.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _INPUT = "demos"  # the name of the demonstrations' digest in an artifact's head
 
 
 def each(paths: str | Path | Sequence[Path]) -> tuple[Path, ...]:
-    """The sets by themselves."""
+    """The sets, one by one."""
     return (Path(paths),) if isinstance(paths, str | Path) else tuple(map(Path, paths))
 
 
@@ -40,7 +40,7 @@ def said(paths: Paths) -> str:
 
 
 def at(named: str | Sequence[str]) -> Paths:
-    """The sets as `demos.path` names them, each as `demonstrations.at` reads it."""
+    """The sets that `demos.path` names, each checked by `demonstrations.at`."""
     if isinstance(named, str):
         return demonstrations.at(named)
     return tuple(demonstrations.at(name) for name in named)
@@ -57,14 +57,15 @@ def load(
     cache: bool | None = True,
     check_text: Callable[[str], None] | None = None,
 ) -> Demonstrations:
-    """Read one set of demonstrations as `demonstrations.load` does, or several and join them.
+    """Read one set of demonstrations as `demonstrations.load` does, or read several and join them.
 
     Raises:
-        AegisError: besides what is wrong with one of them, sets that are not of one robot, one set
-            twice, episodes that are chosen of several, or a renaming of what no set has.
+        AegisError: something is wrong with one of them, the sets are not of one robot, a set is
+            named twice, episodes are selected from several sets, or a name to be renamed is in no
+            set.
     """
     chosen = each(paths)
-    # All that can be told of the meta folders comes first: decoding one set can take hours.
+    # First all that the meta folders can show: decoding a set can take hours.
     _check_each_once(chosen)
     check_rename(chosen, selection.rename)
     if len(chosen) > 1:
@@ -90,13 +91,12 @@ def load(
 def joined(
     paths: Sequence[Path], found: Sequence[Demonstrations], on_event: OnEvent = ignore
 ) -> Demonstrations:
-    """The sets one after the other; a single one is itself.
+    """Concatenate the sets; a single one is returned unchanged.
 
-    Pictures of another size than the first set's are fitted into it, as they are where the policy
-    acts.
+    Pictures are resized to the first set's size, as they are when the policy acts.
 
     Args:
-        paths: what each is called.
+        paths: the name of each set.
     """
     first, *others = found
     if not others:
@@ -104,18 +104,18 @@ def joined(
     sizes = [(frames.shape[1], frames.shape[2]) for frames in first.frames]  # of each camera
     _warn_of_other_sizes(paths, found, on_event)
     shown = [first, *(other.fitted(sizes) for other in others)]
-    # Frames and episodes are numbered through: each set's own numbers begin where the set before
-    # has ended.
+    # Frames and episodes are numbered consecutively: each set's numbers start where the previous
+    # set ends.
     starts = _begin_at([len(own.episode_of) for own in shown])
     numbered = list(zip(shown, starts, strict=True))
     first_episodes = _begin_at([len(own.tensors["episode_starts"]) - 1 for own in shown])
     episode_of = [own.episode_of + n for own, n in zip(shown, first_episodes, strict=True)]
     ends = [own.tensors["episode_starts"][1:] + start for own, start in numbered]
-    # An instruction that several sets have is one.
+    # An instruction of several sets is listed once.
     texts = list(dict.fromkeys(text for own in shown for text in own.instructions))
     of_camera = zip(*(own.frames for own in shown), strict=True)
     members = zip(paths, shown, strict=True)
-    # `_check_alike` has compared what several sets say: the first that says something says it all.
+    # `_check_alike` has compared the sets, so the first one that has a value decides.
     return Demonstrations(
         task=next((own.task for own in shown if own.task is not None), None),
         frames=tuple(map(JoinedFrames, of_camera)),
@@ -141,12 +141,12 @@ def joined(
 
 
 def _begin_at(counts: Sequence[int]) -> list[int]:
-    """The number at which each of several runs of so many begins, the first at 0."""
+    """The offset of each of several consecutive parts of these lengths; the first is 0."""
     return [0, *itertools.accumulate(counts[:-1])]
 
 
 def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
-    """The text of each of a set's frames, by its place among all sets' texts."""
+    """The text of each of a set's frames, as an index into all sets' texts."""
     places = {text: place for place, text in enumerate(texts)}
     of_own = torch.tensor([places[text] for text in own.instructions])
     return of_own[own.instruction_of]
@@ -155,7 +155,7 @@ def _renumbered(own: Demonstrations, texts: Sequence[str]) -> torch.Tensor:
 def playable_task(
     paths: Paths, camera: str | tuple[str, ...] | None, named: str, rename: Renaming = ()
 ) -> str | None:
-    """The simulated task that a policy of these can act in, as `demonstrations` knows it of one."""
+    """As `demonstrations.playable_task`, for one set or the first of several that has a task."""
     tasks = (demonstrations.playable_task(path, camera, named, rename) for path in each(paths))
     return next((task for task in tasks if task is not None), None)
 
@@ -170,7 +170,7 @@ def digest(paths: Paths, selection: Selection = ALL) -> str:
 
 
 def inputs(found: Demonstrations) -> dict[str, str]:
-    """The digests that an artifact's header has: of all together, and of each of several sets."""
+    """The digests for an artifact's header: of all sets together, and of each of several."""
     named = {_INPUT: found.sha256}
     for number, member in enumerate(found.members, start=1):
         named[f"{_INPUT} {number}"] = member.sha256
@@ -178,20 +178,20 @@ def inputs(found: Demonstrations) -> dict[str, str]:
 
 
 def digests(inputs: Mapping[str, str]) -> frozenset[str]:
-    """The digests of the demonstrations that a header's inputs name, each set's among them."""
+    """The digests of demonstrations among a header's inputs, including those of single sets."""
     own = [name for name in inputs if name.split(" ")[0] == _INPUT]  # `demos 2` is the second set
     return frozenset(inputs[name] for name in own)
 
 
 def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """Which inputs of a run have other digests here than there, as in "another anchor"."""
+    """Which inputs of a run have different digests here, as a text such as "another anchor"."""
     names = sorted(name for name in there.keys() | here.keys() if there.get(name) != here.get(name))
     sets = [name for name in names if name.startswith(f"{_INPUT} ")]
     if not sets:
         return f"another {', '.join(names)}"
     if {there.get(name) for name in sets} == {here.get(name) for name in sets}:
         return "the sets of demonstrations in another order"
-    # Where a set differs, so does the digest of all together, which would say no more.
+    # If a set differs, so does the digest of all together, which adds nothing.
     others = [name for name in names if name not in (_INPUT, *sets)]
     numbered = [f"set {name.removeprefix(f'{_INPUT} ')} of the demonstrations" for name in sets]
     return f"another {', '.join([*others, *numbered])}"
@@ -201,7 +201,7 @@ def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
 
 
 def check_weights(weights: Sequence[float] | None, sets: int) -> None:
-    """Raise AegisError unless there are as many weights as sets, or none at all."""
+    """Raise AegisError unless there is one weight per set, or no weights."""
     if weights is None or (sets > 1 and len(weights) == sets):
         return
     raise AegisError(
@@ -214,20 +214,20 @@ def check_weights(weights: Sequence[float] | None, sets: int) -> None:
 def drawn(found: Demonstrations, weights: Sequence[float] | None) -> list[int]:
     """How many of an epoch's frames come from each of several sets, by their weights.
 
-    An epoch has as many frames as there are to train on; without weights each comes once. What
-    rounding leaves goes to the largest remainders, and to the first of equal ones.
+    An epoch has as many draws as there are training frames; without weights each frame comes once.
+    Frames left by rounding go to the largest remainders, and to the first of equal ones.
 
     Raises:
-        AegisError: a weight that is less than a frame.
+        AegisError: a weight amounts to less than one frame.
     """
     sizes = [member.train for member in found.members]
     if weights is None:
         return sizes
     total, exactly = sum(sizes), list(map(Fraction, weights))
-    whole = sum(exactly)  # exactly, for the sum of large weights is more than a float holds
+    whole = sum(exactly)  # exactly, since a sum of large weights may overflow a float
     exact = [total * weight / whole for weight in exactly]
     counts = [int(count) for count in exact]  # rounded down
-    # Sorting is stable, so that of equal remainders the first comes first.
+    # Sorting is stable, so the first of equal remainders comes first.
     by_rest = sorted(range(len(counts)), key=lambda i: counts[i] - exact[i])
     for i in by_rest[: total - sum(counts)]:
         counts[i] += 1
@@ -275,11 +275,11 @@ def _check_selection(paths: Sequence[Path], selection: Selection) -> None:
 
 @dataclass(frozen=True)
 class Robot:
-    """What a set says of the robot that it was recorded with.
+    """The description of the robot that a set was recorded with.
 
     Attributes:
-        sizes: how many positions and how many actions there are.
-        names: `action_names` and `proprio_names`, as far as there are any.
+        sizes: the numbers of positions and of actions.
+        names: `action_names` and `proprio_names`, if there are any.
     """
 
     cameras: tuple[str, ...]
@@ -290,15 +290,15 @@ class Robot:
 
 
 def robot_of(path: Path, selection: Selection) -> Robot:
-    """The robot of a set, of which no frame is decoded for that.
+    """The robot of a set, without decoding any frame.
 
     Raises:
-        AegisError: a set without the cameras or features that are to be learned from.
+        AegisError: the set lacks the selected cameras or features.
     """
     here = demonstrations.locate(path)
     if not here.is_dir():
         artifact = artifacts.load(here, "demos")
-        selection.check_file(here)  # a file of another kind has no option to leave out
+        selection.check_file(here)  # a file of another kind was refused before
         meta = artifact.header.meta
         sizes = artifact.tensors["proprio"].shape[1], artifact.tensors["actions"].shape[1]
         names = {}
@@ -318,16 +318,16 @@ def robot_of(path: Path, selection: Selection) -> Robot:
 def _complete(
     names: Mapping[str, tuple[str, ...]], sizes: tuple[int, int]
 ) -> dict[str, tuple[str, ...]]:
-    """The names of numbers each of which has one."""
+    """The lists of names in which each number has a name."""
     counts = {"proprio_names": sizes[0], "action_names": sizes[1]}
     return {kind: own for kind, own in names.items() if all(own) and len(own) == counts[kind] > 0}
 
 
 def check_rename(paths: Sequence[Path], rename: Renaming) -> None:
-    """Raise AegisError for a name of the renaming that occurs in none of these sets."""
+    """Raise AegisError for a name to be renamed that occurs in none of these sets."""
     if not rename:
         return
-    # One set may have the policy's names already, and another need the renaming.
+    # One set may already have the policy's names, while another needs the renaming.
     names = set[str]()
     for path in paths:
         here = demonstrations.locate(path)
@@ -348,7 +348,7 @@ def _check_alike(paths: Sequence[Path], selection: Selection) -> None:
 
 
 def _check_robot(path: Path, robot: Robot, known_path: Path, known: Robot) -> None:
-    """Raise AegisError unless two sets are of one robot, as far as both say it."""
+    """Raise AegisError unless two sets are of one robot, as far as both describe it."""
     if robot.sizes != known.sizes:
         raise AegisError(
             f"{robot.sizes[0]} positions and {robot.sizes[1]} actions in '{path}'"
@@ -399,7 +399,7 @@ def _refuse_names(path: Path, known_path: Path, other: joints.Difference) -> Non
 def _warn_of_other_sizes(
     paths: Sequence[Path], found: Sequence[Demonstrations], on_event: OnEvent
 ) -> None:
-    """Warn of pictures that are shown in the size of the first set's."""
+    """Warn of pictures that are resized to the size of the first set's."""
     first, *others = found
     texts = list[str]()
     for path, other in zip(paths[1:], others, strict=True):

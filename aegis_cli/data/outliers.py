@@ -1,4 +1,4 @@
-"""Values so far off that they alone make the scale of a joint, as a sensor's glitch does."""
+"""Outliers that alone determine the scale of a joint, such as a sensor's glitches."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 
 from aegis_cli.data.batch import deviations
 
-_FEWEST = 100  # rows; of fewer each may well be the only one of its kind
-_SHARE = 1000  # one in so many rows is left out at either end
+_FEWEST = 100  # rows; among fewer, each may be the only one of its kind
+_SHARE = 1000  # one in this many rows is left out at either end
 _SQUEEZED = 3  # times the deviation of the others
 
 
 class Outlier(NamedTuple):
-    """A dimension, and its row that is farthest from the median.
+    """A dimension, and its row farthest from the median.
 
     Attributes:
-        std: standard deviation of all values, and `others` that of those which are not left out.
+        std: standard deviation of all values; `others` is that of the values that are not left out.
     """
 
     dimension: int
@@ -31,9 +31,9 @@ class Outlier(NamedTuple):
 
 
 def outliers(rows: Tensor) -> Iterator[Outlier]:
-    """Dimensions of rows [N, D] whose deviation is due to one value in 500 or fewer.
+    """Dimensions of rows [N, D] whose deviation is due to at most one value in 500.
 
-    A joint that is at rest but for these is none: a gripper may well close so rarely.
+    A joint that otherwise never moves does not count: a gripper may close as rarely.
     """
     if len(rows) < _FEWEST:
         return

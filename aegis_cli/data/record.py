@@ -26,15 +26,15 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.sim.contract import TaskSpec
 from aegis_cli.sim.recording import RecordedEpisode, record_numbered
 
-# How many episodes repay a worker's start of a few seconds: of our own tasks, and of MetaWorld's,
-# whose robot takes far longer to simulate and to draw. An episode of a planner does so alone.
+# How many episodes are worth a worker's start of a few seconds: for our own tasks, and for
+# MetaWorld's, whose robot takes far longer to simulate and render. With a planner, one is enough.
 _PER_WORKER, _PER_WORKER_METAWORLD = 400, 20
 FORMATS = ("safetensors", "lerobot")
 
 
 @dataclass(frozen=True)
 class TaskCount:
-    """What was recorded of one task of a set: episodes that were kept, and that failed."""
+    """What was recorded of one task of a set: the numbers of kept and of failed episodes."""
 
     episodes: int
     failed: int
@@ -44,12 +44,12 @@ class TaskCount:
 class DemosReport:
     """What was recorded: `episodes` were kept out of `attempts`, and the others dropped.
 
-    In a task measured by success, the episodes that failed are dropped, and `success` is the share
-    that did not fail. `tasks` has both counts for each task of a set.
+    In a task measured by success, failed episodes are dropped, and `success` is the share of the
+    others. `tasks` has both counts for each task of a set.
 
-    In a task measured by its return, those with the lowest are dropped: `returns` has the mean and
-    quantiles over all attempts, `kept_returns` over the episodes that were kept. `seconds` includes
-    the writing.
+    In a task measured by its return, the episodes with the lowest are dropped: `returns` has the
+    mean and quantiles over all attempts, `kept_returns` over the episodes that were kept. `seconds`
+    includes the writing.
     """
 
     task: str
@@ -69,7 +69,7 @@ class DemosReport:
     preview: str | None
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON-ready values."""
+        """The report as values that JSON can hold."""
         return asdict(self)
 
 
@@ -90,29 +90,29 @@ def run(
 ) -> DemosReport:
     """Record `episodes` good episodes of `task` to `out`; equal arguments give equal bytes.
 
-    Episodes in which the expert fails are dropped, and the next numbers take their place. In a task
-    measured by its return, so many are recorded that `episodes` are left when the worst, a share of
-    `drop_below`, are dropped.
+    Episodes in which the expert fails are dropped and replaced by the next numbers. In a task
+    measured by its return, enough are recorded that `episodes` are left after dropping the worst, a
+    share of `drop_below`.
 
     Args:
-        noise: standard deviation of the pushes on the executed actions, 1 = full speed; labels stay
+        noise: standard deviation of the noise on the executed actions, 1 = full speed; labels stay
             clean.
         colors: the targets' colours; distractors have any colour.
         workers: processes; the result does not depend on it. Default: one per core, fewer for few
             episodes.
         preview: also write a contact sheet (PNG) of the first episodes.
         form: one of FORMATS; `lerobot` writes a dataset folder, episode by episode.
-        as_video: keep the dataset's frames as video, which is smaller and loses something.
+        as_video: keep the dataset's frames as video, which is smaller but lossy.
         drop_below: the quantile of the returns below which episodes are dropped; None: a quarter,
-            where there are returns.
-        cameras: those of the task that take pictures, for a LeRobot dataset; empty for its own.
+            if there are returns.
+        cameras: the task's cameras to record, for a LeRobot dataset; empty for its default camera.
 
     Raises:
-        AegisError: a bad argument, a path that cannot be written, or an expert that keeps failing.
+        AegisError: an argument is invalid, a path cannot be written, or the expert keeps failing.
     """
     _check(task, episodes, noise, workers, drop_below)
     noise = abs(noise)  # NumPy takes -0.0 for a negative deviation
-    # All that can be wrong is found before hours of recording.
+    # All errors in the arguments are found before hours of recording.
     _check_form(Path(out), form, as_video, cameras)
     sim.check_cameras(task, cameras)
     gl.check()
@@ -121,7 +121,7 @@ def run(
         files.check_apart("--preview", Path(preview), [Path(out)])
     spec = sim.make(task).spec
     started = time.perf_counter()
-    # The generators below fill `seen` while they are read, so that it is whole only afterwards.
+    # The generators below fill `seen` while they are consumed, so it is complete only afterwards.
     share = keeping.DROP_BELOW if drop_below is None else drop_below
     seen = keeping.Seen()
     workers = workers or _workers(spec, episodes, share)
@@ -140,7 +140,7 @@ def run(
         good = keeping.best(record, episodes, total, workers, seen, on_event)
     else:
         good = keeping.successes(record, episodes, workers, seen, on_event, sim.members(task))
-    with closing(good) as recorded:  # whatever happens, its processes end
+    with closing(good) as recorded:  # ends its processes in any case
         if form == "lerobot":  # written as they come: one episode is held at a time
             _save_folder(Path(out), spec, recorded, as_video, tuple(cameras) or (spec.camera,))
         else:
@@ -191,14 +191,14 @@ def _counts(task: str, episodes: int, seen: keeping.Seen) -> dict[str, TaskCount
     tasks = sim.members(task)
     if tasks == (task,):
         return None
-    kept = keeping.shares(tasks, episodes)  # every task has got its share
+    kept = keeping.shares(tasks, episodes)  # every task has its share
     return {name: TaskCount(kept[name], seen.failures[name]) for name in tasks}
 
 
 def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
-    """How many processes repay their start.
+    """How many processes are worth their start.
 
-    A planner repays one per core; scripted experts are fast, and repay fewer for few episodes.
+    For a planner that is one per core; scripted experts are fast, and need fewer for few episodes.
     """
     if spec.measure == "return":
         return processes.worker_count(keeping.attempts(episodes, drop_below))
@@ -207,7 +207,7 @@ def _workers(spec: TaskSpec, episodes: int, drop_below: float) -> int:
 
 
 def _passed(seen: keeping.Seen, drop_below: float) -> dict[str, Any]:
-    """What an artifact says about the episodes that were recorded and dropped."""
+    """An artifact's meta about the episodes that were recorded and dropped."""
     if not seen.returns:
         return {"attempts": seen.attempts}
     dropped = seen.attempts - len(seen.kept_returns)
@@ -289,7 +289,7 @@ def _save_folder(
 
 
 def _new_episode(recorded: RecordedEpisode, cameras: Sequence[str]) -> write.NewEpisode:
-    """A recorded episode as the dataset has it, its pictures by their cameras' names."""
+    """A recorded episode in the dataset's form, with its pictures by camera name."""
     pictures = (recorded.frames, *recorded.more_frames)
     return write.NewEpisode(
         dict(zip(cameras, pictures, strict=True)),
@@ -319,7 +319,7 @@ def _save(
         tasks = sim.members(spec.name)
         tensors["task"] = np.array([tasks.index(e.task) for e in kept], np.int64)
         meta = {"tasks": list(tasks), **meta}
-    # Last, because it empties `kept`.
+    # Last, because this empties `kept`.
     tensors["frames"] = _join_frames(kept, int(starts[-1]))
     artifacts.save(
         path,
@@ -339,7 +339,7 @@ def _save(
 
 
 def _join_frames(kept: list[RecordedEpisode], total: int) -> np.ndarray:
-    """All frames [N, 64, 64, 3]; `kept` is emptied on the way, so that no picture is held twice."""
+    """All frames [N, 64, 64, 3]; empties `kept` on the way, so that no picture is held twice."""
     frames = np.empty((total, *kept[0].frames.shape[1:]), np.uint8)
     kept.reverse()  # `pop` takes from the end
     start = 0

@@ -1,7 +1,7 @@
-"""Actions that are predicted relative to where the robot is when their chunk begins.
+"""Actions that are predicted relative to the robot's positions at the start of their chunk.
 
-`action - position` of the same joint, as LeRobot's `use_relative_actions` and openpi's
-`DeltaActions` have it. Grippers are often left as they are.
+That is `action - position` of the same joint, as in LeRobot's `use_relative_actions` and openpi's
+`DeltaActions`. Grippers are often left absolute.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from torch import Tensor, nn
 
 from aegis_cli.common.errors import AegisError
 
-# For each action, the place of its own joint among the positions; None where it stays absolute.
+# For each action, the index of its own joint among the positions; None if it stays absolute.
 Places = Sequence[int | None]
 
 
 class Origins(nn.Module):
-    """What is subtracted of each action before the expert learns it, and added to what it predicts.
+    """What is subtracted from each target action of the expert, and added to each predicted one.
 
     Attributes:
-        places: of each of A actions; empty where all are absolute.
+        places: for each of the A actions; empty if all are absolute.
     """
 
     def __init__(self, places: Places = ()) -> None:
         super().__init__()
         self.places = tuple(places)
         self._columns: Tensor
-        # Absolute actions take the last of P + 1 columns, which is 0. It is not saved with the
-        # weights: the header of a policy's file names the places.
+        # Absolute actions use the last of P + 1 columns, which is 0. The buffer is not saved with
+        # the weights: the header of a policy's file has the places.
         columns = torch.tensor([-1 if place is None else place for place in places]).long()
         self.register_buffer("_columns", columns, persistent=False)
 
     def forward(self, proprio: Tensor) -> Tensor | float:
-        """The origins [B, 1, A] of chunks that begin at positions [B, P]; 0 if all are absolute."""
+        """The origins [B, 1, A] of chunks that start at positions [B, P]; 0 if all are absolute."""
         if not self.places:
             return 0.0
         with_zero = nn.functional.pad(proprio, (0, 1))  # [B, P + 1]
@@ -48,19 +48,19 @@ def places(
     sizes: tuple[int, int],
     absolute: Sequence[str],
 ) -> tuple[int | None, ...]:
-    """The position that each action is relative to: that of its name.
+    """The index of the position that each action is relative to: the one of the same name.
 
-    Where the data names neither, actions belong to positions by their order.
+    If the data names neither, actions and positions correspond by order.
 
     Args:
-        actions: names of the A actions; empty where there are none.
+        actions: names of the A actions; empty if there are none.
         positions: names of the P positions.
         sizes: (A, P).
         absolute: words in the names of actions that stay absolute, such as gripper.
 
     Raises:
-        AegisError: an action without a position of its name, other numbers of nameless ones, or a
-            word that no action's name has.
+        AegisError: an action has no position of its name, unnamed actions and positions differ in
+            number, or a word is in no action's name.
     """
     if not actions and not positions and not absolute and sizes[0] == sizes[1]:
         return tuple(range(sizes[0]))
@@ -75,7 +75,7 @@ def places(
     lowered = [name.lower() for name in actions]
     words = [word.lower() for word in absolute]
     for word, as_found in zip(absolute, words, strict=True):
-        # A word that excludes nothing is a slip, and the gripper would be relative by it.
+        # A word that excludes nothing is a mistake, and would leave the gripper relative.
         if not any(as_found in name for name in lowered):
             raise AegisError(
                 f"train.relative_exclude: '{word}', which no action's name has",
@@ -106,15 +106,15 @@ def places(
 
 
 def of_meta(meta: Mapping[str, Any], actions: int, positions: int) -> tuple[int | None, ...]:
-    """The places that the meta of a policy's file tells; empty where all actions are absolute.
+    """The places in the meta of a policy's file; empty if all actions are absolute.
 
     Raises:
-        ValueError: they are not those of so many actions and positions.
+        ValueError: they do not fit these numbers of actions and positions.
     """
     told = meta.get("relative", [])
     known = [None, *range(positions)]
     fits = isinstance(told, list) and len(told) in (0, actions)
-    # Python takes True for the number 1.
+    # In Python, True equals 1.
     if not fits or not all(place in known and type(place) is not bool for place in told):
         raise ValueError(f"'relative' is {told!r}")
     return tuple(told)

@@ -1,7 +1,7 @@
-"""Names that a policy has for the cameras, features and joints of demonstrations.
+"""A policy's own names for the cameras, features and joints of demonstrations.
 
-Two recordings of one robot may call a camera or a joint otherwise. A renaming gives each name of
-the demonstrations that of the policy, wherever it occurs; names that it does not have stay.
+Two recordings of one robot may name a camera or a joint differently. A renaming maps names of the
+demonstrations to the policy's, wherever they occur; other names stay.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from collections.abc import Iterable, Mapping, Sequence
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 
-Renaming = tuple[tuple[str, str], ...]  # a name of the demonstrations, and the policy's
+Renaming = tuple[tuple[str, str], ...]  # (a name in the demonstrations, the policy's name)
 
 
 def of(named: Mapping[str, str] | None) -> Renaming:
-    """The renaming that a recipe's mapping, or a checkpoint's, stands for."""
+    """The renaming given by a mapping in a recipe or a checkpoint."""
     return tuple((named or {}).items())
 
 
 def feature(rename: Renaming, name: str) -> str:
-    """What the policy calls a feature; a camera goes with and without `observation.images.`."""
+    """The policy's name of a feature; a camera is found with or without `observation.images.`."""
     known = dict(rename)
     own = name
-    for spelt in (layout.short(name), name):  # the full name decides, where both are renamed
+    for spelt in (layout.short(name), name):  # if both are renamed, the full name decides
         own = known.get(spelt, own)
     is_short = name.startswith(layout.CAMERA) and not own.startswith("observation.")
     return layout.CAMERA + own if is_short else own
 
 
 def joints(rename: Renaming, names: Sequence[str], where: str) -> tuple[str, ...]:
-    """What the policy calls positions or actions.
+    """The policy's names of positions or actions.
 
     Args:
         where: whose names these are, for an error.
@@ -45,12 +45,12 @@ def joints(rename: Renaming, names: Sequence[str], where: str) -> tuple[str, ...
 
 
 def check_apart(rename: Renaming, names: Sequence[str], renamed: Sequence[str], where: str) -> None:
-    """Raise AegisError where a renaming gives one of these names to two."""
+    """Raise AegisError if a renaming maps two different names to the same one."""
     if not rename:
         return
     for place, name in enumerate(renamed):
         first = renamed.index(name)
-        # Names that were alike before are the dataset's own affair.
+        # Names that were equal before are left to the dataset.
         if first != place and names[first] != names[place]:
             raise AegisError(
                 f"'{names[first]}' and '{names[place]}' in {where}, which both become '{name}'",
@@ -60,13 +60,13 @@ def check_apart(rename: Renaming, names: Sequence[str], renamed: Sequence[str], 
 
 
 def check_known(rename: Renaming, names: Iterable[str], where: str) -> None:
-    """Raise AegisError for a name of a renaming that does not occur in the demonstrations.
+    """Raise AegisError for a name to be renamed that does not occur in the demonstrations.
 
     Args:
-        names: all that occur, of cameras with and without `observation.images.`.
-        where: the demonstrations' names in a sentence.
+        names: all names that occur, cameras both with and without `observation.images.`.
+        where: the demonstrations, as named in a sentence.
     """
-    known = sorted({*names} - {""})  # numbers without a name have an empty one
+    known = sorted({*names} - {""})  # unnamed numbers have an empty name
     for name, _ in rename:
         if name not in known:
             raise AegisError(

@@ -1,4 +1,4 @@
-"""Which of the demonstrations are learned from."""
+"""Which part of the demonstrations is used for training."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Selection:
     """Which episodes of demonstrations are read, and which features of a LeRobot folder.
 
     Attributes:
-        camera: one or several of the folder's cameras; None: the only one there is.
+        camera: one or several of the folder's cameras; None: its only one.
         only: the episodes, as `demos.only` names them; None: all.
-        state, action: the features that are proprioception and actions; several are joined, and ()
-            reads none.
-        rename: what the policy calls cameras, features and joints; the names above are the
+        state, action: the features that are proprioception and actions; several are concatenated,
+            and () reads none.
+        rename: the policy's names of cameras, features and joints; the names above are the
             policy's.
     """
 
@@ -43,11 +43,11 @@ class Selection:
         return (*listed(self.state), *listed(self.action))
 
     def check_file(self, path: Path) -> None:
-        """Raise AegisError where something is chosen that a file of `aegis demos` does not have."""
+        """Raise AegisError if something is selected that a file of `aegis demos` does not have."""
         of_anchor = {"camera": " (of aegis anchor: --camera)"}
         for name, what in (("camera", "a camera"), ("state", "features"), ("action", "features")):
             chosen = getattr(self, name)
-            if chosen in (getattr(ALL, name), ()):  # what nobody chose, or nothing
+            if chosen in (getattr(ALL, name), ()):  # the default, or nothing
                 continue
             named = chosen if isinstance(chosen, str) else ", ".join(chosen)
             raise AegisError(

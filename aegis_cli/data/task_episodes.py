@@ -1,4 +1,4 @@
-"""Which episodes of a dataset are those of a task of LIBERO's: the ones with its instructions."""
+"""Which episodes of a dataset belong to a LIBERO task: those with its instructions."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from aegis_cli.sim import libero_table
 
 
 def is_task(only: str, splits: Mapping[str, str]) -> bool:
-    """Whether `demos.only` names a task of LIBERO's; a split of that name comes first.
+    """Whether `demos.only` names a LIBERO task; a split of that name takes precedence.
 
     Raises:
-        AegisError: a task that LIBERO does not have.
+        AegisError: LIBERO does not have the task.
     """
     return only not in splits and sim.of_datasets(only) is not None
 
 
 def of_task(found: Dataset, task: str) -> list[int]:
-    """The numbers of a task's episodes, or of a suite's, rising.
+    """The numbers of a task's episodes, or of a suite's, in ascending order.
 
     Raises:
-        AegisError: there is none, or its instructions may be those of another task's scene.
+        AegisError: there are none, or its instructions may belong to another task's scene.
     """
     own = {*libero_table.members(task)}
     numbers = [n for n, tasks in enumerate(_tasks_of_each(found)) if tasks & own]
@@ -38,16 +38,15 @@ def of_task(found: Dataset, task: str) -> list[int]:
 
 
 def is_choice(found: Dataset, task: str, shared: bool) -> bool:
-    """Whether a task has to choose its episodes, since the dataset holds others, too.
+    """Whether a task has to select its episodes, because the dataset holds others too.
 
-    Where no instruction is one of LIBERO's, all episodes are the task's: somebody may have said it
-    in other words.
+    If no instruction is LIBERO's, all episodes belong to the task: they may have been reworded.
 
     Args:
-        shared: whether other tasks learn from the dataset as well.
+        shared: whether other tasks are trained on the dataset as well.
 
     Raises:
-        AegisError: it is shared, and no instruction tells whose an episode is.
+        AegisError: it is shared, and no instruction shows which task an episode belongs to.
     """
     own = {*libero_table.members(task)}
     tasks_of_each = _tasks_of_each(found)
@@ -63,10 +62,10 @@ def is_choice(found: Dataset, task: str, shared: bool) -> bool:
 
 
 def check_own(texts: list[str], task: str, where: str) -> None:
-    """Raise AegisError for an instruction that is another task's of LIBERO's.
+    """Raise AegisError for an instruction that belongs to another LIBERO task.
 
     Args:
-        texts: what is learned from has these instructions.
+        texts: the instructions of the selected data.
         where: its name in a sentence.
     """
     own = {*libero_table.members(task)}
@@ -81,7 +80,7 @@ def check_own(texts: list[str], task: str, where: str) -> None:
 
 
 def _tasks_of_each(found: Dataset) -> list[set[str]]:
-    """The tasks that each episode may be of: those that have all its instructions."""
+    """The tasks that each episode may belong to: those that have all its instructions."""
     return [
         set.intersection(*(set(libero_table.told(text)) for text in episode.tasks or ("",)))
         for episode in found.episodes
@@ -89,9 +88,9 @@ def _tasks_of_each(found: Dataset) -> list[set[str]]:
 
 
 def _check_told_apart(found: Dataset, task: str, own: set[str]) -> None:
-    """Raise AegisError where an instruction is another task's, too, whose suite is there as well.
+    """Raise AegisError if another task, whose suite is also present, shares an instruction.
 
-    `turn on the stove` is said in one scene of libero/goal, and in two of libero/90.
+    `turn on the stove` is used in one scene of libero/goal, and in two of libero/90.
     """
     texts = dict.fromkeys(text for episode in found.episodes for text in episode.tasks)
     suites_of_each = [{libero_table.place(t)[0] for t in libero_table.told(text)} for text in texts]

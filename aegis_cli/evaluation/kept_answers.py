@@ -6,25 +6,23 @@ question and its image, and of the code, the libraries and the device that compu
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
-from aegis_cli.common import files, kept_digests
+from aegis_cli.common import circumstances, files, kept_digests
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent, Progress
 from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.data.batch import Share
+from aegis_cli.data.vqa import digests
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded, grade, graded_answer
-from aegis_cli.evaluation import circumstances
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
@@ -54,6 +52,16 @@ def load(name: str) -> Loaded:
         return Loaded(model, None)
     content = [weights[path] for path in sorted(weights)]
     return Loaded(model, files.sha256_value({"weights": content, "settings": model.settings()}))
+
+
+def about(model: Backbone) -> dict[str, Any]:
+    """All that a model's answers depend on in it, as JSON; its weights are read for that."""
+    return {"weights": model.fingerprint(), "settings": model.settings()}
+
+
+def of_now(model: Backbone) -> Loaded:
+    """A model as it is by now, maybe with weights of no file."""
+    return Loaded(model, files.sha256_value(about(model)))
 
 
 def _places(name: str) -> dict[Path, object]:
@@ -87,8 +95,8 @@ def ask(
         if loaded.digest is None:
             graded = grade(model.answers, own, batch_size, on_event)
         else:
-            about = {"model": loaded.digest, **circumstances.of_answers()}
-            kept = KeptLines("answers", about, on_event)
+            by = {"model": loaded.digest, **circumstances.of_answers()}
+            kept = KeptLines("answers", by, on_event)
             graded = _asked(model, own, batch_size, kept, on_event)
     return [one for part in ranks.gathered(graded) for one in part]
 
@@ -96,7 +104,7 @@ def ask(
 def _asked(
     model: Backbone, own: VQASet, batch_size: int, kept: KeptLines, on_event: OnEvent
 ) -> list[Graded]:
-    keys = _keys(own)
+    keys = digests.of_questions(own)
     known = {line["question"]: _said(line) for line in kept.read() if _is_answer(line)}
     rows: list[int] = []  # of the batches that are not answered whole
     for first in range(0, len(keys), batch_size):
@@ -131,36 +139,6 @@ def _going_on(done: int, total: int, on_event: OnEvent) -> OnEvent:
         on_event(event)
 
     return told
-
-
-# --- what tells a question ------------------------------------------------------------------------
-
-
-def _keys(asked: VQASet) -> list[str]:
-    """A digest of each question, its reference answer and its image."""
-    images = _digests(asked)
-    return [
-        files.sha256_value([question.text, question.answer, images[number]])
-        for question, number in zip(asked.questions, asked.image_of.tolist(), strict=True)
-    ]
-
-
-def _digests(asked: VQASet) -> Mapping[int, str]:
-    """A digest of each image that is asked about, by its number."""
-    numbers = sorted(set(asked.image_of.tolist()))
-    images = asked.images
-    if isinstance(images, np.ndarray):
-        return {number: hashlib.sha256(images[number].tobytes()).hexdigest() for number in numbers}
-    sources = {number: images.pictures[number].source for number in numbers}
-    paths = {number: source for number, source in sources.items() if isinstance(source, Path)}
-    found: dict[int, str] = {}
-    if paths:
-        of_files = kept_digests.of_files(paths.values(), min(paths.values()).parent)
-        found = {number: of_files[path] for number, path in paths.items()}
-    for number, source in sources.items():
-        if not isinstance(source, Path):
-            found[number] = hashlib.sha256(source()).hexdigest()
-    return found
 
 
 # --- lines ----------------------------------------------------------------------------------------

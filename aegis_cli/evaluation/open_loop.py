@@ -16,9 +16,10 @@ import numpy as np
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import artifacts, commands, devices, hub
+from aegis_cli.common import artifacts, circumstances, commands, devices, hub, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
+from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.kinds import quoted
 from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
 from aegis_cli.data.demonstrations import Demonstrations
@@ -257,7 +258,16 @@ def evaluated(
     shown = _shown(policy, meta, data, learned, chosen, on_event)
     at = _spread(shown, chosen.episodes, asked.frames)
     policy, seed, batch_size = policy.to(devices.pick()), asked.seed, asked.batch_size
-    predicted = predict(policy, shown, at, seed, batch_size, _STAGE, on_event)
+    about = {
+        "policy": policy.fingerprint(),
+        "data": [shown.sha256, repr(learned), [list(size) for size in checkpoint.sizes_of(meta)]],
+        "frames": at.tolist(),
+        "how": [seed, batch_size],
+        **circumstances.of_answers(),
+        **machine.versions(("av",)),  # which decodes videos
+    }
+    kept = KeptLines("predictions", about, on_event)
+    predicted = predict(policy, shown, at, seed, batch_size, _STAGE, on_event, kept)
     found = compare(shown, at, predicted, _training_std(policy, meta, on_event))
     report = dataclasses.replace(
         found,

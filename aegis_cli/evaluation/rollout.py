@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli import sim
-from aegis_cli.common import devices, gl, media
+from aegis_cli.common import circumstances, devices, gl, media
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.limits import MOST_MADE
 from aegis_cli.core import ensemble as temporal
-from aegis_cli.evaluation import circumstances, results
+from aegis_cli.evaluation import results
 from aegis_cli.models.acting import DEFAULT, EVALUATION_SEED, Acting, RolloutReport, play
 from aegis_cli.models.policy import Policy
 from aegis_cli.sim import libero_table

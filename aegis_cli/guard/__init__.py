@@ -1,4 +1,4 @@
-"""The methods in a user's own training loop."""
+"""The methods, for use in a user's own training loop."""
 
 from aegis_cli.guard.guard import Guard
 

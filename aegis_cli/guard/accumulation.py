@@ -1,15 +1,15 @@
 """Gradient accumulation: `.grad` holds the projection of the sum, after every backward pass.
 
-Over the micro-batches of one optimizer step, the task gradients are summed (as PyTorch sums them)
-and the anchor gradients averaged; the sum is what is projected. Projecting each micro-batch by
-itself would leave the conflicts between one's gradient and another's anchor gradient. Nobody has to
-say which micro-batch is the last: each call takes back the projection of the sum so far, adds its
-own share, and projects the new sum.
+Over the micro-batches of one optimizer step, the task gradients are summed (as PyTorch does) and
+the anchor gradients averaged; then the sum is projected. Projecting each micro-batch separately
+would leave conflicts between the gradient of one and the anchor gradient of another. The caller
+does not have to say which micro-batch is the last: each call undoes the projection of the sum so
+far, adds its own share, and projects the new sum.
 
-Several processes may have a copy of the model each (DistributedDataParallel, which averages what
-arrives in `.grad`). The anchor gradient does not arrive there, so it is averaged here; without that
-each process would project the same task gradient against an anchor gradient of its own, and the
-copies would diverge.
+Several processes may each have a copy of the model (DistributedDataParallel, which averages the
+gradients that arrive in `.grad`). The anchor gradient does not arrive there, so it is averaged
+here; otherwise each process would project the same task gradient against its own anchor gradient,
+and the copies would diverge.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Accumulation:
     """The sum since `.grad` was last cleared.
 
     Attributes:
-        count: micro-batches in it.
+        count: number of micro-batches in the sum.
         anchor: mean anchor gradient of each parameter by its id.
         w2: mean W2^2 of each layer [L].
-        weights: of the anchor gradient in each group's `.grad`.
-        idle: ids of the parameters whose `.grad` is that anchor gradient alone.
-        empty: whether that projection was of zeros.
-        marks: each parameter's `.grad`, and how often it had been written to, when the last
-            projection was done.
+        weights: weight of the anchor gradient in each group's `.grad`.
+        idle: ids of the parameters whose `.grad` is the anchor gradient alone.
+        empty: whether the last projection was of zeros.
+        marks: each parameter's `.grad`, and how often it had been written to, at the last
+            projection.
     """
 
     count: int
@@ -51,7 +51,7 @@ class Accumulation:
 
 
 def started(anchor: Mapping[int, Tensor | None], w2: Tensor) -> Accumulation:
-    """The sum after its first micro-batch, not yet projected."""
+    """The sum after the first micro-batch, not yet projected."""
     return Accumulation(1, dict(anchor), w2, [], {})
 
 
@@ -64,7 +64,7 @@ def grow(total: Accumulation, anchor: Mapping[int, Tensor | None], w2: Tensor) -
     for i, a in anchor.items():
         mean = total.anchor[i]
         if mean is not None:
-            # Never in place: autograd may give several parameters one and the same tensor.
+            # Never in place: autograd may return the same tensor for several parameters.
             total.anchor[i] = mean * (1 - share) if a is None else mean.lerp(a, share)
         elif a is not None:
             total.anchor[i] = a * share
@@ -93,19 +93,18 @@ def cleared(groups: Groups) -> bool:
 
 
 def continues(total: Accumulation | None, groups: Groups) -> bool:
-    """Whether `.grad` is what the last projection left, rather than cleared since.
+    """Whether `.grad` is unchanged since the last projection, rather than cleared.
 
     Raises:
-        AegisError: neither: it was scaled, clipped or added to, so that its projection cannot be
-            taken back.
+        AegisError: neither: it was scaled, clipped or added to, so the projection cannot be undone.
     """
-    # Zeros that were written past PyTorch's count, as by `p.grad.data.zero_()`, are seen first.
+    # First detect zeros that PyTorch's version counter missed, as with `p.grad.data.zero_()`.
     if total is None or (not total.empty and cleared(groups)):
         return False
     parameters = [p for group in groups for p in group]
     if all(_untouched(p, total.marks.get(id(p))) for p in parameters):
         return True
-    if cleared(groups):  # the last projection was of zeros, and others were written since
+    if cleared(groups):  # the last projection was of zeros, which were overwritten with zeros
         return False
     if _only_cleared(total, parameters):
         refuse_partly_cleared(parameters)
@@ -119,8 +118,8 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
 
 
 def refuse_partly_cleared(parameters: Sequence[nn.Parameter]) -> None:
-    """Raise AegisError where some of the gradients are cleared, and others are not."""
-    # A process may have no row of a small sharded parameter, which then tells nothing.
+    """Raise AegisError if some of the gradients are cleared and others are not."""
+    # A process may have no rows of a small sharded parameter, which then says nothing.
     parameters = [p for p in parameters if rows_here(p).numel()]
     kept = sum(not cleared([[p]]) for p in parameters)
     if 0 < kept < len(parameters):
@@ -134,7 +133,7 @@ def refuse_partly_cleared(parameters: Sequence[nn.Parameter]) -> None:
 
 
 def _only_cleared(total: Accumulation, parameters: Sequence[nn.Parameter]) -> bool:
-    """Whether every gradient is what the last projection left, or gone."""
+    """Whether every gradient is either unchanged since the last projection or cleared."""
     return all(_untouched(p, total.marks.get(id(p))) or cleared([[p]]) for p in parameters)
 
 
@@ -146,8 +145,8 @@ def _untouched(parameter: nn.Parameter, marked: tuple[Tensor | None, int] | None
         return gradient is known
     if known._version != written:
         return False
-    # DistributedDataParallel with gradient_as_bucket_view puts gradients into buckets that it makes
-    # anew before the second forward pass: other tensors of the same values.
+    # DistributedDataParallel with gradient_as_bucket_view puts gradients into buckets, which it
+    # recreates before the second forward pass: different tensors with the same values.
     return gradient is known or torch.equal(rows_here(gradient), rows_here(known))
 
 
@@ -164,10 +163,10 @@ def put_back(total: Accumulation, groups: Groups) -> None:
 
 @torch.no_grad()
 def _shift(total: Accumulation, groups: Groups, times: int) -> None:
-    """Add the anchor gradient to `.grad` so many times, with each group's weight.
+    """Add the anchor gradient to `.grad`, multiplied by `times` and each group's weight.
 
-    Where the task left no gradient, there is none without the anchor's: the optimizer leaves such a
-    parameter as it is, and would let one of zeros decay.
+    A parameter without a task gradient has None without the anchor gradient, not zeros: the
+    optimizer skips a parameter without a gradient, but would apply weight decay to one with zeros.
     """
     for group, weight in zip(groups, total.weights, strict=True):
         for parameter in group:
@@ -175,7 +174,7 @@ def _shift(total: Accumulation, groups: Groups, times: int) -> None:
             if weight == 0 or a is None:
                 continue
             if id(parameter) in total.idle:
-                # All of it is the anchor's: without that there is none.
+                # The anchor gradient is all there is; without it there is none.
                 parameter.grad = None if times < 0 else projection.scaled(a, weight)
             elif parameter.grad is not None:
                 projection.add_scaled([parameter.grad], [a], times * weight)
@@ -184,12 +183,12 @@ def _shift(total: Accumulation, groups: Groups, times: int) -> None:
 def poison(total: Accumulation, groups: Groups) -> list[nn.Parameter]:
     """Fill `.grad` with infinity, so that a scaler skips the step.
 
-    It skips steps whose gradients are not finite; where only the anchor gradient overflowed,
-    nothing else would tell it.
+    A scaler skips steps with non-finite gradients; if only the anchor gradient overflowed, it would
+    not notice otherwise.
 
     Returns:
-        The parameters whose gradient it is. Where the task left none, there is none: an optimizer
-        that leaves such a parameter out would never clear it.
+        The parameters whose gradients were filled. Those without a task gradient get none: an
+        optimizer that does not have such a parameter would never clear it.
     """
     poisoned = []
     for group in groups:

@@ -1,9 +1,9 @@
 """The guard in a loop that never calls it, such as a trainer's: hooks do all the work.
 
-A forward pass of the model is watched by hooks on its call. The anchor gradient is taken as it
-ends, from the graph that the loop's own backward pass goes through afterwards. When that backward
-pass has ended, `.grad` is projected, before anything clips it; the optimizer's hooks see the step.
-So the loop may be accelerate's, Lightning's, or a Trainer's.
+Hooks on the model's call watch each forward pass. When it ends, the anchor gradient is computed
+from the graph that the loop's own backward pass goes through later. When that backward pass has
+ended, `.grad` is projected, before anything clips it; the optimizer's hooks see the step. So the
+loop may be that of accelerate, Lightning, or a Trainer.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from aegis_cli.methods.base import Pass
 from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 from aegis_cli.models import wrappers
 
-# The name of an argument of the model's forward, or a function of all its arguments by name.
+# The name of an argument of the model's forward, or a function of a mapping of all its arguments.
 Source = str | Callable[[Mapping[str, Any]], Tensor | None] | None
 
 
 class AutomaticLoop:
-    """What the guard does at each event of the loop that `LoopHooks` reports."""
+    """The guard's action at each event of the loop that `LoopHooks` reports."""
 
     def __init__(
         self,
@@ -43,16 +43,16 @@ class AutomaticLoop:
         ledger: LedgerOutsideRuns,
         owners: Ranks,
     ) -> None:
-        """Begin without a pass.
+        """Start in a state without a pass.
 
         Args:
             stepper: takes the steps.
-            dual: takes the anchor gradients; None for a method that has none.
-            hooks: on the layers.
+            dual: computes the anchor gradients; None for a method that has none.
+            hooks: hooks on the layers.
             check: refuses a pass that cannot be compared with the anchor.
             scaler: the loop's own, which scales its losses.
-            ledger: of the guard.
-            owners: the processes that have some rows of every weight.
+            ledger: the guard's ledger.
+            owners: the processes that each have some rows of every weight.
         """
         self._stepper, self._dual, self._hooks = stepper, dual, hooks
         self._check, self._scaler, self._ledger = check, scaler, ledger
@@ -61,13 +61,14 @@ class AutomaticLoop:
         self._ahead: AnchorGradient | None = None
 
     def begin(self, mask: Tensor | None, image: Tensor | None) -> None:
-        """A forward pass under gradients begins.
+        """A forward pass with gradients begins.
 
         Raises:
-            AegisError: parameters that the guard does not know, or the pass before is still unused.
+            AegisError: the model has parameters that the guard does not know, or the previous pass
+                is still unused.
         """
         if not self._owners.several:
-            # Sharded weights may be gathered already, and others then in their place.
+            # Sharded weights may already be gathered, with other parameters in their place.
             self._stepper.check()
         if self._dual is None:
             return
@@ -86,7 +87,7 @@ class AutomaticLoop:
         self._watched.enter_context(self._hooks.watch(mask, image, self._note))
 
     def end(self, failed: bool) -> None:
-        """It has ended, or has raised an exception."""
+        """The forward pass has ended, or has raised an exception."""
         if self._watched is None:
             return
         watched, self._watched = self._watched, None
@@ -98,14 +99,14 @@ class AutomaticLoop:
     def _note(self, seen: Pass) -> None:
         assert self._dual is not None
         self._check(seen)
-        # Now, and not in the loop's own backward pass: that frees the graph.
+        # Now, not after the loop's own backward pass, which frees the graph.
         device = seen.hidden[0].device.type
         # The loop may call the model inside an autocast of its own.
         with torch.autocast(device, enabled=False):
             self._ahead = self._dual.ahead(seen, self._scale())
 
     def _scale(self) -> float:
-        """What the loop's scaler multiplies its next loss by."""
+        """The factor by which the loop's scaler multiplies its next loss."""
         return 1.0 if self._scaler is None else self._scaler.get_scale()
 
     def discard(self) -> None:
@@ -113,23 +114,23 @@ class AutomaticLoop:
         self._ahead = None
 
     def before_backward(self) -> None:
-        """A backward pass has come to the first parameter, and left nothing in it yet."""
+        """A backward pass has reached the first parameter, and not yet changed its gradient."""
         if self._dual is not None:
             self._dual.reopen()
 
     def left_nothing(self) -> None:
-        """The backward pass has ended and left nothing in `.grad`: it belongs to no step."""
+        """The backward pass has ended without changing `.grad`, so it belongs to no step."""
         if self._dual is not None:
             self._dual.leave()
 
     def after_backward(self) -> None:
-        """All its gradients lie in `.grad`.
+        """The backward pass has ended, with all its gradients in `.grad`.
 
         Raises:
-            AegisError: the guard saw no pass that they could be of.
+            AegisError: the guard saw no forward pass that they could belong to.
             Diverged: one is not finite, and no scaler skips the step.
         """
-        # An enabled scaler skips a step that overflows by itself.
+        # An enabled scaler skips overflowing steps on its own.
         skips = self._scaler is not None and self._scaler.is_enabled()
         if self._dual is None:
             self._stepper.passed()
@@ -148,10 +149,10 @@ class AutomaticLoop:
 
 
 class LoopHooks:
-    """Hooks on one module's call and on parameters of a model.
+    """Hooks on one module's call and on the parameters of a model.
 
-    A sharded parameter's hooks see nothing, since its gradient is put into `.grad` past them. Then
-    a backward pass begins where it comes to what the call has given.
+    Hooks on a sharded parameter see nothing, because FSDP writes its gradient into `.grad` without
+    calling them. In that case a backward pass begins when it reaches the outputs of the call.
     """
 
     def __init__(
@@ -163,22 +164,22 @@ class LoopHooks:
         mask: Source,
         image: Source,
     ) -> None:
-        """Put the hooks on.
+        """Register the hooks.
 
         Args:
-            learning: what learns; nothing where that is sharded.
+            learning: the trainable parameters; empty if they are sharded.
             around: the module whose call is a forward pass.
-            loop: what is told of it.
-            reads: whether masks are read from a call's arguments.
-            mask: where the mask of a pass is found.
-            image: where it is found which tokens are the image's.
+            loop: receives the events.
+            reads: whether masks are read from the arguments of a call.
+            mask: source of the mask of a pass.
+            image: source of the image mask of a pass.
         """
         self._around, self._loop, self._reads = around, loop, reads
         self._mask, self._image = mask, image
         self._parameters = inspect.signature(wrappers.unwrapped(around).forward)
         self._in_pass = self._in_backward = self._accumulated = self._at_output = False
-        # Functions are no part of a copy of the module, as bound methods would be. Compiled code
-        # leaves them alone.
+        # Plain functions, because bound methods would be copied along with the module. They are
+        # excluded from compilation.
         before = torch.compiler.disable(lambda *given: self._before(*given))
         after = torch.compiler.disable(lambda *given: self._after(*given))
         self._handles: list[Any] = [
@@ -193,17 +194,17 @@ class LoopHooks:
             self._handles.append(on_sum)
 
     def remove(self) -> None:
-        """Take the hooks off."""
+        """Remove the hooks."""
         for handle in self._handles:
             handle.remove()
 
     # --- the call ---------------------------------------------------------------------------------
 
     def _before(self, module: nn.Module, args: tuple[Any, ...], named: dict[str, Any]) -> None:
-        # A pass without gradients is an evaluation. A copy of the module has the hooks too.
+        # A pass without gradients is an evaluation. A copy of the module carries the hooks too.
         if module is not self._around or not torch.is_grad_enabled() or self._in_pass:
             return
-        # A backward pass that never ended has raised an exception, such as for want of memory.
+        # A backward pass that never ended has raised an exception, such as out of memory.
         if self._in_backward or self._at_output:
             self._loop.discard()
         self._in_backward = self._at_output = False
@@ -218,11 +219,11 @@ class LoopHooks:
         if module is not self._around or not self._in_pass:
             return
         try:
-            # Where the call has raised an exception, there is no output.
+            # If the call has raised an exception, there is no output.
             self._loop.end(failed=output is None)
         finally:
             self._in_pass = False
-        # A backward pass comes to the call's outputs before any of the model's gradients.
+        # A backward pass reaches the outputs of the call before any gradient of the model.
         hook = self._on_gradient if self._sharded else self._on_output
         for part in tree_leaves(output):
             if isinstance(part, Tensor) and part.requires_grad:
@@ -231,7 +232,7 @@ class LoopHooks:
     def _given(self, args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name."""
         given = dict(self._parameters.bind_partial(*args, **named).arguments)
-        # What the signature calls **kwargs was given by names of its own.
+        # Arguments collected in **kwargs have names of their own.
         for name, kind in self._parameters.parameters.items():
             if kind.kind is inspect.Parameter.VAR_KEYWORD:
                 given |= given.pop(name, {})
@@ -255,7 +256,7 @@ class LoopHooks:
     # --- the backward pass ------------------------------------------------------------------------
 
     def _on_output(self, gradient: Tensor) -> None:
-        """Note, until it has ended, a backward pass that may fail before the first parameter."""
+        """Record a running backward pass, since it may fail before the first parameter."""
         if not self._at_output:
             self._at_output = True
             at_end(self._on_output_end)
@@ -264,10 +265,10 @@ class LoopHooks:
         self._at_output = False
 
     def _on_gradient(self, gradient: Tensor) -> None:
-        """Prepare for the end of a backward pass, at the first tensor that it comes to."""
+        """Prepare for the end of a backward pass, at the first tensor that it reaches."""
         if self._in_pass or self._in_backward:  # the guard's own pass, or a later tensor
             return
-        # Of sharded parameters nobody tells whether anything is left in `.grad`: it is taken to be.
+        # For sharded parameters, no hook reports whether `.grad` has changed: assume that it has.
         self._in_backward, self._accumulated = True, self._sharded
         self._loop.before_backward()
         at_end(self._on_end)
@@ -276,12 +277,12 @@ class LoopHooks:
         self._accumulated = True
 
     def _on_end(self) -> None:
-        # DistributedDataParallel has its own work at the end, which it may have asked for later.
+        # DistributedDataParallel has a callback of its own, which may have been queued after ours.
         at_end(self._on_finished)
 
     def _on_finished(self) -> None:
         self._in_backward = False
-        # `torch.autograd.grad` leaves nothing in `.grad`: it is no step's.
+        # `torch.autograd.grad` does not change `.grad`, so it belongs to no step.
         if self._accumulated:
             self._loop.after_backward()
         else:

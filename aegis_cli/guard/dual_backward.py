@@ -23,10 +23,10 @@ from aegis_cli.methods.ledger_file import LedgerOutsideRuns
 
 @dataclass(frozen=True)
 class AnchorGradient:
-    """The gradient of one pass's penalty.
+    """The gradient of the penalty of one pass.
 
     Attributes:
-        taken: it, by the parameters' ids; None where the penalty does not reach.
+        taken: the gradient by the parameters' ids; None if the penalty does not reach a parameter.
         w2: W2^2 of each layer [L].
     """
 
@@ -35,7 +35,7 @@ class AnchorGradient:
 
 
 class DualBackward:
-    """The backward passes of a method that has a penalty.
+    """The backward passes of a method with a penalty.
 
     Attributes:
         anchor: mean anchor gradient of the current sum, by the parameters' ids.
@@ -51,14 +51,14 @@ class DualBackward:
         processes: ProcessGroup,
         around: Sequence[nn.Parameter] = (),
     ) -> None:
-        """Begin without a pass.
+        """Start in a state without a pass.
 
         Args:
-            groups: the parameters that learn, each once; the ledger has a column for each group.
-            owners: the processes that have some rows of every weight.
-            processes: those that train the model together.
-            around: the parameters of the policy that the model is a part of, which are left to the
-                task alone.
+            groups: the trainable parameters, each once; the ledger has a column for each group.
+            owners: the processes that each have some rows of every weight.
+            processes: the processes that train the model together.
+            around: the parameters of the policy that the model is a part of, which keep only their
+                task gradient.
         """
         self._parts, self._groups, self._stepper = parts, groups, stepper
         self._ledger, self._owners, self._processes = ledger, owners, processes
@@ -66,10 +66,10 @@ class DualBackward:
         self._sum: Accumulation | None = None
         self._reopened: Accumulation | None = None  # while a backward pass of the loop adds to it
         self._step, self._checkpointing_checked = 0, False
-        # Whether the ledger has a row of the last sum, of which a step may still be to come; and
-        # whether a scaler may skip that.
+        # Whether the ledger has a row for the last sum although its step may still be to come; and
+        # whether a scaler may skip that step.
         self._row_is_open, self._skips = False, False
-        # Those whose `.grad` tells a scaler to skip the step that it is of.
+        # Parameters whose `.grad` makes a scaler skip the current step.
         self._poisoned: list[nn.Parameter] = []
 
     @property
@@ -87,19 +87,19 @@ class DualBackward:
         self.close_row()
 
     def close_row(self) -> None:
-        """Drop the row of the last sum where no step was made of it.
+        """Drop the ledger's row for the last sum if it led to no step.
 
-        A scaler has skipped it, as for a gradient of what the guard does not know, or the loop has
-        left it out.
+        Either a scaler skipped the step, perhaps because of a gradient outside the guarded model,
+        or the loop left it out.
         """
         if self._row_is_open and not self._stepper.may_have_moved(self._skips):
             self._ledger.truncate(self._step - 1)
         self._row_is_open = False
 
     def check_group(self) -> None:
-        """Raise AegisError where processes have been connected of which the guard does not know.
+        """Raise AegisError if processes were connected that the guard does not know of.
 
-        Trainers connect them long after the guard was made.
+        Trainers connect them long after the guard was created.
         """
         process_groups.check(self._processes)
 
@@ -112,7 +112,7 @@ class DualBackward:
         """Whether `.grad` still holds the projected sum, which further passes add to.
 
         Raises:
-            AegisError: it is neither that nor cleared, or a step was made of it already.
+            AegisError: it is neither that nor cleared, or a step was already taken with it.
         """
         continued = accumulation.continues(self._sum, self._learning())
         if continued and self._sum is not None and not self._sum.empty:
@@ -120,7 +120,7 @@ class DualBackward:
         return continued
 
     def _refuse_uncleared(self) -> None:
-        """Refuse to add to gradients of which a step was made: they would count in the next too."""
+        """Refuse to add to gradients that were already used in a step: they would count twice."""
         if self._stepper.has_stepped:
             raise AegisError(
                 "gradients that were not cleared after the step that was made of them",
@@ -129,7 +129,7 @@ class DualBackward:
             )
 
     def backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
-        """Go back from the loss and the pass's penalty, and project the sum.
+        """Backpropagate from the loss and the penalty of the pass, and project the sum.
 
         Args:
             loss: scaled by `scale`.
@@ -140,19 +140,19 @@ class DualBackward:
         self._refuse_reentrant(penalty)
         groups = self._learning()
         continued = self.continues()
-        total, self._sum = self._sum if continued else None, None  # until this pass has ended well
-        # PyTorch adds to `.grad`, where the sum has to lie plain: what is projected is the sum, not
-        # each pass's share of it.
+        total, self._sum = self._sum if continued else None, None  # until this pass has succeeded
+        # PyTorch adds to `.grad`, so that must hold the unprojected sum: the sum is projected, not
+        # the share of each pass.
         if total is not None:
             accumulation.take_back(total, groups)
         else:
             self.close_row()
         self._see_whether_cleared()
-        # Loss and penalty share the graph. Both are scaled alike, so that the weights of their
-        # gradients are those of unscaled ones.
+        # Loss and penalty share the graph. Both have the same scale, so that the weights of their
+        # gradients are the same as without it.
         loss.backward(retain_graph=True)
         self._stepper.passed()
-        # Under FSDP a gradient is reduced and cut only on its way into `.grad`.
+        # Under FSDP a gradient is reduced and sharded only on its way into `.grad`.
         if self._owners.several:
             taken = backward.second_backward_of_rows(groups, penalty * scale, self._around)
         else:
@@ -160,11 +160,12 @@ class DualBackward:
         self._add(total, AnchorGradient(taken, w2), loss.detach(), scale, skips)
 
     def ahead(self, seen: Pass, scale: float) -> AnchorGradient:
-        """The anchor gradient of a pass that a loss is still to be made of; the graph stays.
+        """The anchor gradient of a pass whose loss is not computed yet; the graph is kept.
 
         Args:
-            scale: what the loss is going to be scaled by. The penalty is scaled before it goes
-                back, as the loss is: in half precision its gradients would vanish otherwise.
+            scale: the factor that the loss will be scaled by. The penalty is scaled by it before
+                its backward pass too, because its half-precision gradients would underflow
+                otherwise.
         """
         assert self._parts.penalty is not None
         penalty, w2 = self._parts.penalty(seen)
@@ -173,13 +174,13 @@ class DualBackward:
         return AnchorGradient(taken, w2.detach())
 
     def reopen(self) -> None:
-        """Make `.grad` the plain sum, before a backward pass of the loop's own adds to it.
+        """Make `.grad` the unprojected sum, before the loop's own backward pass adds to it.
 
-        DistributedDataParallel averages `.grad` as that pass ends, and each process has taken back
-        its own projection by then.
+        DistributedDataParallel averages `.grad` when that pass ends, and by then each process has
+        undone its own projection.
 
         Raises:
-            AegisError: as `continues`.
+            AegisError: as in `continues`.
         """
         self._reopened, self._sum = self._sum if self.continues() else None, None
         if self._reopened is not None:
@@ -189,27 +190,27 @@ class DualBackward:
         self._see_whether_cleared()
 
     def _see_whether_cleared(self) -> None:
-        """Before a backward pass: whether a step that overflowed is over.
+        """Check, before a backward pass, whether a step that overflowed is over.
 
         Raises:
-            AegisError: it is for some of the parameters alone. The others' infinities would have
-                every step skipped from now on.
+            AegisError: it is over only for some of the parameters. The infinite gradients of the
+                others would cause every later step to be skipped.
         """
         if accumulation.cleared([self._poisoned]):
             self._poisoned = []
         accumulation.refuse_partly_cleared(self._poisoned)
 
     def leave(self) -> None:
-        """Project `.grad` as it was before `reopen`, for that pass has added nothing to it."""
+        """Project `.grad` as before `reopen`, because the backward pass added nothing to it."""
         self._sum, self._reopened = self._reopened, None
         if self._sum is not None:
             accumulation.put_back(self._sum, self._learning())
 
     def arrived(self, anchor: AnchorGradient, scale: float, skips: bool) -> None:
-        """Project `.grad`, to which a backward pass of the loop's own has added its gradient.
+        """Project `.grad`, to which the loop's own backward pass has added its gradient.
 
         Args:
-            anchor: what `ahead` gave of the same forward pass, with the same `scale`.
+            anchor: the result of `ahead` for the same forward pass, with the same `scale`.
         """
         total, self._reopened = self._reopened, None
         self._stepper.passed()
@@ -225,32 +226,32 @@ class DualBackward:
     ) -> None:
         """Add an anchor gradient to the sum, and project.
 
-        The ledger's row of this step is that of the sum.
+        The ledger's row for this step is that of the sum.
         """
         assert self._parts.combine is not None
         groups, taken, w2 = self._learning(), anchor.taken, anchor.w2
         processes = process_groups.resolved(self._processes)
         if processes is not None:
-            if not self._owners.several:  # else they arrive as means
+            if not self._owners.several:  # otherwise they are already averaged
                 learning = {id(p): p for group in groups for p in group}
                 taken = process_groups.mean_gradients(taken, learning, processes)
-            # The same figures in every process: they decide together whether the step is finite.
+            # The same values in every process, so that all agree on whether the step is finite.
             numbers = [w2] if loss is None else [w2, loss]
             w2, *rest = process_groups.mean_over(numbers, processes)
             loss = next(iter(rest), None)
         if total is None:
-            if not self._poisoned:  # else it is a further micro-batch of that step
+            if not self._poisoned:  # otherwise it is another micro-batch of the same step
                 self._step += 1
             total = accumulation.started(taken, w2)
         else:
             accumulation.grow(total, taken, w2)
         over_rows = self._owners.total if self._owners.several else None
-        # Noted before the combination, which may give these parameters the anchor's gradient.
+        # Recorded before the combination, which may give these parameters the anchor gradient.
         total.idle = {id(p) for group in groups for p in group if p.grad is None}
         gram, weights = backward.combine_gradients(
             groups, total.anchor, self._parts.combine, over_rows
         )
-        # A further micro-batch of the same step replaces the step's row.
+        # Another micro-batch of the same step replaces the row of the step.
         self._ledger.truncate(self._step - 1)
         numbers = [*gram, total.w2] if loss is None else [loss, *gram, total.w2]
         if not all(x.isfinite().all() for x in numbers) or _overflowed(groups):
@@ -259,7 +260,7 @@ class DualBackward:
             self._poisoned = accumulation.poison(total, groups)
             return
         check_row(gram, self._ledger.groups)
-        # Both gradients are scaled, so that each inner product has the scale twice.
+        # Both gradients are scaled, so each inner product contains the scale squared.
         tt, ta, aa = (x / scale**2 for x in gram)
         self._ledger.append(self._step, tt, ta, aa, total.w2)
         self._row_is_open, self._skips = True, skips
@@ -288,14 +289,14 @@ class DualBackward:
 
 
 def _overflowed(groups: Sequence[Sequence[nn.Parameter]]) -> bool:
-    """Whether a combination of finite gradients is none in float16, the only type so narrow."""
+    """Whether combined gradients overflowed in float16, the only dtype with so small a range."""
     gradients = [p.grad for group in groups for p in group if p.grad is not None]
     narrow = [gradient for gradient in gradients if gradient.dtype == torch.float16]
     return bool(narrow) and not nn.utils.get_total_norm(narrow, norm_type=math.inf).isfinite()
 
 
 def diverged(steps: int) -> Diverged:
-    """The error for a loss or gradient that is not finite, after so many steps."""
+    """The error for a loss or gradient that is not finite, after `steps` steps."""
     return Diverged(
         "a loss or gradient that is not finite",
         "finite numbers",
@@ -309,11 +310,12 @@ def check_pass(seen: Pass, widths: Sequence[int], compared: Sequence[str]) -> No
     """Refuse a watched pass that cannot be compared with the anchor.
 
     Args:
-        widths: of the anchor's layers.
-        compared: token types that are compared apart.
+        widths: widths of the anchor's layers.
+        compared: token types that are compared separately.
 
     Raises:
-        AegisError: no graph, other layers than the anchor's, or no token of a compared type.
+        AegisError: there is no graph, the layers differ from those of the anchor, or there is no
+            token of a compared type.
     """
     if not any(hidden.requires_grad for hidden in seen.hidden):
         raise AegisError(

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from transformers import TrainerCallback
 
 METHODS = tuple(SECTIONS)
-# The token types that a scope tells apart.
+# The token types that each scope compares separately.
 _COMPARED = {"all": (), "image": ("image",), "text": ("text",), "each": ("image", "text")}
 
 
@@ -46,22 +46,22 @@ class Guard(Removable):
             with guard.watch(batch["attention_mask"]):  # None: every token counts
                 loss = model(**batch).loss
             guard.backward(loss)  # instead of loss.backward()
-            guard.step(optimizer)  # or optimizer.step(), where nothing constrains the update
+            guard.step(optimizer)  # or optimizer.step(), if nothing constrains the update
             optimizer.zero_grad()
         guard.ledger.save("ledger.safetensors")
 
-    Give it the VLM rather than the policy around it: what lies outside is left to the task alone.
+    Pass the VLM rather than the policy around it: parameters outside it follow the task alone.
 
-    Several backward passes before one step: the *sum* of their task gradients is projected against
-    the mean of their anchor gradients, and lies in `.grad` after each. What lay in `.grad` before
-    the first is part of that sum.
+    With several backward passes before one step, the *sum* of their task gradients is projected
+    against the mean of their anchor gradients, and the result is in `.grad` after each pass.
+    Gradients that were in `.grad` before the first pass are part of that sum.
 
     Attributes:
-        ledger: inner products of each group of which something learns, and W2^2 of each layer, one
-            row per optimizer step.
-        unprotected: names of learning modules that nothing holds (`nullspace` and `kfac`): those
-            that `protect` leaves free, and those on which no answer depended when the anchor was
-            measured.
+        ledger: inner products of each group that has trainable parameters, and W2^2 of each layer,
+            one row per optimizer step.
+        unprotected: names of trainable modules that are not protected (`nullspace` and `kfac`):
+            those that `protect` leaves free, and those on which no answer depended when the anchor
+            was measured.
     """
 
     def __init__(
@@ -83,23 +83,23 @@ class Guard(Removable):
         Args:
             model: the pre-trained VLM, or with `part` the policy around it; frozen parts stay
                 frozen.
-            anchor: file of `Guard.measure`, or of `aegis anchor` for the VLM that was loaded.
-            layers: dotted name of the list of transformer layers, or the layers; None: the only
-                list of equal blocks.
-            part: dotted name of the VLM in a policy that is given as `model`; all other names are
-                those inside it.
-            method: `aegis`; or `nullspace` or `kfac`, which need `guard.step`.
-            vision: dotted names of the parts that read pixels (of `protect`, the kind `stem`).
+            anchor: file from `Guard.measure`, or from `aegis anchor` for the loaded VLM.
+            layers: dotted name of the list of transformer layers, or the layers themselves; None:
+                the only list of equal blocks.
+            part: dotted name of the VLM within a policy given as `model`; all other names are
+                relative to it.
+            method: `aegis`, or `nullspace` or `kfac`, which need `guard.step`.
+            vision: dotted names of the parts that read pixels (kind `stem` of `protect`).
             process_group: the processes that train copies of the model together
-                (DistributedDataParallel), or a model that is sharded already (FSDP2). "world" is
-                all of them, also where a trainer connects them later.
-            options: the method's, as in a recipe. `nullspace` and `kfac` protect all that learns,
-                or refuse; with `protect`, exactly those kinds (of `kfac`: `maps`, `stem`). Their
-                `every` is 1 unless given: see `settle`.
+                (DistributedDataParallel), or a model that is already sharded (FSDP2). "world" means
+                all of them, even if a trainer connects them later.
+            options: options of the method, as in a recipe. `nullspace` and `kfac` protect
+                everything trainable or raise an error; with `protect`, exactly the kinds given (for
+                `kfac`: `maps`, `stem`). Their `every` defaults to 1: see `settle`.
 
         Raises:
-            AegisError: nothing that learns, layers that cannot be told, an anchor of another model,
-                unknown options, sharded weights.
+            AegisError: nothing is trainable, the layers cannot be identified, the anchor is of
+                another model, options are unknown, or weights are sharded in an unsupported way.
         """
         if method not in METHODS:
             raise AegisError(
@@ -112,7 +112,7 @@ class Guard(Removable):
         if dual:
             process_groups.check(process_group)
         _refuse_unfit(model)
-        # The other methods look at maps, and need not be told which modules are layers.
+        # The other methods work on maps and do not need to know which modules are layers.
         with naming_its_part(model, path, part):
             found = structure.find_layers(model, layers) if dual else {}
         groups = structure.learning_groups(model, found) if dual else {}
@@ -124,7 +124,7 @@ class Guard(Removable):
         self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
-        # Whoever names the kinds to protect has decided about the rest too.
+        # Naming the kinds to protect is a decision about all others too.
         averaging = {} if dual or "protect" in options else structure.averaging(model)
         self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
         self._hooks = LayerHooks(found)
@@ -153,18 +153,19 @@ class Guard(Removable):
         """Compare the forward pass inside the block with the anchor.
 
         Each `backward` needs one block; evaluation needs none. `nullspace` and `kfac` compare
-        nothing, and need no block.
+        nothing and need no block.
 
         Args:
-            mask: [B, T] of the tokens that the layers see, true at those that count; None: every
-                token counts. Where a layer is called several times in the block, all tokens in the
-                order of the calls.
+            mask: [B, T] for the tokens that the layers see, true at those that count; None: every
+                token counts. If a layer is called several times in the block, it covers the tokens
+                of all calls, in their order.
             image: [B, T] or [T], true at image tokens; for the options `scope="image"`, `"text"`
                 and `"each"`.
 
         Raises:
-            AegisError: a mask of another shape, layers that were not called or have no graph, a
-                pass still unused, parameters that the guard does not know.
+            AegisError: the mask has a wrong shape, layers were not called or have no graph, the
+                previous pass is still unused, or the model has parameters that the guard does not
+                know.
         """
         self._check_ready()
         self._refuse_automatic("guard.watch", "the model itself")
@@ -189,25 +190,25 @@ class Guard(Removable):
         self._check_image(image)
         self._dual.check_group()
         self._dual.forget_cleared()
-        # In every pass, for the model may be compiled after the guard was made.
+        # In every pass, because the model may be compiled after the guard was created.
         backward.recompile_for_two_backward_passes()
         with self._hooks.watch(mask, image, self._note):
             yield
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
-        """Give the hidden states after a layer by hand, where nobody calls the layer itself.
+        """Report the hidden states after a layer by hand, if the layer itself is never called.
 
-        So do loops that run two models side by side, as pi0's: they call the parts of both models'
-        layers, and attend over the tokens of both. Outside a watched pass this does nothing, so
-        that it can stay in the policy; neither does it after `remove`, nor for `nullspace` and
-        `kfac`, which compare no hidden states.
+        Loops that run two models side by side need this, such as that of pi0: they call the parts
+        of both models' layers and attend over the tokens of both. Outside a watched pass this does
+        nothing, so the call can stay in the policy. It also does nothing after `remove`, and for
+        `nullspace` and `kfac`, which compare no hidden states.
 
         Args:
-            layer: one of the guard's layers, or its number.
-            hidden: [B, T, D] after the layer, of the tokens that the mask is of.
+            layer: one of the guard's layers, or its index.
+            hidden: [B, T, D] after the layer, for the tokens that the mask covers.
 
         Raises:
-            AegisError: none of the layers, or one that is called too.
+            AegisError: it is none of the layers, or one that is also called.
         """
         if not self._removed:
             self._hooks.note(layer, hidden)
@@ -220,24 +221,24 @@ class Guard(Removable):
         image: Source = None,
         scaler: Scaler | None = None,
     ) -> Self:
-        """Guard a loop that calls nothing of the guard: a trainer's, or your own as it is.
+        """Guard a loop that never calls the guard: a trainer's, or your own, unchanged.
 
-        From now on each forward pass under gradients is watched, each `backward()` leaves the
-        gradients as the method wants them, and each `optimizer.step()` is constrained.
+        From now on each forward pass with gradients is watched, each `backward()` leaves the
+        gradients that the method computes, and each `optimizer.step()` is constrained.
 
         Args:
             around: the module whose call is one forward pass; None: the model itself.
-            mask: the argument of that call that is the mask [B, T] of `watch`; or a function of
-                all its arguments, a mapping by name, that gives the mask; None: every token counts.
-            image: likewise the image mask, for the options `scope="image"`, `"text"`, `"each"`.
+            mask: the argument of that call that is the mask [B, T] of `watch`; or a function that
+                takes a mapping of all its arguments and returns the mask; None: every token counts.
+            image: likewise for the image mask, for the options `scope="image"`, `"text"`, `"each"`.
             scaler: the GradScaler that scales the loop's losses.
 
         Returns:
             The guard itself.
 
         Raises:
-            AegisError: no image mask where one is needed, a method with a second backward pass over
-                sharded weights, or a guard that is automatic already.
+            AegisError: a needed image mask is missing, the method has a second backward pass but
+                the weights are sharded, or the guard is automatic already.
         """
         self._check_ready()
         if self._automatic is not None:
@@ -269,16 +270,16 @@ class Guard(Removable):
         )
         self._stepper.take_by_itself(self._anchor_gradient)
         called = self._model if around is None else around
-        # Hooks on sharded parameters would see nothing: see `LoopHooks`.
+        # Hooks on sharded parameters are never called: see `LoopHooks`.
         learning = [] if self._owners.several else structure.learning(self._model).values()
         reads = self._dual is not None
         self._loop_hooks = LoopHooks(learning, called, self._automatic, reads, mask, image)
         return self
 
     def callback(self, *, mask: Source = "attention_mask", image: Source = None) -> TrainerCallback:
-        """A callback for `transformers.Trainer(callbacks=[...])`, which then trains guarded.
+        """A callback for `transformers.Trainer(callbacks=[...])` that guards its training.
 
-        It makes the guard automatic as the training begins, and settles before each checkpoint and
+        It makes the guard automatic when training begins, and settles before each checkpoint and
         evaluation, and at the end.
 
         Args:
@@ -307,23 +308,23 @@ class Guard(Removable):
             self._automatic.discard()
 
     def backward(self, loss: Tensor, scaler: Scaler | None = None) -> None:
-        """Leave the gradients as the method wants them in `.grad`, instead of `loss.backward()`.
+        """Compute the gradients that the method wants in `.grad`, instead of `loss.backward()`.
 
         Args:
-            loss: the task's, a scalar with its graph, unscaled.
-            scaler: scales it and the penalty; then `scaler.unscale_`, clipping and `scaler.step`
-                follow as ever.
+            loss: the task loss, a scalar with its graph, unscaled.
+            scaler: scales the loss and the penalty; then `scaler.unscale_`, clipping and
+                `scaler.step` follow as usual.
 
         Raises:
-            AegisError: no watched pass, no scalar with a graph, gradients that changed between two
-                calls, or a pass that does not reach what the guard knows.
-            Diverged: a loss or gradient that is not finite, and no scaler to skip the step; nothing
-                has moved.
+            AegisError: there is no watched pass, the loss is not a scalar with a graph, gradients
+                changed between two calls, or the pass does not reach the guarded parameters.
+            Diverged: a loss or gradient is not finite, and there is no scaler to skip the step;
+                nothing has moved.
         """
         self._check_ready()
         self._refuse_automatic("guard.backward", "loss.backward()")
         if not self._owners.several:
-            # Sharded weights may still be gathered, and others then in their place.
+            # Sharded weights may still be gathered, with other parameters in their place.
             self._stepper.check()
         if self._hooks.open:
             raise AegisError(
@@ -333,11 +334,11 @@ class Guard(Removable):
             )
         _check_loss(loss)
         scaled = loss if scaler is None else scaler.scale(loss)
-        # An enabled scaler expects overflows: it skips such steps by itself, and lowers its scale.
+        # An enabled scaler expects overflows: it skips such steps itself and lowers its scale.
         skips = scaler is not None and scaler.is_enabled()
         if self._dual is None:
-            # No second backward pass: the method constrains the update, and gradients stay as the
-            # task leaves them.
+            # No second backward pass: the method constrains the update, and the gradients stay
+            # those of the task.
             if not skips and not loss.isfinite():
                 raise diverged(len(self.ledger))
             scaled.backward()
@@ -345,7 +346,7 @@ class Guard(Removable):
             if not skips and not self._stepper.gradients_finite(self._owners):
                 raise diverged(len(self.ledger))
             return
-        seen, self._seen = self._seen, None  # each pass once: its graph is used up here
+        seen, self._seen = self._seen, None  # used only once: its graph is freed here
         if seen is None:
             raise AegisError(
                 "guard.backward without a watched pass",
@@ -355,15 +356,15 @@ class Guard(Removable):
         self._dual.backward(scaled, seen, 1.0 if scaler is None else scaler.get_scale(), skips)
 
     def step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
-        """Take the step with the update as the method wants it, instead of `optimizer.step()`.
+        """Take a step with the update that the method allows, instead of `optimizer.step()`.
 
         Args:
-            optimizer: the user's own.
-            scaler: takes the step where there is one, instead of `scaler.step(optimizer)`.
+            optimizer: the user's own optimizer.
+            scaler: if given, the step is taken through it, instead of `scaler.step(optimizer)`.
 
         Raises:
-            AegisError: no guard.backward before it, or other parameters learning than when the
-                guard was made.
+            AegisError: there was no guard.backward before it, or the trainable parameters are not
+                those from when the guard was created.
         """
         self._check_ready()
         self._refuse_automatic("guard.step", "optimizer.step()")
@@ -376,22 +377,22 @@ class Guard(Removable):
                 "call it instead of loss.backward()",
             )
         self._stepper.step(optimizer, scaler, self._anchor_gradient())
-        # With several optimizers another one may still step on the same sum.
+        # With several optimizers, another one may still take a step with the same sum.
         if dual is not None and self._stepper.is_of_all(optimizer):
             dual.close_row()
 
     def settle(self) -> None:
-        """Constrain the steps since the last constraint now, before a model is saved or evaluated.
+        """Constrain the pending steps now, before a model is saved or evaluated.
 
-        Only `nullspace` and `kfac` with `every` above 1 need it, which constrain so many steps
-        together: in between, the weights also hold what the last steps have moved along protected
-        directions.
+        Only `nullspace` and `kfac` with `every` above 1 need it, because they constrain that many
+        steps together: in between, the weights also contain what the last steps have moved along
+        protected directions.
         """
         self._check_ready()
         self._stepper.settle()
 
     def remove(self) -> None:
-        """Settle, and take all hooks off; the model is as it was."""
+        """Settle, and remove all hooks from the model."""
         self._stepper.settle()
         self._hooks.remove()
         self._stepper.remove()
@@ -435,7 +436,7 @@ class Guard(Removable):
 
 
 def _check_mask(mask: object) -> None:
-    """Raise AegisError for a mask that is no tensor."""
+    """Raise AegisError for a mask that is not a tensor."""
     if mask is not None and not isinstance(mask, Tensor):
         raise AegisError(
             f"a mask that is a {type(mask).__name__}",
@@ -445,7 +446,7 @@ def _check_mask(mask: object) -> None:
 
 
 def _check_loss(loss: object) -> None:
-    """Raise AegisError for a loss that no backward pass can begin with."""
+    """Raise AegisError for a loss that no backward pass can start from."""
     if not isinstance(loss, Tensor):
         raise AegisError(
             f"a loss that is a {type(loss).__name__}",
@@ -461,7 +462,7 @@ def _check_loss(loss: object) -> None:
 
 
 def _check_optimizer(optimizer: object, constrained: bool) -> None:
-    """Raise AegisError for what takes no step, or for one whose parameters have to be known."""
+    """Raise AegisError for an object that takes no steps, or lacks the `param_groups` needed."""
     needed = "param_groups" if constrained else "step"
     is_scheduler = isinstance(optimizer, torch.optim.lr_scheduler.LRScheduler)
     if is_scheduler or not hasattr(optimizer, needed):
@@ -473,7 +474,7 @@ def _check_optimizer(optimizer: object, constrained: bool) -> None:
 
 
 def _refuse_unfit(model: nn.Module) -> None:
-    """Raise AegisError for a model that no method can guard, or of which nothing learns."""
+    """Raise AegisError for a model that no method can guard, or in which nothing learns."""
     _refuse_sparse(model)
     structure.refuse_offloaded(model)
     _refuse_spread_together(model)
@@ -486,7 +487,7 @@ def _refuse_unfit(model: nn.Module) -> None:
 
 
 def _refuse_sparse(model: nn.Module) -> None:
-    """Raise AegisError for tables whose gradients are sparse, which no projection reads."""
+    """Raise AegisError for tables with sparse gradients, which no projection supports."""
     for name, module in model.named_modules():
         table = isinstance(module, nn.Embedding | nn.EmbeddingBag)
         if table and module.sparse and module.weight.requires_grad:
@@ -498,9 +499,9 @@ def _refuse_sparse(model: nn.Module) -> None:
 
 
 def _refuse_spread_together(model: nn.Module) -> None:
-    """Raise AegisError where several processes each have a model that lies on several devices.
+    """Raise AegisError if several processes each have a model that spans several devices.
 
-    They would exchange gradients of a device that is another process's.
+    They would exchange gradients on a device that belongs to another process.
     """
     devices = sorted({str(p.device) for p in model.parameters()})
     if len(devices) > 1 and process_groups.count() > 1:
@@ -512,10 +513,10 @@ def _refuse_spread_together(model: nn.Module) -> None:
 
 
 def _owners(model: nn.Module, group: dist.ProcessGroup | None) -> Ranks:
-    """The processes that have some rows of every weight; one where each has all.
+    """The processes that each have some rows of every weight; just one if each has all.
 
     Raises:
-        AegisError: weights that are sharded in a way that no method knows.
+        AegisError: the weights are sharded in a way that no method supports.
     """
     if not sharded(model):
         return ALONE

@@ -1,7 +1,7 @@
-"""The parameters that learn in a guarded model: where they are, what moved them, their gradients.
+"""The trainable parameters of a guarded model: their device, their gradients, and what moved them.
 
-A guard works on what it found when it was made. It refuses a model in which other parameters learn
-than then, or the same ones in another place.
+A guard works on the parameters that it found when it was created. It refuses a model in which other
+parameters have become trainable, or the same ones are on another device.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from aegis_cli.models import structure
 
 
 class LearningParameters:
-    """What learned in a model when a guard was made for it.
+    """The parameters that were trainable in a model when a guard was created for it.
 
     Attributes:
         named: the parameters by their names in the model.
@@ -34,19 +34,19 @@ class LearningParameters:
     # --- refusals ---------------------------------------------------------------------------------
 
     def refuse_others(self) -> None:
-        """Raise AegisError where other parameters learn now."""
+        """Raise AegisError if other parameters learn now."""
         if structure.learning(self._model).keys() != self.named.keys():
             raise _others()
 
     def refuse_further(self) -> None:
-        """Raise AegisError where more parameters learn now; some may be frozen meanwhile."""
+        """Raise AegisError if further parameters learn now; some may have been frozen since."""
         if structure.learning(self._model).keys() - self.named.keys():
             raise _others()
 
     def refuse_another_place(self) -> None:
-        """Raise AegisError where they are elsewhere now, or of another type.
+        """Raise AegisError if they are on another device now, or have another dtype.
 
-        The tensors that constrain them did not move with them.
+        The tensors that constrain them were not moved with them.
         """
         devices = [p.device for p in self.named.values()]
         if devices != self._devices:
@@ -68,28 +68,28 @@ class LearningParameters:
                 )
 
     def refuse_unreached(self) -> None:
-        """Raise AegisError where none of them has a gradient."""
+        """Raise AegisError if none of them has a gradient."""
         check_reached(self.named.values())
 
     # --- gradients and writes ---------------------------------------------------------------------
 
     def gradients(self) -> list[Tensor]:
-        """Their gradients, as far as they are there, and of sharded ones the rows."""
+        """Their gradients, where present; for sharded ones, the local rows."""
         return [rows_here(p.grad) for p in self.named.values() if p.grad is not None]
 
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
         """Whether every gradient is finite, in all processes."""
-        # The largest entry is finite only if all are; NaN passes through the maximum.
+        # The largest entry is finite only if all are; a NaN propagates through the maximum.
         largest = nn.utils.get_total_norm(self.gradients(), norm_type=math.inf)
         return not owners.any(not largest.isfinite())[0]
 
     def by_name(self, gradients: Mapping[int, Tensor | None]) -> dict[str, Tensor]:
-        """Gradients that are known by the parameters' ids, by their names."""
+        """Map gradients from the ids of the parameters to their names."""
         found = {name: gradients.get(id(p)) for name, p in self.named.items()}
         return {name: gradient for name, gradient in found.items() if gradient is not None}
 
     def versions(self) -> list[int]:
-        """How often each was written to, as PyTorch counts it."""
+        """How often each was written to, by PyTorch's version counter."""
         return [p._version for p in self.named.values()]
 
     # --- optimizers -------------------------------------------------------------------------------
@@ -100,16 +100,16 @@ class LearningParameters:
         return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
 
     def are_all_in(self, optimizer: Optimizer) -> bool:
-        """Whether an optimizer has all of them, and no other one's step belongs to its own.
+        """Whether an optimizer has all of them, so that no other one shares its step.
 
-        One that is none of PyTorch's does not tell.
+        False for an optimizer that is not PyTorch's, because it cannot be asked.
         """
         if not isinstance(optimizer, Optimizer):
             return False
         return self._ids() <= {id(p) for group in optimizer.param_groups for p in group["params"]}
 
     def shared_with(self, other: LearningParameters) -> list[str]:
-        """The other's names of those that it has too."""
+        """Names, in `other`, of the parameters that both have."""
         mine = self._ids()
         return [name for name, p in other.named.items() if id(p) in mine]
 

@@ -1,7 +1,7 @@
-"""Which of an optimizer's nameless parameters are a VLM's: told by their values.
+"""Identify, by their values, which of an optimizer's unnamed parameters belong to a VLM.
 
-A program that takes an optimizer and nothing else gives it parameters without names. Before
-anything has learned, the values of a parameter say which weight of the VLM it is.
+A program that accepts nothing but an optimizer gives it parameters without names. Before any
+training, the values of a parameter tell which weight of the VLM it is.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.structure import digest
 
-# The types in which a program may keep a VLM that is stored in float32, in the order of looking.
+# The dtypes in which a program may hold a VLM that is stored in float32, in search order.
 _TYPES = (torch.float32, torch.bfloat16, torch.float16)
-# How far a weight that has learned is from what it was, of its own size, at most. Weights that have
-# nothing to do with each other are farther apart than the size of either.
+# The largest distance, relative to its norm, that a weight is assumed to move by learning.
+# Unrelated weights are farther apart than the norm of either.
 _NEAR = 0.5
 
 
@@ -36,15 +36,15 @@ def match(
 ) -> dict[str, Pair]:
     """The parameters that have the values of the base model's sites, by site.
 
-    A program may have rounded the VLM, which is stored in float32: then those that have the rounded
-    values, of sites whose own nothing has.
+    A program may have rounded the VLM, which is stored in float32. So if no parameter has the exact
+    values of a site, those with its rounded values match.
 
     Args:
         claimed: ids of parameters that are known to be something else.
 
     Raises:
-        AegisError: several sites of equal values, and not as many parameters; a weight without its
-            bias.
+        AegisError: several sites have equal values but the number of matching parameters differs,
+            or a weight lacks its bias.
     """
     # Parameters of a shape that the VLM does not have are not read at all.
     shapes = {tensor.shape for pair in base.values() for tensor in pair if tensor is not None}
@@ -53,7 +53,7 @@ def match(
         if parameter.shape in shapes and id(parameter) not in claimed:
             places.setdefault(_values(parameter), []).append(place)
     found: dict[str, Pair] = {}
-    # In float32 first: a site that has its exact values somewhere is not looked for as rounded.
+    # float32 first: if the exact values of a site are found, its rounded ones are not tried.
     for dtype in _TYPES:
         rest = {site: pair for site, pair in base.items() if site not in found}
         found |= _match_in(dtype, rest, ordered, places)
@@ -66,10 +66,10 @@ def _match_in(
     ordered: Sequence[Tensor],
     places: Mapping[str, Sequence[int]],
 ) -> dict[str, Pair]:
-    """The parameters that have the values of the base model's sites in one type, by site.
+    """The parameters that have the values of the base model's sites in one dtype, by site.
 
     Args:
-        places: of the parameters, by their values.
+        places: indices of the parameters, by their values.
     """
     alike: dict[str, list[str]] = {}
     for site, (weight, _) in base.items():
@@ -84,8 +84,8 @@ def _match_in(
                 "freeze them in the policy, and leave only their kind out of protect=: what "
                 "is left free can undo what the others hold",
             )
-        # Where there are none, nothing is found: a truncated VLM, or one that has learned. Sites of
-        # equal values, as tied or fresh ones, are told by their order.
+        # Without a match, nothing is found: the VLM is truncated, or has already learned. Sites
+        # with equal values, such as tied or freshly initialised ones, are identified by order.
         for site, place in zip(sites, at, strict=False):
             found[site] = (ordered[place], _bias(site, base[site][1], place, ordered, places))
     return found
@@ -98,7 +98,7 @@ def _bias(
     ordered: Sequence[Tensor],
     places: Mapping[str, Sequence[int]],
 ) -> Tensor | None:
-    """The bias that belongs to the weight at a place: the next parameter, or the only one alike."""
+    """The bias of the weight at an index: the next parameter, or the only one with its values."""
     if value is None:
         return None
     at = next((places[v] for v in _in_each_type(value) if v in places), ())
@@ -114,7 +114,9 @@ def _bias(
 
 
 def refuse_half_frozen(found: Mapping[str, Pair]) -> None:
-    """Refuse a map of which only one half learns: the other cannot make up for it.
+    """Refuse a map of which only the weight or only the bias learns.
+
+    A frozen half cannot compensate for changes of the other.
 
     Raises:
         AegisError: there is one.
@@ -132,13 +134,14 @@ def refuse_half_frozen(found: Mapping[str, Pair]) -> None:
 def refuse_strays(
     base: Mapping[str, Pair], found: Mapping[str, Pair], ordered: Sequence[Tensor]
 ) -> None:
-    """Refuse learning parameters that belong to a map of the VLM which was not found.
+    """Refuse trainable parameters that belong to a map of the VLM that was not found.
 
-    A map may be missing, as in a VLM with fewer layers. One that is there with other values would
-    learn unprotected, and so would a table with more rows.
+    A map may be missing, as in a VLM with fewer layers. But a map that is there with other values
+    would learn unprotected, and so would a table with more rows.
 
     Raises:
-        AegisError: a weight that has moved, a table of another size, or a bias without its weight.
+        AegisError: there is a weight that has moved, a table of another size, or a bias without its
+            weight.
     """
     free = _free(found, ordered)
     for site in sorted(base.keys() - found.keys()):
@@ -152,7 +155,7 @@ def refuse_strays(
                 "name the VLM that the policy begins with as the base, and measure its anchor; or "
                 "resume with the optimizer's state",
             )
-        # Equal entries, as of biases that began at 0, may be anything's.
+        # Constant biases, such as those initialised to 0, could belong to anything.
         if bias is None or bool((bias == bias[0]).all()):
             continue
         if any(torch.equal(on_cpu(p), bias) for p in free.get(bias.shape, ())):
@@ -169,16 +172,16 @@ def refuse_lost(
     found: Mapping[str, Pair],
     ordered: Sequence[Tensor],
 ) -> None:
-    """Refuse learning parameters that belong to the VLM and that `kfac` could not freeze.
+    """Refuse trainable parameters that belong to the VLM and that `kfac` could not freeze.
 
-    Those of a layer of which no map was found are missing, as the layer is.
+    If no map of a layer was found, the layer is missing, and so are its parameters.
 
     Args:
-        lost: values of the VLM's parameters that are of no map, and were not found, by name.
-        base: the VLM's maps, of which some were found.
+        lost: values of the VLM's parameters that belong to no map and were not found, by name.
+        base: the VLM's maps, some of which were found.
 
     Raises:
-        AegisError: one that has moved, or a table of another size.
+        AegisError: there is one that has moved, or a table of another size.
     """
     free = _free(found, ordered)
     for name, value in lost.items():
@@ -196,7 +199,7 @@ def refuse_lost(
 
 
 def _is_there(name: str, sites: Collection[str], found: Collection[str]) -> bool:
-    """Whether maps were found in the innermost part of the VLM that has the parameter and maps."""
+    """Whether any map was found in the innermost part of the VLM around the parameter with maps."""
     part = name
     while part:
         part = part.rpartition(".")[0]
@@ -207,7 +210,7 @@ def _is_there(name: str, sites: Collection[str], found: Collection[str]) -> bool
 
 
 def _refuse_resized(name: str, table: Tensor, free: Mapping[torch.Size, Sequence[Tensor]]) -> None:
-    """Refuse a table that has rows after those of the VLM's: its own would learn unprotected."""
+    """Refuse a table with extra rows after those of the VLM's, which would learn unprotected."""
     for shape, parameters in free.items():
         if table.ndim != 2 or shape[1:] != table.shape[1:] or len(shape) != 2:
             continue
@@ -222,7 +225,7 @@ def _refuse_resized(name: str, table: Tensor, free: Mapping[torch.Size, Sequence
 
 
 def _free(found: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[torch.Size, list[Tensor]]:
-    """What learns and was not found to be the VLM's, by shape."""
+    """Trainable parameters that were not identified as the VLM's, by shape."""
     claimed = ids(found)
     free: dict[torch.Size, list[Tensor]] = {}
     for parameter in ordered:
@@ -232,49 +235,50 @@ def _free(found: Mapping[str, Pair], ordered: Sequence[Tensor]) -> dict[torch.Si
 
 
 def _near(parameter: Tensor, weight: Tensor) -> bool:
-    """Whether a parameter may be this weight after it has learned, or was rounded."""
+    """Whether a parameter may be this weight after training or rounding."""
     now = on_cpu(parameter)
-    # Equal entries are those of a normalisation that is new.
+    # A constant tensor is a freshly initialised normalisation.
     if bool((now == now.flatten()[0]).all()):
         return False
     return bool((now - weight).norm() <= _NEAR * weight.norm())
 
 
 def on_cpu(tensor: Tensor) -> Tensor:
-    """The values in float32 on the CPU, where those of any two devices and types compare."""
+    """The values in float32 on the CPU, comparable across devices and dtypes."""
     return tensor.detach().cpu().float()
 
 
 def _values(tensor: Tensor) -> str:
-    """A digest of shape and values, whatever the type that they are kept in."""
+    """A digest of shape and values, independent of the dtype."""
     return digest({"": tensor})
 
 
 def _in_each_type(tensor: Tensor) -> Iterator[str]:
-    """Digests of its values, and of these rounded to each narrower type."""
+    """Digests of its values in float32 and rounded to each narrower dtype."""
     return (_values(tensor.to(dtype)) for dtype in _TYPES)
 
 
 def freeze_rest(
     base: Backbone, protected: Iterable[str], groups: Sequence[Mapping[str, Sequence[Tensor]]]
 ) -> tuple[list[tuple[str, Tensor]], dict[str, Tensor]]:
-    """Let nothing learn of the VLM besides its protected maps.
+    """Freeze all parameters of the VLM except those of its protected maps.
 
-    Values tell what is the VLM's. Equal ones, as of normalisations that are still as they were
-    made, may be an expert's too; of these, what is frozen stands in the VLM's order.
+    They are identified by their values. An expert may have parameters with equal values, such as
+    normalisations in their initial state; among these, the order of the VLM's parameters decides
+    which are frozen.
 
     Args:
         protected: the sites that learn.
-        groups: the optimizer's.
+        groups: the optimizer's parameter groups.
 
     Returns:
-        What was frozen, with its name; and by name those of the VLM that have too few parameters of
-        their values, on the CPU. They may have learned before.
+        The frozen parameters with their names; and by name the VLM's parameters whose values too
+        few of the optimizer's parameters have, on the CPU. They may have learned before.
     """
     held = {id(t) for site in protected for t in weights(base, site) if t is not None}
     in_groups = [(group["params"], [_values(p) for p in group["params"]]) for group in groups]
     # `given` counts the optimizer's parameters by their values, `others` those of the VLM that are
-    # to be frozen; `sequence` has all of the VLM's in its order.
+    # to be frozen; `sequence` lists all parameters of the VLM in its order.
     given = Counter(value for _, values in in_groups for value in values)
     named, sequence = list(base.named_parameters()), []
     for _, parameter in named:
@@ -286,8 +290,8 @@ def freeze_rest(
     for (name, parameter), (value, is_held) in zip(named, sequence, strict=True):
         if not is_held and given[value] < others[value]:
             lost[name] = on_cpu(parameter)
-    # Values that do not tell: more parameters have them than the VLM has to freeze, or a protected
-    # one has them too. Then the order in the group decides.
+    # Ambiguous values: more parameters have them than the VLM has to freeze, or a protected one has
+    # them too. Then the order in the group decides.
     unclear = {v for v, count in others.items() if given[v] > count or v in held_values}
     names = {value: name for (name, _), (value, _) in zip(named, sequence, strict=True)}
     frozen: list[tuple[str, Tensor]] = []
@@ -297,20 +301,21 @@ def freeze_rest(
             is_other = place in others_here if value in unclear else value in others
             if is_other:
                 parameter.requires_grad_(False)
-                parameter.grad = None  # AdamW would step by one that was there before
+                parameter.grad = None  # AdamW would still apply an existing gradient
                 frozen.append((names[value], parameter))
     return frozen, lost
 
 
 def _in_order(sequence: Sequence[tuple[str, bool]], values: Sequence[str]) -> set[int]:
-    """The places of the VLM's unprotected parameters in a group of the optimizer's.
+    """The indices of the VLM's unprotected parameters in one of the optimizer's groups.
 
     Args:
         sequence: the values of the VLM's parameters, and whether each is protected.
-        values: those of the group, which may have some of them, and others.
+        values: the values of the group's parameters, which may include only some of the VLM's, and
+            others.
     """
-    # Both sequences have the VLM's parameters in its order; what the group has besides lies between
-    # them. The blocks that match are the VLM's.
+    # Both sequences have the VLM's parameters in its order; the group's other parameters lie in
+    # between. The matching blocks are the VLM's.
     here = set(values)
     expected = [pair for pair in sequence if pair[0] in here]
     matcher = SequenceMatcher(None, [value for value, _ in expected], values, autojunk=False)

@@ -1,8 +1,8 @@
-"""AdamW that keeps what a VLM knew, for programs that take an optimizer and nothing else.
+"""AdamW that preserves what a VLM knows, for programs that accept nothing but an optimizer.
 
-Such a program gives the optimizer parameters without names. The weights themselves say which map of
-the VLM they are: the anchor was measured on them. What belongs to no map of the VLM, as an action
-expert, moves as under AdamW.
+Such a program gives the optimizer parameters without names. The weights themselves tell which map
+of the VLM they are, because the anchor was measured on them. Parameters that belong to no map of
+the VLM, such as those of an action expert, move as under plain AdamW.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.backbones.base import Backbone
 
 CONSTRAINING = ("kfac", "nullspace")
-_PLACE = "aegis_place"  # in a parameter's state: the number of what it is in the base model
-# In a weight's state, how many places after it the optimizer has its bias; in a bias's, its weight.
+_PLACE = "aegis_place"  # in a parameter's state: the number of its role in the base model
+# In a weight's state, the offset of its bias in the optimizer's order; in a bias's, of its weight.
 _PARTNER = "aegis_partner"
 _log = logging.getLogger(__name__)
 
@@ -40,11 +40,11 @@ _log = logging.getLogger(__name__)
 class ProtectedAdamW(torch.optim.AdamW):
     """AdamW whose applied updates a method constrains, in the maps of one VLM.
 
-    Its state is AdamW's and, with each protected parameter, a number that says what it is in the
-    VLM. So a resumed training, whose weights are no longer those of the VLM, knows them again.
+    Its state is that of AdamW plus, for each protected parameter, a number that tells what it is in
+    the VLM. So a resumed run can identify them although its weights are no longer those of the VLM.
 
-    A protected parameter in half precision is stepped in float32: its master is part of the state,
-    and the parameter is the master rounded.
+    A protected parameter in half precision is updated in float32: its master weight is part of the
+    state, and the parameter is the rounded master.
     """
 
     def __init__(
@@ -58,19 +58,19 @@ class ProtectedAdamW(torch.optim.AdamW):
     ) -> None:
         """Find the VLM's maps among the parameters.
 
-        With `kfac`, the VLM's other parameters (normalisations, tables) no longer learn, unless its
-        weight is 0.
+        With `kfac`, the VLM's other parameters (normalisations, tables) are frozen, unless the
+        option `weight` is 0.
 
         Args:
-            params: what AdamW takes.
+            params: as for AdamW.
             method: one of CONSTRAINING.
-            anchor: file of `aegis anchor`, with the part that the method reads.
+            anchor: file from `aegis anchor`, with the part that the method reads.
             base: the VLM that the anchor was measured on.
-            options: the method's, as in a recipe; `every` is 1.
+            options: the method's options, as in a recipe; `every` is 1.
             adamw: AdamW's own settings.
 
         Raises:
-            AegisError: an anchor of another VLM or without that part, unknown options.
+            AegisError: the anchor is of another VLM or lacks that part, or an option is unknown.
         """
         super().__init__(params, **adamw)
         if method not in CONSTRAINING:
@@ -86,17 +86,17 @@ class ProtectedAdamW(torch.optim.AdamW):
             )
         self._kinds = _kinds(method, base, self._anchor, self._options)
         self._lone = self._kinds.keys() - base.site_modules().keys()
-        # These tensors alone stay in memory, and not the base model.
+        # Only these tensors stay in memory, not the base model.
         self._base = {site: _copied(weights(base, site)) for site in self._kinds}
-        # Weight and bias of each site have a number, by which a resumed training knows them.
+        # Weight and bias of each site have a number, by which a resumed run identifies them.
         self._places = [(site, part) for site in sorted(self._base) for part in (0, 1)]
         self._found: dict[str, Pair] = {}
-        # A resumed training has moved some weights, and others not: those without a gradient, and
-        # in half precision those that stayed within their rounding. Its state, which is still to
-        # come, tells what they are; the first step asks again.
+        # In a resumed run some weights have moved and others have not: those without a gradient,
+        # and in half precision those that stayed within rounding. The state, which is loaded later,
+        # identifies them; the first step matches again.
         with contextlib.suppress(AegisError):
             self._found = matching.match(self._base, self._ordered())
-        # What does not learn, by name, and the VLM's values of what should not and was not found.
+        # Frozen parameters by name, and the VLM's values of those to freeze that were not found.
         self._frozen: list[tuple[str, Tensor]] = []
         self._lost: dict[str, Tensor] = {}
         if method == "kfac" and self._options["weight"] > 0:
@@ -115,12 +115,13 @@ class ProtectedAdamW(torch.optim.AdamW):
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
         """Take AdamW's step, and let the method constrain what it did to the VLM.
 
-        Where a scaler has found that the gradients overflowed, nothing is done.
+        If a scaler has found that the gradients overflowed, nothing is done.
 
         Raises:
-            AegisError: at the first step, where none of the VLM's maps is among the parameters,
-                they cannot be told, some have learned or are tables of another size, or half of one
-                is frozen; at any, where something of the VLM learns that was frozen at the first.
+            AegisError: at the first step, if none of the VLM's maps is among the parameters, they
+                cannot be identified, some have learned or are tables of another size, or half of
+                one is frozen; at any step, if a parameter of the VLM learns that was frozen at the
+                first.
         """
         if overflowed(self):
             return None
@@ -131,7 +132,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._count += 1
         loss = None
         if closure is not None:
-            # A pass needs the parameters in the program's own types.
+            # A pass needs the parameters in the program's own dtypes.
             with torch.enable_grad():
                 loss = closure()
 
@@ -140,15 +141,15 @@ class ProtectedAdamW(torch.optim.AdamW):
             super(ProtectedAdamW, self).step()
             slowed.go_back()
 
-        # AdamW and the constraint both see float32: a projected update that was rounded in between
-        # would not be orthogonal any more. Neither method reads an anchor gradient.
+        # AdamW and the constraint both run in float32: a projected update that was rounded in
+        # between would no longer be orthogonal. Neither method reads an anchor gradient.
         with self._wide.taken():
             self._stepper.step(self._count, move, {})
         self._remember()
         return loss
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load what `state_dict` gave, moments and masters in float32 where they were."""
+        """Load the result of `state_dict`; moments and masters that were float32 stay so."""
         with wide_step.loading(self, state_dict):
             super().load_state_dict(state_dict)
 
@@ -156,7 +157,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         """Add a group, as AdamW does, before the first step.
 
         Raises:
-            AegisError: the method has started, and would not hold what is the VLM's among them.
+            AegisError: the method has started and would not protect the VLM's parameters in it.
         """
         if getattr(self, "_stepper", None) is not None:
             raise AegisError(
@@ -167,7 +168,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         super().add_param_group(param_group)
 
     def _refuse_thawed(self) -> None:
-        """Refuse a step of what was frozen at the start, which nothing holds."""
+        """Refuse a step on parameters that were frozen at the start, as nothing protects them."""
         thawed = [name for name, parameter in self._frozen if parameter.requires_grad]
         if thawed:
             raise AegisError(
@@ -179,7 +180,7 @@ class ProtectedAdamW(torch.optim.AdamW):
             )
 
     def _ordered(self) -> list[Tensor]:
-        """The parameters in the order that their state is saved in."""
+        """The parameters in the order in which their state is saved."""
         return [p for group in self.param_groups for p in group["params"]]
 
     def _start(self) -> None:
@@ -199,18 +200,18 @@ class ProtectedAdamW(torch.optim.AdamW):
                 "let the VLM learn (of SmolVLA: --policy.train_expert_only=false), and name the "
                 "VLM that it begins with as the base",
             )
-        # Those of a resumed training have learned; it has been asked when it began.
+        # In a resumed run they have learned; the check was made when training began.
         if not known:
             matching.refuse_strays(self._base, found, self._ordered())
             matching.refuse_lost(self._lost, self._base, found, self._ordered())
-        # A method works on named modules, which the program has not given.
+        # A method works on named modules, which the program does not provide.
         model = _tree(learning, self._lone)
         kinds = {site: self._kinds[site] for site in learning}
         device = next(model.parameters()).device
         anchor = anchor_file.to_device(self._anchor, device)
         self._wide = WideStep(self, model.parameters())
-        # A method takes the values that it finds for the pre-trained ones, which a resumed
-        # training's weights no longer are.
+        # A method takes the current values for the pre-trained ones, which those of a resumed run
+        # no longer are.
         with self._wide.taken(), _at_origin(learning, self._base):
             context = MethodContext(model, {}, kinds, self._options, anchor)
             self._parts = methods.get(self._method).start(context)
@@ -222,10 +223,10 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._lost.clear()
 
     def _known_again(self) -> dict[str, Pair]:
-        """The sites that a loaded state names.
+        """The sites that a loaded state identifies.
 
         Raises:
-            AegisError: one of another shape than the parameter.
+            AegisError: the shape of one differs from that of the parameter.
         """
         ordered = self._ordered()
         at = {parameter: place for place, parameter in enumerate(ordered)}
@@ -236,8 +237,8 @@ class ProtectedAdamW(torch.optim.AdamW):
             site, part = self._places[int(state[_PLACE])]
             pair = pairs.setdefault(site, [None, None])
             pair[part] = parameter
-            # The other has no state where it never had a gradient, and may have moved with this one
-            # all the same.
+            # The partner has no state if it never had a gradient, but it may still have moved along
+            # with this one.
             if _PARTNER in state:
                 pair[1 - part] = ordered[at[parameter] + int(state[_PARTNER])]
         for site, pair in pairs.items():
@@ -252,7 +253,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         return {site: (weight, bias) for site, (weight, bias) in pairs.items()}  # type: ignore[misc]
 
     def _to_remember(self) -> dict[Tensor, dict[str, int]]:
-        """The numbers by which a resumed training knows each protected parameter again."""
+        """The numbers by which a resumed run identifies each protected parameter."""
         at = {parameter: place for place, parameter in enumerate(self._ordered())}
         notes = {}
         for number, (site, part) in enumerate(self._places):
@@ -266,9 +267,9 @@ class ProtectedAdamW(torch.optim.AdamW):
         return notes
 
     def _remember(self) -> None:
-        """Note these numbers in each protected parameter's state, once AdamW has made one."""
+        """Store these numbers in each protected parameter's state, once AdamW has created it."""
         for parameter, numbers in self._notes.items():
-            # AdamW fills an empty state by itself, so nothing may be there before.
+            # AdamW initialises only an empty state, so nothing may be stored there before.
             if state := self.state.get(parameter):
                 for name, number in numbers.items():
                     state.setdefault(
@@ -283,7 +284,7 @@ def _kinds(
     sites = base.sites()
     measured = set(anchor.inputs)
     if method == "kfac":
-        # Each map has two factors there, `SITE.inputs` and `SITE.outputs`.
+        # The curvature has two factors for each map, `SITE.inputs` and `SITE.outputs`.
         measured = {name.rpartition(".")[0] for name in anchor.curvature}
     return {s: kind for s, kind in sites.items() if s in measured and kind in options["protect"]}
 
@@ -295,7 +296,7 @@ def _copied(pair: Pair) -> Pair:
 
 @contextlib.contextmanager
 def _at_origin(found: Mapping[str, Pair], base: Mapping[str, Pair]) -> Generator[None]:
-    """Give the parameters the VLM's values inside the block, and then back their own."""
+    """Give the parameters the VLM's values inside the block, and restore their own afterwards."""
     pairs = []
     for site, pair in found.items():
         for parameter, value in zip(pair, base[site], strict=True):
@@ -321,7 +322,7 @@ def _report(method: str, found: Collection[str], absent: Collection[str]) -> Non
 
 
 def _tree(found: Mapping[str, Pair], lone: Collection[str]) -> nn.Module:
-    """Modules that hold the parameters under the names that they have in the base model."""
+    """Modules that hold the parameters under their names in the base model."""
     root = nn.Module()
     for site, pair in found.items():
         # The pair of a lone row is (row, None), and its site is the row's own name.

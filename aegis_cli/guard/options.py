@@ -1,4 +1,4 @@
-"""What a guard begins with: its options, an anchor that fits the model, and the method's parts."""
+"""The setup of a guard: its options, an anchor that fits the model, and the method's parts."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from aegis_cli.recipes.decoding import build
 from aegis_cli.recipes.strict_yaml import Problem, refuse
 
 SECTIONS = {"aegis": policy.Aegis, "nullspace": policy.Nullspace, "kfac": policy.Kfac}
-_DENSE_KINDS = ("maps", "stem")  # where `kfac` has linear maps and convolutions to hold
-# Options that a guard has at one value alone: its gradients add up over any number of passes, it
-# knows no schedule, and it leaves the task's gradient alone where a method only pulls.
+_DENSE_KINDS = ("maps", "stem")  # kinds with linear maps and convolutions that `kfac` can protect
+# Options that a guard supports at one value only: its gradients accumulate over any number of
+# passes, it knows no schedule, and a method that only pulls leaves the task gradient alone.
 _TRAINING_ALONE = {
     "idle": "moved",
     "refresh": 1,
@@ -38,18 +38,18 @@ _TRAINING_ALONE = {
     "growth": 0.0,
     "step": "proximal",
 }
-_IN_BACKBONE = "vlm."  # before the names of a Hugging Face model in an anchor of `aegis anchor`
+_IN_BACKBONE = "vlm."  # prefix of a Hugging Face model's names in an anchor from `aegis anchor`
 
 
 @dataclass(frozen=True)
 class StartedMethod:
-    """A method at work on the model.
+    """A method that was started on the model.
 
     Attributes:
-        parts: what it does.
-        widths: of the anchor's layers.
-        unprotected: learning modules that the method leaves free.
-        sha256: of the anchor's file.
+        parts: the parts of the method.
+        widths: widths of the anchor's layers.
+        unprotected: trainable modules that the method leaves free.
+        sha256: hash of the anchor's file.
     """
 
     parts: Parts
@@ -72,12 +72,12 @@ def start(
     """Check options, anchor and model against each other, then start the method.
 
     Args:
-        part: the name by which the model was found in a policy, where it was.
-        owners: the processes that have some rows of every weight.
+        part: the name of the model within a policy, if it was given as a part of one.
+        owners: the processes that each have some rows of every weight.
 
     Raises:
-        AegisError: unknown options, an anchor of another model or without the part that the method
-            reads, or what learns and cannot be protected.
+        AegisError: an option is unknown, the anchor is of another model or lacks the part that the
+            method reads, or a trainable module cannot be protected.
     """
     chosen = method_options(method, options)
     anchor, header = load_anchor(method, path)
@@ -98,7 +98,7 @@ def start(
             unprotected = tuple(sorted({*unprotected, *_without_curvature(anchor, sites)}))
         else:
             anchor = _renamed(anchor, sites, maps.heads, unmeasured, plain)
-    # In a model on several GPUs this is the device of the first parameter that learns.
+    # In a model on several GPUs this is the device of the first trainable parameter.
     device = next(p for p in model.parameters() if p.requires_grad).device
     held = anchor_file.to_device(anchor, device)
     context = MethodContext(model, groups, sites, chosen, held, owners=owners)
@@ -111,13 +111,13 @@ def start(
 
 
 def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's defaults and checks of the options, with `every` 1 unless it is given.
+    """The options with a recipe's defaults and checks, except that `every` defaults to 1.
 
-    A constraint covers one step where nobody promises to settle. `kfac` has no key `protect` in a
-    recipe, where everything else is frozen; a guard's may leave some maps free.
+    A constraint covers one step, because a user's loop may never call `settle`. In a recipe `kfac`
+    has no key `protect`, as everything else is frozen; under a guard it may leave some maps free.
 
     Raises:
-        AegisError: an option that the method does not have, or a value that is for training alone.
+        AegisError: the method does not have an option, or a value is only for `aegis train`.
     """
     problems: list[Problem] = []
     every = {} if methods.get(method).compares_layers else {"every": 1}
@@ -125,7 +125,7 @@ def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     protect = {}
     if method == "kfac":
         protect["protect"] = _dense_kinds(given.pop("protect", _DENSE_KINDS))
-    # The checks are those of YAML's values, which has lists and no tuples.
+    # The checks are made for YAML values, which include lists but no tuples.
     raw = {}
     for name, value in given.items():
         raw[name] = list(value) if isinstance(value, tuple) else value
@@ -155,10 +155,10 @@ def _dense_kinds(protect: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def load_anchor(method: str, path: Path) -> tuple[Anchor, artifacts.Header]:
-    """The anchor, and what its file says of the model and of how it was measured.
+    """The anchor, and the header of its file about the model and the measurement.
 
     Raises:
-        AegisError: no anchor, or one without the part that the method reads.
+        AegisError: it is not an anchor, or lacks the part that the method reads.
     """
     artifact = artifacts.load(path, "anchor")
     (part,) = methods.get(method).needs
@@ -192,10 +192,10 @@ def _check_layers(
 
 @contextlib.contextmanager
 def naming_its_part(model: nn.Module, path: Path, part: str | None) -> Generator[None]:
-    """Advise `part=` where a model does not fit an anchor, and a part of it does.
+    """Suggest `part=` if a model does not fit an anchor, but a part of it does.
 
     Raises:
-        AegisError: what is raised inside the block.
+        AegisError: the error from inside the block, with that advice.
     """
     try:
         yield
@@ -214,7 +214,7 @@ def _measured_part(model: nn.Module, path: Path) -> str | None:
     """The name of the part whose weights an anchor was measured on; None if there is none."""
     try:
         wanted = artifacts.read_header(path).fingerprint
-    except AegisError:  # whoever loads it says what is wrong with it
+    except AegisError:  # loading it later reports what is wrong
         return None
     if wanted is None:
         return None
@@ -226,10 +226,10 @@ def _measured_part(model: nn.Module, path: Path) -> str | None:
 
 
 def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames:
-    """A function that takes the name of a part of the model and gives the anchor's name for it.
+    """A function from the name of a part of the model to the anchor's name for it.
 
     Raises:
-        AegisError: the anchor is of other weights.
+        AegisError: the anchor was measured on other weights.
     """
     plain = plain_names(model)
     if structure.fingerprint(model) == header.fingerprint:
@@ -255,9 +255,9 @@ def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames
 def _check_adapters(
     model: nn.Module, sites: Iterable[str], header: artifacts.Header, path: Path
 ) -> None:
-    """Raise AegisError if adapters are protected by what others have read.
+    """Raise AegisError if adapters would be protected by the inputs of other adapters.
 
-    What the maps of an adapter read depends on its own weights, which are random.
+    The inputs of an adapter's maps depend on its own weights, which are random.
     """
     held = wrappers.adapter_weights(model)
     inside = [site for site in sites if any(name.startswith(f"{site}.") for name in held)]
@@ -271,19 +271,19 @@ def _check_adapters(
     )
 
 
-# --- what constrains the applied update -----------------------------------------------------------
+# --- constraints on the applied update ------------------------------------------------------------
 
 
 def _protected(
     model: nn.Module, maps: structure.Maps, protect: Sequence[str], explicit: bool, dense: bool
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """The sites to protect with their kinds, and the names of what learns and stays free.
+    """The sites to protect with their kinds, and the names of trainable modules left free.
 
     Args:
         dense: only linear maps and convolutions can be protected.
     """
     all_kinds = _DENSE_KINDS if dense else policy.SITE_KINDS
-    # What is frozen cannot move, and asks for no protection.
+    # Frozen sites cannot move and need no protection.
     kinds = {site: kind for site, kind in maps.kinds.items() if not structure.frozen(model, site)}
     unknown = {
         name: why for name, why in maps.unknown.items() if _learns(model.get_submodule(name))
@@ -296,7 +296,7 @@ def _protected(
                 why = "a row by itself" if module is None else f"a {type(module).__name__}"
                 unknown[site] = why
         kinds = {site: kind for site, kind in kinds.items() if site not in unknown}
-    # Whoever names the kinds to protect has decided about the rest too.
+    # Naming the kinds to protect is a decision about all others too.
     if unknown and not explicit:
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
@@ -319,7 +319,7 @@ def _learns(module: nn.Module) -> bool:
 
 
 def _by_reason(unknown: Mapping[str, str]) -> str:
-    """a RMSNorm (norm1, norm2, ... 17 in all); ..."""
+    """Names by reason, such as "a RMSNorm (norm1, norm2, ... 17 in all); ..."."""
     grouped: dict[str, list[str]] = {}
     for name, why in unknown.items():
         grouped.setdefault(why, []).append(name or "the model itself")
@@ -329,8 +329,8 @@ def _by_reason(unknown: Mapping[str, str]) -> str:
 def check_precision(dtypes: Mapping[str, torch.dtype]) -> None:
     """Refuse weights in half precision.
 
-    An update that is projected and then rounded to half precision is not orthogonal: the rounding
-    is as large as the update.
+    An update that is projected and then rounded to half precision is no longer orthogonal: the
+    rounding error is as large as the update.
     """
     half = [site for site, dtype in dtypes.items() if dtype not in (torch.float32, torch.float64)]
     if half:
@@ -352,7 +352,7 @@ def _renamed(
     wanted = {site: plain(site) for site in sites}
     for site in sites:
         scores = f"{plain(site)}.scores"
-        # A head that is no module is known from the questions alone.
+        # A head that is not a module is known only from the measurement on questions.
         if site in heads or scores in anchor.inputs:
             wanted[f"{site}.scores"] = scores
     _check_measured("inputs", wanted.values(), anchor.inputs, unmeasured)
@@ -371,9 +371,9 @@ def _renamed_curvature(
 
 
 def _without_curvature(anchor: Anchor, sites: Collection[str]) -> list[str]:
-    """The sites on which no answer depended when the anchor was measured: nothing holds them.
+    """The sites on which no answer depended when the anchor was measured; they are unprotected.
 
-    Such is the first map of a fresh LoRA, whose second one is zero.
+    An example is the first map of a fresh LoRA, whose second map is zero.
     """
     side = SIDES[1]
     return [site for site in sites if not torch.any(anchor.curvature[f"{site}.{side}"].values)]

@@ -1,4 +1,4 @@
-"""The processes that train one guarded model together, and what they average."""
+"""The processes that train one guarded model together, and their averages."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import distributed as dist
 
 from aegis_cli.common.errors import AegisError
 
-WORLD = "world"  # all processes, also where they are connected only after the guard was made
+WORLD = "world"  # all processes, even if they are connected only after the guard was created
 ProcessGroup = dist.ProcessGroup | str | None
 
 
 def count() -> int:
-    """How many processes torch.distributed has connected by now; 1 where it has none."""
+    """How many processes torch.distributed has connected so far; 1 if it has none."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def resolved(group: ProcessGroup) -> dist.ProcessGroup | None:
-    """The group that is meant, as far as it is there by now.
+    """The group that is meant; None if the processes are not connected yet.
 
     Raises:
-        AegisError: another text than "world".
+        AegisError: it is a string other than "world".
     """
     if not isinstance(group, str):
         return group
@@ -37,7 +37,7 @@ def resolved(group: ProcessGroup) -> dist.ProcessGroup | None:
 
 
 def check(group: ProcessGroup) -> None:
-    """Raise AegisError where several processes run and no group names those that share a model."""
+    """Raise AegisError if several processes run and no group names those that share a model."""
     if resolved(group) is None and count() > 1:
         raise AegisError(
             f"a guard in one of {count()} processes without process_group=",
@@ -50,10 +50,10 @@ def check(group: ProcessGroup) -> None:
 def mean_over(tensors: Sequence[Tensor], group: dist.ProcessGroup) -> list[Tensor]:
     """Mean of each tensor over the group's processes.
 
-    The means are new tensors, because autograd may give several parameters one and the same.
+    The means are new tensors, because autograd may return the same one for several parameters.
     """
     means = [tensor / dist.get_world_size(group) for tensor in tensors]
-    # All are begun before the first is waited for, so that they overlap.
+    # All are started before waiting for the first, so that they overlap.
     begun = [dist.all_reduce(tensor, group=group, async_op=True) for tensor in means]
     for work in begun:
         work.wait()
@@ -71,9 +71,9 @@ def mean_gradients(
     A gradient that a process lacks counts as zero there; one that all lack stays None.
     """
     like = next(iter(parameters.values()))
-    # In the order of `parameters`, which is the same in every process; ids are not.
+    # In the order of `parameters`, which is the same in every process, unlike the ids.
     here = [gradients[i] is not None for i in parameters]
-    # Every process has to join each reduction below, so they agree first on which there are.
+    # Every process has to join each reduction below, so first they agree on the list of them.
     counts = torch.tensor(here, dtype=torch.int32, device=like.device)
     dist.all_reduce(counts, group=group)
     somewhere = [i for i, count in zip(parameters, counts.tolist(), strict=True) if count]

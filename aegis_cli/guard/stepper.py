@@ -1,4 +1,4 @@
-"""Steps of an optimizer that is not ours, and none of them past the guard."""
+"""Steps of a user's optimizer, none of which bypasses the guard."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from aegis_cli.models.buffers import WrittenBuffers
 
 Scaler = torch.amp.GradScaler
 Closure = Callable[[], Any]
-_AT_WORK: weakref.WeakSet[GuardedStepper] = weakref.WeakSet()  # those that were not removed
+_AT_WORK: weakref.WeakSet[GuardedStepper] = weakref.WeakSet()  # those that are not removed
 
 
 class GuardedStepper:
-    """Takes the user's optimizer through a `Stepper`, and refuses steps that go past the guard.
+    """Runs the user's optimizer through a `Stepper`, and refuses steps that bypass the guard.
 
-    A method that constrains nothing leaves every step as it is, if a guarded backward pass came
-    before it.
+    A method that constrains nothing leaves every step as it is, provided that a guarded backward
+    pass came before it.
     """
 
     def __init__(
@@ -43,26 +43,27 @@ class GuardedStepper:
         may_shard: bool = False,
         averaging: Mapping[str, nn.Module] | None = None,
     ) -> None:
-        """Begin without a step.
+        """Create a stepper that has taken no step yet.
 
         Args:
-            may_shard: as of `Stepper`.
-            averaging: modules that may not average what they read while the method works, by name.
+            may_shard: as for `Stepper`.
+            averaging: modules, by name, that must not update running averages of their inputs
+                while the method is active.
         """
         self._parts, self._averaging = parts, averaging or {}
         self._learning = LearningParameters(model)
         self._stepper, self._may_shard = Stepper(model, parts, may_shard), may_shard
-        self._count = 0  # steps since the guard was made, or was settled
+        self._count = 0  # steps since the guard was created or last settled
         self._automatic: Callable[[], Mapping[int, Tensor | None]] | None = None
         self._since = _SincePass()
         self._taken: _TakenStep | None = None
         self._own: _OwnStep | None = None
-        # Steps inside each other: of an optimizer that calls its base class's, or another one's.
+        # Nesting depth, for an optimizer that calls the step of its base class or of another one.
         self._depth, self._in_closure = 0, False
-        self._tells = False  # whether any optimizer has ever told of a step
+        self._tells = False  # whether any optimizer has ever reported a step
         self._buffers = _BufferWatch(model)
         _AT_WORK.add(self)
-        # On every optimizer of the process: the loop's own may be made after the guard.
+        # On every optimizer of the process: that of the loop may be created after the guard.
         before, after = _hooks_of_every_optimizer(self)
         self._hooks = [
             register_optimizer_step_pre_hook(before),
@@ -73,7 +74,7 @@ class GuardedStepper:
         """Constrain the steps that a loop takes by `optimizer.step()`, instead of refusing them.
 
         Args:
-            anchor: gives the anchor gradient by the parameters' ids.
+            anchor: returns the anchor gradient by the parameters' ids.
         """
         self._automatic = anchor
 
@@ -86,11 +87,11 @@ class GuardedStepper:
     # --- passes -----------------------------------------------------------------------------------
 
     def check(self) -> None:
-        """Refuse a model whose parameters are not those that the guard was made with.
+        """Refuse a model whose parameters are not those that the guard was created with.
 
         Raises:
-            AegisError: they were replaced or moved, further ones learn, or another guard is at
-                work on them.
+            AegisError: they were replaced or moved, further ones learn, or another guard is active
+                on them.
         """
         self._end_broken_step()
         self._refuse_another_guard()
@@ -107,10 +108,10 @@ class GuardedStepper:
             )
 
     def passed(self) -> None:
-        """Note a guarded backward pass, which every optimizer may follow with one step.
+        """Record a guarded backward pass, after which every optimizer may take one step.
 
         Raises:
-            AegisError: it left no gradient in the model, or another guard is at work on it.
+            AegisError: it left no gradient in the model, or another guard is active on it.
         """
         self._end_broken_step()
         self._refuse_another_guard()
@@ -119,12 +120,12 @@ class GuardedStepper:
         self._buffers.look()
         self._since = _SincePass(guarded=True, written=self._learning.versions())
         if not self._in_closure:
-            self._depth = 0  # a step that raised an exception has left it as it was
+            self._depth = 0  # a step that raised an exception did not reset it
 
     def _refuse_another_guard(self) -> None:
-        """Refuse a second guard of the same kind on a parameter: it would undo what one has held.
+        """Refuse a second guard of the same kind on a parameter: it would undo the first's work.
 
-        One may project gradients, and another one constrain the updates that are made of them.
+        But one may project gradients while another constrains the updates computed from them.
         """
         for other in _AT_WORK:
             used = other is not self and other._since.guarded
@@ -142,29 +143,29 @@ class GuardedStepper:
         """Whether a step may have moved the weights since the last guarded backward pass.
 
         Args:
-            skips: whether a scaler was there, which skips steps that overflow.
+            skips: whether there was a scaler, which skips steps that overflow.
         """
         if self._since.moved or self._since.written != self._learning.versions():
             return True
-        # An optimizer that is none of PyTorch's tells nothing, and may write past its count.
+        # An optimizer that is not PyTorch's reports nothing, and may bypass the version counter.
         return not (self._tells or skips)
 
     @property
     def has_stepped(self) -> bool:
-        """Whether an optimizer has told that it moved weights since the last guarded pass."""
+        """Whether an optimizer has reported moving weights since the last guarded pass."""
         return self._since.moved
 
     @property
     def _sums_late(self) -> bool:
-        """Whether gradients may arrive in the last pass of a step alone.
+        """Whether gradients may arrive only in the last pass of a step.
 
-        Several passes over sharded weights may leave their sum to the last of them. A method that
-        reads the gradient needs that of each pass.
+        Several passes over sharded weights may sum their gradients only in the last of them. A
+        method that reads the gradient needs that of each pass.
         """
         return self._may_shard and self._parts.penalty is None
 
     def gradients_finite(self, owners: Ranks = ALONE) -> bool:
-        """Whether every gradient of what learns is finite, in all processes."""
+        """Whether the gradients of all trainable parameters are finite, in all processes."""
         return self._learning.gradients_finite(owners)
 
     # --- steps that the guard takes ---------------------------------------------------------------
@@ -172,14 +173,14 @@ class GuardedStepper:
     def step(
         self, optimizer: Optimizer, scaler: Scaler | None, anchor: Mapping[int, Tensor | None]
     ) -> None:
-        """Take the optimizer's step, its update constrained.
+        """Take the optimizer's step and constrain its update.
 
         Args:
             anchor: the anchor gradient by the parameters' ids.
 
         Raises:
-            AegisError: other parameters learn than when the guard was made, or their gradients are
-                those of a plain backward pass.
+            AegisError: the trainable parameters are not those from when the guard was created, or
+                their gradients come from a plain backward pass.
         """
         if not self._parts.constrains or not self._learning.are_in(optimizer):
             _take(optimizer, scaler)
@@ -190,15 +191,15 @@ class GuardedStepper:
         self._refuse_second(optimizer)
         self._refuse_unreached()
         self._stepper.begin(self._learning.by_name(anchor))
-        # Before the step: the shares are those of the gradients that it is made of.
+        # Before the step: the shares come from the gradients that the step uses.
         slowed = SlowedStep(self._parts)
         taken = self._taken = _TakenStep(self._learning.versions())
         try:
             _take(optimizer, scaler)
         finally:
             self._taken = None
-            # A scaler skips a step that overflowed, and a trainer's optimizer skips those between
-            # its accumulated ones. A step that moved nothing must not be constrained. One that
+            # A scaler skips a step that overflowed, and a trainer's optimizer skips steps while it
+            # accumulates gradients. A step that moved nothing must not be constrained. One that
             # raises an exception may have moved some of the weights.
             self._end(slowed, taken.has_moved(optimizer, self._learning))
 
@@ -207,7 +208,7 @@ class GuardedStepper:
         if not moved:
             self._stepper.cancel()
             return
-        # First the shares, as a lower rate would have moved it; what is constrained is the result.
+        # First apply the shares, as if the learning rate had been lower; then constrain the result.
         slowed.go_back()
         self._count += 1
         self._stepper.end(self._count)
@@ -218,26 +219,26 @@ class GuardedStepper:
         return self._stepper.pending
 
     def settle(self) -> None:
-        """Constrain the steps since the last time, whatever their turn."""
+        """Constrain the pending steps, however many there are."""
         self._end_broken_step()
         self._stepper.settle()
-        # What is saved now may be gone on with by a guard that counts from here.
+        # A model saved now may be continued by a new guard, which counts from here.
         self._count = 0
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
-        """Whether an optimizer has all that learns, and no other one's step belongs to its own."""
+        """Whether an optimizer has all trainable parameters, so that no other shares its step."""
         return self._learning.are_all_in(optimizer)
 
     # --- every optimizer of the process -----------------------------------------------------------
 
     def before_step(self, optimizer: Optimizer, closure: Closure | None) -> Closure | None:
-        """Raise before anything moves, if this is a step that goes past the guard.
+        """Raise, before anything moves, if this is a step that bypasses the guard.
 
         Args:
-            closure: makes the backward passes itself, inside the step.
+            closure: runs the backward passes inside the step.
 
         Returns:
-            What the optimizer is to call in the place of its closure.
+            The function that the optimizer calls instead of its closure.
         """
         if not self._learning.are_in(optimizer):
             return closure
@@ -254,8 +255,8 @@ class GuardedStepper:
             return None
         self._depth += 1
 
-        # The backward passes happen inside the step, so that its gradients can only be looked at
-        # between the closure's end and the first weight that moves.
+        # The backward passes happen inside the step, so its gradients can only be checked between
+        # the end of the closure and the first weight that moves.
         def guarded() -> Any:
             self._in_closure = True
             try:
@@ -268,7 +269,7 @@ class GuardedStepper:
         return guarded
 
     def _begin(self, optimizer: Optimizer) -> None:
-        """The gradients are there, and the weights are about to move."""
+        """The gradients are ready, and the weights are about to move."""
         self._refuse_unguarded(optimizer)
         if self._automatic is None or self._taken is not None or not self._parts.constrains:
             return
@@ -281,35 +282,35 @@ class GuardedStepper:
         self._own = _OwnStep(SlowedStep(self._parts), self._learning.versions())
 
     def after_step(self, optimizer: Optimizer, scaler: Scaler | None = None) -> None:
-        """The weights have moved, and go on to move where this step lies inside another one.
+        """The weights have moved, and will move further if this step is nested in another one.
 
         Args:
-            scaler: what the step was given as `grad_scaler`.
+            scaler: the `grad_scaler` argument of the step.
         """
         if not self._learning.are_in(optimizer):
             return
         moved = not overflowed(optimizer, scaler)
         self._tells = True
-        # A second step of this optimizer before the next pass would be one on used gradients.
+        # A second step of this optimizer before the next pass would reuse the same gradients.
         self._since.stepped.add(id(optimizer))
         self._since.moved = moved or self._since.moved
         if self._taken is not None:
             self._taken.told = moved or bool(self._taken.told)
-        # Only when the outermost step has ended have the weights moved for good.
+        # The update is complete only when the outermost step has ended.
         self._depth = max(0, self._depth - 1)
         if not self._depth:
             self._end_own(moved)
 
     def _end_own(self, moved: bool) -> None:
-        """End the step of the loop's own, if one is under way."""
+        """End the loop's own step, if one is in progress."""
         own, self._own = self._own, None
         if own is not None:
             self._end(own.slowed, moved)
 
     def _end_broken_step(self) -> None:
-        """End a step of the loop's own that has raised an exception, if there was one.
+        """End a step of the loop that has raised an exception, if there was one.
 
-        An optimizer that calls its closure goes on with its step after it.
+        While an optimizer is calling its closure, its step is still in progress.
         """
         if self._own is not None and not self._in_closure:
             self._end_own(self._own.written != self._learning.versions())
@@ -317,17 +318,17 @@ class GuardedStepper:
     # --- refusals ---------------------------------------------------------------------------------
 
     def _refuse_another_place(self) -> None:
-        """Refuse a model that is elsewhere, or of another type, than what constrains it."""
+        """Refuse a model whose device or dtype differs from those of its constraints."""
         if self._parts.constrains:
             self._learning.refuse_another_place()
 
     def _refuse_unreached(self) -> None:
-        """Raise AegisError where the passes of a step have left no gradient in the model."""
+        """Raise AegisError if the passes of a step have left no gradient in the model."""
         if self._sums_late and self._since.guarded:
             self._learning.refuse_unreached()
 
     def _refuse_second(self, optimizer: Optimizer) -> None:
-        """Refuse a second optimizer's step after one pass, which would constrain twice."""
+        """Refuse a second optimizer's step after one pass, to avoid constraining updates twice."""
         if self._since.constrained not in (None, id(optimizer)):
             raise AegisError(
                 "two optimizers on guarded parameters, whose updates would be constrained twice",
@@ -338,10 +339,10 @@ class GuardedStepper:
         self._since.constrained = id(optimizer)
 
     def _refuse_unguarded(self, optimizer: Optimizer) -> None:
-        """Raise if guarded gradients are those of a plain backward pass."""
+        """Raise AegisError if gradients of guarded parameters come from a plain backward pass."""
         if self._since.guarded and id(optimizer) not in self._since.stepped:
             return
-        # Some libraries take a step on zeros, to have an optimizer's state made.
+        # Some libraries take a step with zero gradients to initialise an optimizer's state.
         if any(gradient.any() for gradient in self._learning.gradients()):
             raise AegisError(
                 "a step on guarded parameters without a guard.backward since the last one",
@@ -359,9 +360,9 @@ class _SincePass:
     Attributes:
         guarded: whether there was such a pass.
         written: how often each weight had been written to at that pass.
-        stepped: ids of the optimizers that have stepped since.
+        stepped: ids of the optimizers that have taken a step since.
         moved: whether one of them has moved the weights.
-        constrained: id of the one whose update was constrained; None: none's was.
+        constrained: id of the optimizer whose update was constrained; None if there was none.
     """
 
     guarded: bool = False
@@ -377,7 +378,7 @@ class _TakenStep:
 
     Attributes:
         written: how often each weight had been written to before it.
-        told: whether an optimizer has moved the weights, by its hook; None: no hook has told.
+        told: whether an optimizer's hook reported moved weights; None if no hook was called.
     """
 
     written: Sequence[int]
@@ -387,7 +388,7 @@ class _TakenStep:
         """Whether the weights have moved."""
         if self.told is not None:
             return self.told
-        # One that is no optimizer of PyTorch's may write past its count.
+        # An optimizer that is not PyTorch's may bypass the version counter.
         return not isinstance(optimizer, Optimizer) or self.written != learning.versions()
 
 
@@ -396,7 +397,7 @@ class _OwnStep:
     """A step that the loop takes by itself.
 
     Attributes:
-        slowed: goes back to the shares of its update.
+        slowed: reduces the update to its shares.
         written: how often each weight had been written to before it.
     """
 
@@ -405,14 +406,14 @@ class _OwnStep:
 
 
 class _BufferWatch:
-    """Warns, at the second pass, of the buffers that it has written to since the first."""
+    """Warns at the second pass about buffers that were written to since the first."""
 
     def __init__(self, model: nn.Module) -> None:
         self._model, self._looked = model, False
         self._first: WrittenBuffers | None = None
 
     def look(self) -> None:
-        """A pass has ended."""
+        """Check the buffers at the end of a pass."""
         if self._looked:
             return
         if self._first is None:
@@ -440,22 +441,22 @@ class SlowedStep:
 
     @torch.no_grad()
     def __init__(self, parts: Parts) -> None:
-        """Keep the weights before the step, by the gradients that it is made of."""
+        """Compute the shares from the gradients, and copy the weights before the step."""
         shares = {} if parts.shares is None else _read(parts.shares())
-        # A gradient that overflowed has no finite share, and a scaler skips its step.
+        # An overflowed gradient has no finite share, but a scaler skips its step anyway.
         self._shares = {p: s for p, s in shares.items() if s != 1 and math.isfinite(s)}
         self._before = {p: p.detach().clone() for p in self._shares}
 
     @torch.no_grad()
     def go_back(self) -> None:
-        """Leave of what has moved each parameter's share."""
+        """Reduce each parameter's update to its share."""
         for parameter, share in self._shares.items():
             # before + share (after - before)
             parameter.copy_(torch.lerp(self._before[parameter], parameter, share))
 
 
 def _read(shares: Mapping[Tensor, float | Tensor]) -> dict[Tensor, float]:
-    """The shares as numbers; those of a GPU by one transfer instead of one sync each."""
+    """The shares as numbers; those on a GPU in one transfer instead of one sync each."""
     unread = {p: share for p, share in shares.items() if isinstance(share, Tensor)}
     numbers = torch.stack([*unread.values()]).tolist() if unread else []
     read = dict(zip(unread, numbers, strict=True))
@@ -466,14 +467,15 @@ def _read(shares: Mapping[Tensor, float | Tensor]) -> dict[Tensor, float]:
 
 
 def overflowed(optimizer: Optimizer, scaler: Scaler | None = None) -> bool:
-    """Whether a scaler has told this optimizer to leave out the step that it is in.
+    """Whether a scaler has told this optimizer to skip its current step.
 
-    A scaler calls the step of a fused optimizer in any case. It gives it `found_inf` for that time,
-    and the kernel leaves the weights as they are, although PyTorch counts them as written to.
+    A scaler calls the step of a fused optimizer in any case. For the time of the call it sets
+    `found_inf` on it, and the kernel leaves the weights as they are, although PyTorch counts them
+    as written to.
 
     Args:
-        scaler: what the step was given as `grad_scaler`: by the older contract, the optimizer asks
-            it by itself.
+        scaler: the `grad_scaler` argument of the step: by the older convention, the optimizer
+            queries the scaler itself.
     """
     found = getattr(optimizer, "found_inf", None)
     if found is not None:
@@ -482,7 +484,7 @@ def overflowed(optimizer: Optimizer, scaler: Scaler | None = None) -> bool:
 
 
 def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
-    """The step as the loop's owner would take it."""
+    """Take the step as the user's loop would take it."""
     if scaler is None:
         optimizer.step()
     else:
@@ -492,7 +494,7 @@ def _take(optimizer: Optimizer, scaler: Scaler | None) -> None:
 def _hooks_of_every_optimizer(
     stepper: GuardedStepper,
 ) -> tuple[Callable[..., Any], Callable[..., None]]:
-    """Checks before and after any step in the process, which do not keep the model alive."""
+    """Hooks before and after any step in the process that do not keep the model alive."""
     known = weakref.ref(stepper)
 
     def before(

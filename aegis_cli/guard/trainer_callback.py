@@ -1,4 +1,4 @@
-"""A callback of Hugging Face's Trainer, which makes a guard automatic for as long as it trains."""
+"""A callback for Hugging Face's Trainer that makes a guard automatic during training."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 def trainer_callback(
     guard: Guard, model: nn.Module, mask: Source, image: Source
 ) -> TrainerCallback:
-    """What a Trainer takes among its `callbacks`.
+    """A callback for the `callbacks` of a Trainer.
 
     Args:
-        guard: made before the Trainer.
-        model: what it guards.
+        guard: created before the Trainer.
+        model: the guarded model.
         mask: as for `Guard.automatic`.
         image: as for `Guard.automatic`.
 
     Raises:
-        AegisError: transformers is not installed, or not beside a peft that it works with.
+        AegisError: transformers is not installed, or only with an incompatible peft.
     """
     try:
         from transformers import TrainerCallback
@@ -40,7 +40,7 @@ def trainer_callback(
         ) from error
 
     class GuardCallback(TrainerCallback):
-        """Begins with the training, and settles before a checkpoint or an evaluation."""
+        """Starts the guard with the training, and settles before a checkpoint or an evaluation."""
 
         def on_train_begin(self, args: Any, state: Any, control: Any, **given: Any) -> None:
             _check_model(given["model"], model)
@@ -49,7 +49,7 @@ def trainer_callback(
                 scaler = getattr(given.get("optimizer"), "scaler", None)
                 guard.automatic(mask=mask, image=image, scaler=scaler)
             else:
-                # A Trainer begins again with smaller batches where the memory did not suffice.
+                # A Trainer starts again with smaller batches if it ran out of memory.
                 guard.discard()
 
         def on_step_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:
@@ -57,7 +57,7 @@ def trainer_callback(
                 guard.settle()
 
         def on_epoch_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:
-            # Whether it saves or evaluates now, a callback after this one may still decide.
+            # A later callback may still decide to save or evaluate now.
             guard.settle()
 
         def on_train_end(self, args: Any, state: Any, control: Any, **given: Any) -> None:

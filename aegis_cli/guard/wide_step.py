@@ -1,8 +1,8 @@
-"""An optimizer's step on float32 masters of weights that somebody else keeps in half precision.
+"""An optimizer's step on float32 master weights, if a program keeps the weights in half precision.
 
-Programs such as LeRobot load a VLM in bfloat16. Its parameters stay as they are for the program's
+Programs such as LeRobot load a VLM in bfloat16. Its parameters keep that dtype for the program's
 passes. Within a step they are float32, with float32 gradients; the masters are part of the
-optimizer's state, so that a resumed training has them.
+optimizer's state, so that a resumed run has them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WIDE = (torch.float32, torch.float64)
 
 
 class WideStep:
-    """The parameters of an optimizer that have masters: those in half precision among some."""
+    """The half-precision parameters of an optimizer, which have float32 masters."""
 
     def __init__(self, optimizer: Optimizer, parameters: Iterable[Tensor]) -> None:
         self._optimizer = optimizer
@@ -35,13 +35,13 @@ class WideStep:
 
     @contextlib.contextmanager
     def taken(self) -> Generator[None]:
-        """Let the parameters be their masters inside the block, and then those rounded.
+        """Replace the parameters by their masters inside the block, and round them back afterwards.
 
-        A parameter that somebody has changed since has its master anew, from what it is now.
+        A parameter that was changed since the last step gets a new master from its current value.
 
         Raises:
-            AegisError: several processes, whose DistributedDataParallel would no longer see the
-                gradients of parameters that have been of another type.
+            AegisError: there are several processes: DistributedDataParallel would no longer see the
+                gradients of parameters whose dtype has changed.
         """
         if self._half and process_groups.count() > 1:
             raise AegisError(
@@ -53,7 +53,7 @@ class WideStep:
         narrow = [p.data for p in self._half]
         given = [p.grad for p in self._half]
         for parameter, master in zip(self._half, self._masters(), strict=True):
-            # A gradient has its parameter's type, so that it is taken off while that changes.
+            # A gradient must have its parameter's dtype, so it is detached while that changes.
             gradient, parameter.grad = parameter.grad, None
             parameter.data = master
             parameter.grad = None if gradient is None else gradient.float()
@@ -63,14 +63,14 @@ class WideStep:
             for parameter, values, gradient in zip(self._half, narrow, given, strict=True):
                 master = parameter.data
                 parameter.grad = None
-                parameter.data = values.copy_(master)  # where the program may hold a view of it
+                parameter.data = values.copy_(master)  # in place: the program may hold a view
                 parameter.grad = gradient
-                # The optimizer fills an empty state by itself, so nothing may be there before.
+                # The optimizer initialises only an empty state, so nothing may be there before.
                 if state := self._optimizer.state.get(parameter):
                     state[MASTER] = master
 
     def _masters(self) -> list[Tensor]:
-        """Each parameter's master, as the last step left it."""
+        """Each parameter's master from the last step, or a new one."""
         known = []
         for parameter in self._half:
             known.append(self._optimizer.state.get(parameter, {}).get(MASTER))
@@ -81,7 +81,7 @@ class WideStep:
         return found
 
     def _rounded_alike(self, masters: Sequence[Tensor | None]) -> list[bool]:
-        """Whether each parameter is its master rounded, by one transfer from the device."""
+        """Whether each parameter equals its rounded master, in one transfer from the device."""
         if not masters:
             return []
         flags = []
@@ -90,20 +90,20 @@ class WideStep:
                 flags.append(torch.zeros((), dtype=torch.bool, device=parameter.device))
             else:
                 flags.append((master.to(parameter.dtype) == parameter.data).all())
-        # The program may have its layers on several GPUs.
+        # The program may have spread its layers over several GPUs.
         return torch.stack([flag.to(flags[0].device) for flag in flags]).tolist()
 
 
 @contextlib.contextmanager
 def loading(optimizer: Optimizer, state: Mapping[str, Any]) -> Generator[None]:
-    """Let parameters with masters be float32 while their state is loaded.
+    """Make parameters with masters float32 while their state is loaded.
 
-    PyTorch casts what it loads to the type of the parameter.
+    PyTorch casts a loaded state to the dtype of its parameter.
     """
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
     numbers = [number for group in state["param_groups"] for number in group["params"]]
     wide: list[nn.Parameter] = []
-    # Not strict: PyTorch has an error of its own for a state of other groups.
+    # Not strict: PyTorch itself raises an error for a state with other groups.
     for number, parameter in zip(numbers, ordered, strict=False):
         if MASTER in state["state"].get(number, {}):
             wide.append(parameter)

@@ -1,6 +1,6 @@
-"""Say what a path is: an artifact file, a run, a dataset or a model.
+"""Determine what a path is: an artifact file, a run, a dataset or a model.
 
-What needs torch is imported when it is needed, for a header's bytes are read in no time.
+Modules that load torch are imported only when needed, so reading a header stays fast.
 """
 
 from __future__ import annotations
@@ -56,25 +56,25 @@ def run(
 ) -> InspectReport | StreamInspection | QuestionsReport:
     """Recognise `path`: an embedded model's name, an artifact file, a run, a dataset or questions.
 
-    What is on the hub goes by its id. Of a LeRobot dataset only the meta folder is downloaded, of
-    questions the split that is read, which may follow a #.
+    Data on the hub is named by its id. Of a LeRobot dataset only the meta folder is downloaded; of
+    questions only one split, which may be named after a #.
 
-    Only an artifact's header is read, unless figures need the tensors. It is done at once, so
-    `on_event` is called for images alone.
+    Only an artifact's header is read, unless figures need the tensors. This is fast, so `on_event`
+    is only called for images.
 
     Args:
         images: whether to decode every image that questions are about.
 
     Raises:
-        AegisError: nothing there, nothing we know, damaged, a run without a ledger yet, or a stream
-            that is not learned to its end.
+        AegisError: nothing is there, it is unknown or damaged, it is a run without a ledger yet, or
+            a stream that is not finished.
     """
     path = _located(path)
     if is_questions(path):
         from aegis_cli.data.vqa import summary
 
         return summary.of_set(str(path), images, on_event)
-    # What is here goes before what the hub may have of the same name.
+    # A local path takes precedence over a hub id of the same name.
     if not path.exists() and not hub.is_local(str(path)):
         from aegis_cli.data.lerobot import download
         from aegis_cli.inspection import folders
@@ -91,7 +91,7 @@ def is_questions(path: Path) -> bool:
     """Whether a path is a file or folder of questions, easy-VQA's name, or a set on the hub.
 
     Raises:
-        AegisError: what has the form of an id on the hub, and is not there.
+        AegisError: the path has the form of a hub id, but the hub has nothing of that name.
     """
     if path.is_dir():
         from aegis_cli.inspection import folders
@@ -100,9 +100,9 @@ def is_questions(path: Path) -> bool:
     if not path.exists() and not hub.is_local(str(path)):
         from aegis_cli.data.lerobot import download
 
-        # Whatever is no LeRobot dataset is read as questions, or refused as such.
+        # Anything but a LeRobot dataset is read as questions, or refused as such.
         return not download.is_dataset(str(path))
-    if path.exists() and path.suffix not in file.OF_QUESTIONS:  # told without torch
+    if path.exists() and path.suffix not in file.OF_QUESTIONS:  # decided without torch
         return False
     from aegis_cli.data.vqa import summary
 
@@ -110,24 +110,24 @@ def is_questions(path: Path) -> bool:
 
 
 def verify(path: Path) -> dict[Path, bool]:
-    """Read every artifact at a path or in a folder whole; models of other programs are left out.
+    """Read all artifacts at a path completely; models of other programs are skipped.
 
     Returns:
-        The files, and whether each has a digest, with which it then agrees.
+        The files, and whether each has a digest, which was then verified.
 
     Raises:
-        AegisError: a damaged file, or no artifact at all.
+        AegisError: a file is damaged, or there is no artifact.
     """
     from aegis_cli.common import artifacts
 
     path = _located(path)
     if not path.is_dir():
         return {path: artifacts.load(path).header.digest is not None}
-    # Links to one file, such as those of the last checkpoint, count once.
+    # A file reached through several links, such as the last checkpoint's, counts once.
     listed = {os.path.realpath(each): each for each in _artifacts_below(path)}
     found = {}
     for each in listed.values():
-        if artifacts.is_artifact(each):  # else it may be a Hugging Face model's
+        if artifacts.is_artifact(each):  # it may be a Hugging Face model's
             found[each] = artifacts.load(each).header.digest is not None
     if not found:
         raise AegisError(
@@ -137,12 +137,12 @@ def verify(path: Path) -> dict[Path, bool]:
 
 
 def _artifacts_below(folder: Path) -> Iterator[Path]:
-    """The safetensors files below a folder and the folders that links in it lead to, in order."""
+    """The safetensors files below a folder, including linked folders, in order."""
     seen = set()
     for place, inner, names in os.walk(folder, followlinks=True):
         inner.sort()
         real = os.path.realpath(place)
-        if real in seen:  # a link to a folder above would go round for ever
+        if real in seen:  # a link to a parent folder would loop forever
             inner.clear()
             continue
         seen.add(real)

@@ -1,4 +1,4 @@
-"""The figures of an anchor and of a ledger, from their tensors."""
+"""The figures of anchors and ledgers, from their tensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.inspection.report import BINS, ENERGIES, Bin, LayerEnergy, LayerM
 
 
 def of_file(path: Path, kind: str) -> dict[str, Any]:
-    """The fields of a report that an anchor or a ledger fills."""
+    """The report fields for an anchor or a ledger."""
     return of_anchor(path) if kind == "anchor" else of_ledger(path)
 
 
@@ -29,14 +29,14 @@ def of_anchor(path: Path) -> dict[str, Any]:
     moments = []
     for i in range(len(anchor.image)):
         for kind, layers in (("image", anchor.image), ("text", anchor.text)):
-            if layers[i].count:  # a model without images has seen no token of one
+            if layers[i].count:  # a model without images has no image tokens
                 moments.append(_moments(f"layers.{i} {kind}", layers[i].mean, layers[i].var))
     inputs, curvature = _sites(anchor.inputs), _sites(anchor.curvature)
     return {"moments": tuple(moments), "inputs": inputs, "curvature": curvature}
 
 
 def _sites(spectra: Mapping[str, Spectrum]) -> tuple[SiteSpectrum, ...]:
-    """A line for each map; those that share a spectrum follow the one that it is stored with."""
+    """One entry per map; maps that share a spectrum follow the one that it is stored with."""
     followers = shared(spectra)
     found = []
     for leader, spectrum in spectra.items():
@@ -50,7 +50,7 @@ def _sites(spectra: Mapping[str, Spectrum]) -> tuple[SiteSpectrum, ...]:
 
 def _site(name: str, spectrum: Spectrum) -> SiteSpectrum:
     values, vectors = spectrum.values, spectrum.vectors
-    if vectors is None:  # a table, whose directions are its rows
+    if vectors is None:  # an embedding table: its directions are its rows
         read = int((values > 0).sum())
         return SiteSpectrum(name, spectrum.kind, len(values), (read,) * len(ENERGIES), None)
     # Dense [d, k]; elementwise [D, m, m], which keeps all.
@@ -64,7 +64,7 @@ def _moments(name: str, mean: Tensor, var: Tensor) -> LayerMoments:
 
 
 def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
-    """The energies of a ledger over all steps, or over those up to one."""
+    """The energies of a ledger over all steps, or up to step `until`."""
     artifact = artifacts.load(path, "ledger")
     tensors, groups = artifact.tensors, artifact.header.meta["groups"]
     if until is not None:
@@ -76,7 +76,7 @@ def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
         for g in ledger.summarize_groups(groups, tensors)
     )
     mean = ledger.energy_shed_mean(tensors)
-    # A ledger has W2^2 of every layer, and inner products of what learns alone.
+    # A ledger has W2^2 of every layer, but inner products only of trainable groups.
     frozen = tuple(name for name in artifact.header.meta["layers"] if name not in groups)
     return {
         "layers": tuple(layers),
@@ -87,9 +87,9 @@ def of_ledger(path: Path, until: int | None = None) -> dict[str, Any]:
 
 
 def _over_time(groups: list[str], tensors: Mapping[str, Tensor]) -> tuple[Bin, ...]:
-    """The rows in at most `BINS` parts of (almost) equal length."""
+    """The rows in at most `BINS` bins of (almost) equal length."""
     count = len(tensors["step"])
-    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})  # fewer of a short run
+    edges = sorted({round(i * count / BINS) for i in range(BINS + 1)})  # fewer for a short run
     bins = []
     for first, end in pairwise(edges):
         bins.append(_bin(groups, {name: rows[first:end] for name, rows in tensors.items()}))

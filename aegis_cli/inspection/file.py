@@ -1,4 +1,4 @@
-"""A file by its header; torch is loaded only for the figures of those kinds that have some."""
+"""Inspect a file by its header; torch is loaded only for kinds that have figures."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.inspection.report import InspectReport, TensorInfo
 
 _WITH_FIGURES = ("anchor", "ledger")
-OF_QUESTIONS = (".jsonl", ".json", ".parquet")  # how files of questions end
+OF_QUESTIONS = (".jsonl", ".json", ".parquet")  # suffixes of question files
 
 
 def inspect(path: Path) -> InspectReport:
-    """What an artifact is.
+    """Inspect an artifact.
 
     Raises:
-        AegisError: it is none, or damaged.
+        AegisError: the file is no artifact, or damaged.
     """
     if path.is_file() and path.suffix != ".safetensors" and not _is_safetensors(path):
         what = f"a {path.suffix} file" if path.suffix else "a file that Aegis does not know"
@@ -39,12 +39,12 @@ def inspect(path: Path) -> InspectReport:
 
 
 def asked_by(path: Path) -> str:
-    """What to do with questions, which are no artifact."""
+    """Advice for question files, which are no artifacts."""
     return f"questions are asked by aegis probe MODEL --vqa '{path}'"
 
 
 def _is_safetensors(path: Path) -> bool:
-    """Whether a file of another name begins as those do: the header's length, then JSON."""
+    """Whether a file of another suffix begins like safetensors: the header's length, then JSON."""
     with files.reading(path, "check the path"), open(path, "rb") as file:
         return file.read(9)[8:] == b"{"  # the length takes 8 bytes
 
@@ -56,7 +56,7 @@ def _header_facts(header: headers.Header) -> dict[str, Any]:
         "seed": header.seed,
         "fingerprint": header.fingerprint,
     }
-    facts = known | {"inputs": header.inputs or None} | header.meta  # what is None has no line
+    facts = known | {"inputs": header.inputs or None} | header.meta  # None values are left out
     if header.kind == "ledger" and "step" in header.tensors:
         facts["steps"] = header.tensors["step"].shape[0]
     return {k: v for k, v in facts.items() if v is not None}

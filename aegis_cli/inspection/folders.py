@@ -1,4 +1,4 @@
-"""A folder: a run, a checkpoint, a stream, a dataset or a model."""
+"""Inspect a folder: a run, a checkpoint, a stream, a dataset or a model."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from aegis_cli.training import (
 )
 from aegis_cli.training.up_to_date import refuse_unfinished
 
-# What a merged checkpoint and a report of `aegis run` tell alike.
+# The entries that merged checkpoints and reports of `aegis run` have in common.
 _TOLD_OF_MERGES = ("method", "strength", "damping", "base", "kept", "validation_loss")
 
 
 def inspect(path: Path) -> InspectReport | StreamInspection:
-    """What a folder is.
+    """Determine what a folder is.
 
     Raises:
         UnknownFolder: nothing we know.
@@ -68,6 +68,8 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
         )
     if model_folder.is_policy(path):
         return file.inspect(path / "model.safetensors")
+    if (kind := model_folder.foreign_policy(path)) is not None:
+        return _foreign_policy(path, kind)
     for inside in (path, path / "backbone"):
         if model_folder.is_model(inside):
             return _hub_model(inside)
@@ -102,6 +104,16 @@ def _policy_folder(path: Path) -> InspectReport:
     return dataclasses.replace(found, kind="policy", path=str(path), facts=facts)
 
 
+def _foreign_policy(path: Path, kind: str) -> InspectReport:
+    """A policy of LeRobot's, by its weights' headers, and how its VLM is measured."""
+    # Beside the weights lie the scales of LeRobot's steps, as policy_preprocessor_*.safetensors.
+    parts = [part for part in model_folder.weights(path) if not part.name.startswith("policy_")]
+    tensors = tuple(info for part in parts for info in _tensor_infos(part))
+    count = sum(math.prod(tensor.shape) for tensor in tensors)
+    facts = {"type": kind, "parameters": count, "vlm": model_folder.take_out(path)}
+    return InspectReport("lerobot-policy", str(path), facts, tensors)
+
+
 def _hub_model(path: Path) -> InspectReport:
     """A folder of the Hugging Face hub's layout, by its configuration and its weights' headers."""
     config = files.load_json(path / "config.json")
@@ -110,7 +122,7 @@ def _hub_model(path: Path) -> InspectReport:
         raise AegisError(
             found, "the configuration of a Hugging Face model", "download the model again"
         )
-    # A model of images and text has the language model's sizes in a section of its own.
+    # A vision-language model has the language model's sizes in a separate section.
     inner = config.get("text_config")
     text = inner if isinstance(inner, dict) else config
     named = {
@@ -142,7 +154,7 @@ def _tensor_infos(weights: Path) -> Iterator[TensorInfo]:
 
 
 def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
-    """A run, or, as it was then, at one of its checkpoints."""
+    """A run, or its state at one of its checkpoints."""
     settings = recipes.load(path / "recipe.yaml")
     rows = path / "ledger.safetensors"
     if not rows.is_file():
@@ -155,7 +167,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     which = path / "checkpoints" / checkpoint.LAST if at is None else at
     merged = _merged(path, which)
     if merged:
-        # The log is that of the training, before the weights were moved back.
+        # The log is from the training, before the merge.
         metrics["validation_loss"] = merged.get("validation_loss")
     facts = _run_facts(path, until, header, settings, metrics)
     if merged:
@@ -183,7 +195,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
 
 
 def _with_results(report: InspectReport, path: Path, settings: Recipe) -> InspectReport:
-    """The report of a run, and what was measured of it."""
+    """Add to a run's report what was measured of it."""
     facts = dict(report.facts)
     if before := results.steps_measured_before(path):
         facts["measured_before"] = before
@@ -206,7 +218,7 @@ def _run_facts(
     settings: Recipe,
     metrics: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What a run is, or after `until` steps was."""
+    """The facts of a run, as it is now or was after `until` steps."""
     which: dict[str, Any] = {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
     if until is not None:
         which = {"run": str(path), "checkpoint": f"{until:06d}"}
@@ -226,7 +238,7 @@ def _run_facts(
 
 
 def _data_facts(header: Header, demos: Demos) -> dict[str, Any]:
-    """What a run has learned from, as far as it is not the task's own demonstrations."""
+    """The data that a run was trained on, unless it is the task's own demonstrations."""
     facts: dict[str, Any] = {}
     if cameras := header.meta.get("cameras", demos.camera):
         facts["cameras"] = cameras
@@ -242,7 +254,7 @@ def _data_facts(header: Header, demos: Demos) -> dict[str, Any]:
 
 
 def _steps(path: Path, metrics: Mapping[str, Any]) -> int | None:
-    """The steps of a run's policy, or of its log where a study has removed the checkpoints."""
+    """The steps of a run's policy, or of its log if a study has removed the checkpoints."""
     last = path / "checkpoints" / checkpoint.LAST
     there = (last / checkpoint.EXPERT).is_file()
     return checkpoint.step_of(last) if there else metrics.get("step")
@@ -255,10 +267,10 @@ def _without_pictures(found: Result) -> Result:
 
 
 def _merged(run: Path, at: Path) -> dict[str, Any] | None:
-    """How `aegis merge` made a checkpoint of a run; None of any other.
+    """How `aegis merge` made a checkpoint of a run; None if it did not.
 
-    The report of `aegis run` tells it too: a study removes checkpoints, and those of an earlier
-    Aegis do not know the loss after the merge.
+    The report of `aegis run` is used too: a study removes checkpoints, and those of an earlier
+    Aegis lack the loss after the merge.
     """
     expert, home = at / checkpoint.EXPERT, folder.measured_in(run)
     found = artifacts.read_header(expert).meta.get("merge") if expert.is_file() else None
@@ -266,15 +278,15 @@ def _merged(run: Path, at: Path) -> dict[str, Any] | None:
         return found
     told = kept_figures.read(home / folder.MERGE_REPORT, kept_figures.MergeFigures)
     merge = {name: told.get(name) for name in _TOLD_OF_MERGES}
-    # The checkpoint's own facts win, as far as it has them.
+    # The checkpoint's own facts take precedence.
     return merge | {name: value for name, value in (found or {}).items() if value is not None}
 
 
 def _last_metrics(path: Path, until: int | None) -> dict[str, Any]:
-    """The latest value of each figure of a run, or of its beginning."""
+    """The latest value of each figure of a run, up to step `until` if given."""
     latest: dict[str, Any] = {}
     for row in folder.read_metrics(path, "step"):
         if until is None or row["step"] <= until:
-            # Not every line has every figure: the validation loss comes more seldom.
+            # Not every line has every figure: the validation loss is less frequent.
             latest |= {name: value for name, value in row.items() if value is not None}
     return latest

@@ -1,7 +1,7 @@
-"""What is known of a path; nothing here loads torch.
+"""The report on a path; nothing here loads torch.
 
-The inspection of a run or ledger tells how much gradient energy each layer shed, and when; that of
-a stream's run tells which experts were used and which were pruned, per task and map.
+For a run or ledger it shows how much gradient energy each layer shed, and when; for a stream's run,
+which experts were used and which were pruned, per task and map.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aegis_cli.data.lerobot.summary import FeatureInfo
     from aegis_cli.evaluation.results import PlayedResult, Result
 
-BINS = 64  # parts of a run's steps in `over_time`
+BINS = 64  # bins of a run's steps in `over_time`
 ENERGIES = (0.9, 0.99, 0.999)  # shares of the energy in `SiteSpectrum.kept`
 
 
@@ -60,14 +60,14 @@ class LayerMoments:
 
 @dataclass(frozen=True)
 class SiteSpectrum:
-    """What one map reads on questions, or how much their answers mind what it reads and writes.
+    """The spectrum of a map's inputs on questions, or of the curvature of their answers at the map.
 
     Attributes:
-        size: directions of its inputs, or outputs; of a table, rows.
-        kept: how many of them hold each share of `ENERGIES` of the energy; of a table, the rows
-            that are read.
+        size: number of directions of its inputs or outputs; for a table, of rows.
+        kept: how many of them hold each share in `ENERGIES` of the energy; for a table, the number
+            of rows that are read.
         stored: eigenvectors in the file; None for a table, whose directions are its rows.
-        same_as: the map that reads the same tensor, with which the spectrum is stored; None where
+        same_as: the map that reads the same tensor and with which the spectrum is stored; None if
             it is this map's own.
     """
 
@@ -84,7 +84,7 @@ class Bin:
     """The steps from `first_step` to `last_step`, and the energy shed in them.
 
     Attributes:
-        energy_shed: share of the energy of all groups together, mean over the steps.
+        energy_shed: share of the energy of all groups together, as a mean over the steps.
         layers: mean per group.
     """
 
@@ -95,21 +95,21 @@ class Bin:
 
 
 class UnknownFolder(AegisError):
-    """A folder that is nothing by itself, whatever it holds."""
+    """A folder that is of no known kind, whatever it contains."""
 
 
 @dataclass(frozen=True)
 class InspectReport:
-    """What is known of a path; what does not apply to its kind is empty or None.
+    """The report on a path; fields that do not apply to its kind are empty or None.
 
     Attributes:
         kind: what the path is.
-        facts: what is said of it in one line each.
-        frozen: the layers of which nothing has learned, so that they have no energies.
-        energy_shed_mean: None, with `layers`, `frozen` and `over_time` empty, where no anchor
-            gradient was taken.
+        facts: facts that are shown in one line each.
+        frozen: the layers without trained parameters, which have no energies.
+        energy_shed_mean: None, with `layers`, `frozen` and `over_time` empty, if no anchor gradient
+            was taken.
         probes, rollouts, open_loops: what was measured of a run's last checkpoint.
-        question_sets: that of each of the probes, as somebody named it.
+        question_sets: the question set of each probe, as the user named it.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
     """
 
@@ -135,7 +135,7 @@ class InspectReport:
 
     @property
     def method(self) -> str:
-        """A run's method, and whether what it trained was merged afterwards."""
+        """A run's method, and whether its result was merged afterwards."""
         return f"{self.facts['method']}, merged" if "merge" in self.facts else self.facts["method"]
 
     def to_json(self) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class InspectReport:
 
 
 def steps_taken(steps: int | None, planned: int | None) -> str:
-    """How many steps a run has taken in words, and of how many where some are left."""
+    """In words, how many steps a run has taken, and of how many if some are left."""
     if steps is None:
         return "-"
     left = planned is not None and steps < planned
@@ -152,7 +152,7 @@ def steps_taken(steps: int | None, planned: int | None) -> str:
 
 @dataclass(frozen=True)
 class StreamInspection:
-    """The finished run of a stream, and where it lies."""
+    """The finished run of a stream, and its path."""
 
     kind: str
     path: str

@@ -12,16 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import files, locks
+from aegis_cli.common import circumstances, files, kept_lines, locks
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.kept_lines import KeptLines
+from aegis_cli.common.ranks import ALONE
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.gate import MEAN, passes
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import kept_answers, probe
 from aegis_cli.merging import rules, sources
 from aegis_cli.merging.displacement import Displacement
 from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
-from aegis_cli.models.asking import ask
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,10 @@ def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, A
 
 
 class _Judge:
-    """Asks validation questions of the merged model, and tries its task on validation data."""
+    """Asks validation questions of the merged model, and tries its task on validation data.
+
+    Answers and figures are kept by the weights that gave them: an interrupted sweep goes on.
+    """
 
     def __init__(self, source: sources.Source, settings: MergeSettings, on_event: OnEvent) -> None:
         self._source, self._size = source, settings.batch_size
@@ -235,7 +239,11 @@ class _Judge:
         self._asked = read.choose(
             "validation", settings.questions, probe.PROBE_SEED, checks, on_event
         )
-        self._before = ask(source.base, self._asked, self._size, on_event)
+        base = kept_answers.of_now(source.base)
+        self._before = kept_answers.ask(base, self._asked, self._size, ALONE, on_event)
+        self._figures = KeptLines("merges", circumstances.of_answers(), on_event)
+        lines = filter(None, map(kept_lines.unsealed, self._figures.read()))
+        self._known = {line["judged_by"]: line["figures"] for line in lines}
 
     @property
     def questions(self) -> int:
@@ -248,13 +256,23 @@ class _Judge:
 
     def point(self, strength: float, kept: float) -> MergePoint:
         """What the backbone's weights of now are worth."""
-        after = ask(self._source.backbone, self._asked, self._size)
+        merged = kept_answers.of_now(self._source.backbone)
+        after = kept_answers.ask(merged, self._asked, self._size, ALONE, ignore)
         report = probe.compare(after, self._before, [], None)
-        performance = _performance(self._source, strength)
+        performance = self._performance(strength)
         assert report.drop_points is not None and report.drop_interval is not None
         return MergePoint(
             strength, kept, report.accuracy, report.drop_points, report.drop_interval, **performance
         )
+
+    def _performance(self, strength: float) -> dict[str, float]:
+        """How well the task is done, as it was found before or is now."""
+        by = files.sha256_value(self._source.judged_by())
+        if by not in self._known:
+            self._known[by] = _performance(self._source, strength)
+            line = {"judged_by": by, "figures": self._known[by]}
+            self._figures.add([kept_lines.sealed(line)])
+        return self._known[by]
 
 
 def _try(

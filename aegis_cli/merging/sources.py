@@ -23,10 +23,10 @@ from aegis_cli.core.spectrum import Spectrum
 from aegis_cli.data import mixture
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
-from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa import digests, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import score
-from aegis_cli.evaluation import probe
+from aegis_cli.evaluation import kept_answers, probe
 from aegis_cli.merging import task_factors
 from aegis_cli.merging.settings import MergeSettings
 from aegis_cli.methods import ledger_file
@@ -66,6 +66,9 @@ class Source(Protocol):
 
         It is empty where nothing says so.
         """
+
+    def judged_by(self) -> dict[str, Any]:
+        """All that `performance` depends on, as JSON: the weights of now, too."""
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         """Write the merged weights, all or nothing; `merged` says how they were made."""
@@ -127,6 +130,14 @@ class PolicyRun:
         noise = train.validation_noise(self._recipe.seed)
         loss = train.validation_loss(self._policy, self._demos, self._recipe.train, noise)
         return {"validation_loss": loss}
+
+    def judged_by(self) -> dict[str, Any]:
+        return {
+            "policy": self._policy.fingerprint(),
+            "demos": self._demos.sha256,
+            "recipe": files.sha256_file(self._run / "recipe.yaml"),
+            **machine.versions(("av",)),  # which decodes videos
+        }
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         step = checkpoint.step_of(self._checkpoint)
@@ -293,6 +304,11 @@ class ModelFolder:
         asked, size = self._asked.validation, self._settings.batch_size
         graded = ask(self.backbone, asked, size, self._on_event)
         return {"task_accuracy": score(graded).accuracy}
+
+    def judged_by(self) -> dict[str, Any]:
+        asked = None if self._asked is None else digests.of_questions(self._asked.validation)
+        size = self._settings.batch_size
+        return {**kept_answers.about(self.backbone), "questions": asked, "batch_size": size}
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         def fill(folder: Path) -> None:

@@ -1,8 +1,8 @@
-"""The methods by name: each is the file of that name in this folder, as far as recipes know it.
+"""The methods by name. Each is the file of that name in this folder, if recipes list it.
 
-A new method is a file with `METHOD = Method(...)`, its name in `recipes.METHODS` (in the order of
-tables), the parts of an anchor that it reads in `recipes.NEEDS`, and a section of options if it has
-any. Recipes are read without torch, so they repeat names and needs.
+A new method is a file with `METHOD = Method(...)`, its name in `recipes.METHODS` (in the order that
+tables use), the parts of an anchor that it reads in `recipes.NEEDS`, and a section of options if it
+has any. Recipes are read without torch, so they repeat names and needs.
 """
 
 from collections.abc import Iterable
@@ -14,17 +14,17 @@ from aegis_cli.methods.base import Method
 
 
 def find(names: Iterable[str]) -> dict[str, Method]:
-    """The methods of these names from their files.
+    """The methods with these names, from their files.
 
     Raises:
         ModuleNotFoundError: no file of that name.
-        ValueError: a file that disagrees with recipes about its name or its needs.
+        ValueError: a file disagrees with the recipes about its name or its needs.
     """
     return {name: _load(name) for name in names}
 
 
 def get(name: str) -> Method:
-    """The method of that name.
+    """The method with this name.
 
     Raises:
         AegisError: there is none.

@@ -1,23 +1,24 @@
 """AEGIS (arXiv 2604.16067): project each layer's task gradient off its anchor gradient.
 
-Per parameter group, with g the task gradient, a the gradient of the transport penalty and
-d = <g, a>, where d < 0 (the paper's eq. 12-14, without an epsilon in the denominator, with which
+For each parameter group, let g be the task gradient, a the gradient of the transport penalty and
+d = <g, a>. If d < 0 (the paper's eq. 12-14, but without the epsilon in the denominator, with which
 the result would not be orthogonal):
 
     g <- g - (d / <a, a>) a
 
 The options are ours, not the paper's:
 
-    scope, weighting  which tokens are compared, and how layers are weighed
+    scope, weighting  which tokens are compared, and how layers are weighted
     groups            which parameter groups are projected
     restoration       lambda of an added restoring term, g + lambda a
     projects          what is projected: the gradient, the *applied* update D (a conflict is
                       <D, a> > 0), or both. Adam scales elementwise, so an orthogonal gradient does
                       not give an orthogonal update.
     idle: kept        a is 0 wherever g is 0, so that the projection moves nothing that the task
-                      does not: most of the last layer, of which the expert reads keys and values
-    refresh           steps that share one a, taken at the first of them
-    fraction          share of the batch that a is taken on
+                      does not: most of the last layer, since the expert reads only its keys and
+                      values
+    refresh           steps that share one a, computed at the first of them
+    fraction          fraction of the batch that a is computed on
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def start(context: MethodContext) -> Parts:
     """Start the method of the paper, or a variant of it.
 
     Raises:
-        AegisError: options that leave no group to project.
+        AegisError: the options leave no group to project.
     """
     options = context.options
     assert context.anchor is not None
@@ -65,10 +66,10 @@ def start(context: MethodContext) -> Parts:
             "--set aegis.groups=all, or freeze less",
         )
     like = next(p for group in context.groups.values() for p in group)
-    # The anchor is compared in float32, also where the weights are bfloat16.
+    # The anchor is compared in float32, even if the weights are bfloat16.
     like = like.new_empty(0, dtype=wide_type(like.dtype))
     projects = options["projects"]
-    # In the order of the groups, as the inner products [G] are.
+    # In the order of the groups, like the inner products [G].
     combine = _combine(list(chosen.values()), projects != "update", options["restoration"])
     return Parts(
         penalty=_penalty(context.anchor, options["scope"], options["weighting"], like),
@@ -85,12 +86,12 @@ def start(context: MethodContext) -> Parts:
 
 @dataclass
 class _Target:
-    """What the tokens of one type are compared with.
+    """The reference for the tokens of one type.
 
     Attributes:
         scope: which tokens: `all`, `image` or `text`.
         anchor: their Gaussian in the pre-trained backbone, one per layer.
-        weights: what each layer's distance counts [L].
+        weights: weight of each layer's distance [L].
     """
 
     scope: str
@@ -102,7 +103,7 @@ class _Target:
         self._follow(seen.hidden[0].device)
         everything = torch.ones_like(seen.image)  # [T] or [B, T], as `image` is
         inside = {"all": everything, "image": seen.image, "text": ~seen.image}
-        # In a user's own model the layers may be on several GPUs; the Gaussians are on one.
+        # In a user's own model the layers may span several GPUs; the Gaussians are on one.
         at = self.anchor[0].mean.device
         found = []
         for mean, variance in _moments(seen, seen.mask & inside[self.scope]):
@@ -110,7 +111,7 @@ class _Target:
         return transport_penalty(found, self.anchor, self.weights)
 
     def _follow(self, device: torch.device) -> None:
-        """Move the anchor to the hidden states' device: the model may have been moved since."""
+        """Move the anchor to the hidden states' device, in case the model has been moved."""
         if self.anchor[0].mean.device != device:
             self.anchor = [layer.to(device) for layer in self.anchor]
             self.weights = self.weights.to(device)
@@ -124,10 +125,10 @@ def _penalty(
     The scope `each` averages the costs of image and of text tokens.
 
     Raises:
-        AegisError: an anchor that saw no tokens in scope.
+        AegisError: the anchor saw no tokens in scope.
     """
     measured: dict[str, Sequence[Moments]] = {"image": anchor.image, "text": anchor.text}
-    # Merged, so that each token counts alike; `each` gives both kinds the same weight instead.
+    # Merged, so that every token counts the same; `each` gives both types equal weight instead.
     merged = []
     for of_image, of_text in zip(anchor.image, anchor.text, strict=True):
         merged.append(merge(of_image, of_text))
@@ -143,7 +144,7 @@ def _penalty(
     targets = []
     for name in scopes:
         layers = [layer.to(like) for layer in measured[name]]
-        # Made once, because their checks force a GPU sync.
+        # Created once, because the checks force a GPU sync.
         targets.append(_Target(name, layers, layer_weights(layers, weighting)))
 
     def penalty(seen: Pass) -> tuple[Tensor, Tensor]:
@@ -154,7 +155,7 @@ def _penalty(
 
 
 def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
-    """Mean [D] and variance [D] of each layer over a pass's tokens in the mask [B, T]."""
+    """Mean [D] and variance [D] of each layer over the tokens of a pass in the mask [B, T]."""
     # On a GPU, selecting rows would force a sync per layer.
     waits = devices.reading_stalls(mask.device)
     if seen.total is not None:
@@ -164,7 +165,7 @@ def _moments(seen: Pass, mask: Tensor) -> Sequence[tuple[Tensor, Tensor]]:
     return [batch_moments(hidden, mask) for hidden in seen.hidden]
 
 
-# --- what is done with it -------------------------------------------------------------------------
+# --- the projection -------------------------------------------------------------------------------
 
 
 def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> projection.Combine:
@@ -175,8 +176,8 @@ def _combine(chosen: Sequence[bool], project: bool, restoration: float) -> proje
         nonlocal counts  # moved to the gradients' device once, at the first step
         task, anchor = rule(tt, ta, aa)
         counts = devices.send(counts, anchor.device)
-        # lambda comes on top of the projection's own weight. A group that is not chosen keeps its
-        # task gradient, bit for bit.
+        # lambda is added to the projection's own weight. A group that is not chosen keeps its task
+        # gradient, bit for bit.
         return task, (anchor + restoration) * counts
 
     return combine
@@ -205,7 +206,7 @@ def project_update(
     """Remove from one group's applied update what would raise the transport cost to first order.
 
     Args:
-        owners: the processes that have some rows of each parameter.
+        owners: the processes that each have some rows of every parameter.
     """
     here = [rows_here(p) for p in group]
     moved = []
@@ -213,9 +214,9 @@ def project_update(
         moved.append(parameter - rows_here(update.before[name]))
     given = [update.anchor_gradient.get(name) for name in names]
     anchor = [None if a is None else rows_here(a) for a in given]
-    # The update descends, where a gradient ascends: it raises the cost where <D, a> > 0.
+    # An update points downhill, a gradient uphill: the update raises the cost if <D, a> > 0.
     products = torch.stack(projection.inner(moved, anchor))
-    _, along, aa = owners.total(products)  # rows add up, as parameters do
+    _, along, aa = owners.total(products)  # inner products add up over rows
     # D <- D - relu(<D, a>) / <a, a> a, which leaves <D, a> = 0 in a conflict.
     excess: float | Tensor = ratio(torch.relu(along), aa)
     if not devices.reading_stalls(aa.device):

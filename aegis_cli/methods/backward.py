@@ -1,4 +1,4 @@
-"""The second backward pass over a kept graph, and what a method makes of both gradients."""
+"""The second backward pass over a kept graph, and the combination of both gradients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Weights = Sequence[float] | Tensor  # one for each group
 def second_backward(
     groups: Groups, penalty: Tensor, retain_graph: bool = False
 ) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id; None where the penalty does not reach it.
+    """The anchor gradient of each parameter by its id; None if the penalty does not reach it.
 
     Args:
         groups: the parameters, each once.
@@ -28,7 +28,7 @@ def second_backward(
         retain_graph: whether the other backward pass is still to come.
     """
     flat = [p for group in groups for p in group]
-    # `grad` leaves `.grad` alone, where the task gradient lies.
+    # `autograd.grad` does not touch `.grad`, which holds the task gradient.
     gradients = torch.autograd.grad(penalty, flat, retain_graph=retain_graph, allow_unused=True)
     return {id(p): gradient for p, gradient in zip(flat, gradients, strict=True)}
 
@@ -36,21 +36,22 @@ def second_backward(
 def second_backward_of_rows(
     groups: Groups, penalty: Tensor, others: Iterable[nn.Parameter] = ()
 ) -> dict[int, Tensor | None]:
-    """The anchor gradient of each parameter by its id, where a process has only rows of it.
+    """The anchor gradient of each parameter by its id, if a process has only some of its rows.
 
-    FSDP reduces and shards a gradient on its way into `.grad`, so this one has to go there too. The
-    task's gradients are put aside meanwhile, also those of other parameters that the penalty
-    reaches: these keep the task's gradient alone.
+    FSDP reduces and shards a gradient on its way into `.grad`, so the anchor gradient has to go
+    there too. The task gradients are set aside meanwhile, including those of other parameters that
+    the penalty reaches: these keep only their task gradient.
 
     Args:
-        others: further parameters that it may depend on. Leaves of its graph are found, but the
-            graph does not know the rows that FSDP cuts a gradient to.
+        others: further parameters that the penalty may depend on. The leaves of its graph are
+            found anyway, but the graph does not show the sharded parameters that FSDP writes
+            gradients to.
     """
     parameters = [p for group in groups for p in group]
-    # By id, because a parameter may come once more as a leaf of the graph.
+    # By id, because a parameter may also be a leaf of the graph.
     reached = {id(p): p for p in (*parameters, *others, *_leaves(penalty))}
     task = {key: p.grad for key, p in reached.items()}
-    # Emptied, since a backward pass adds to what is there.
+    # Cleared, because a backward pass accumulates into `.grad`.
     for parameter in reached.values():
         parameter.grad = None
     penalty.backward()
@@ -62,7 +63,7 @@ def second_backward_of_rows(
 
 def _nodes(result: Tensor) -> Iterator[Node]:
     """The nodes of the graph that leads to `result`, each once."""
-    # A loop, because a deep model's graph is deeper than Python lets a function recurse.
+    # A loop, because the graph of a deep model exceeds Python's recursion limit.
     waiting, seen = [result.grad_fn], set()
     while waiting:
         node = waiting.pop()
@@ -74,16 +75,16 @@ def _nodes(result: Tensor) -> Iterator[Node]:
 
 
 def _leaves(result: Tensor) -> Iterator[Tensor]:
-    """The tensors into whose `.grad` a backward pass from `result` may add."""
+    """The tensors whose `.grad` a backward pass from `result` may accumulate into."""
     for node in _nodes(result):
         if (leaf := getattr(node, "variable", None)) is not None:
             yield leaf
 
 
 def uses_reentrant_checkpointing(result: Tensor) -> bool:
-    """Whether a part of the graph is recomputed by `torch.utils.checkpoint(use_reentrant=True)`.
+    """Whether part of the graph is recomputed by `torch.utils.checkpoint(use_reentrant=True)`.
 
-    Such a part allows one backward pass only.
+    Such a part allows only one backward pass.
     """
     return any(node.name() == "CheckpointFunctionBackward" for node in _nodes(result))
 
@@ -91,10 +92,10 @@ def uses_reentrant_checkpointing(result: Tensor) -> bool:
 def where_task_moves(
     groups: Groups, anchor: Mapping[int, Tensor | None]
 ) -> dict[int, Tensor | None]:
-    """The anchor gradient with zeros wherever `.grad` is zero, and None where there is no `.grad`.
+    """The anchor gradient, zeroed wherever `.grad` is zero, and None if there is no `.grad`.
 
     Args:
-        anchor: the anchor gradient by the parameters' ids; it stays as it is.
+        anchor: the anchor gradient by the parameters' ids; it is not modified.
     """
     return {id(p): _masked(p.grad, anchor[id(p)]) for group in groups for p in group}
 
@@ -117,8 +118,8 @@ def combine_gradients(
     Args:
         anchor: the anchor gradient by the parameters' ids.
         combine: the method's rule (AEGIS: arXiv 2604.16067).
-        total: a tensor -> its sum over the processes, where each has rows of every parameter; None
-            where each has all of them.
+        total: sums a tensor over the processes, if each has some rows of every parameter; None if
+            each has all of them.
         reads: whether the weights may be read, which forces a GPU sync.
 
     Returns:
@@ -134,7 +135,7 @@ def combine_gradients(
     of_anchor: Weights
     of_task, of_anchor = combine(*gram)
     if reads or _moves_idle(pairs):
-        # One transfer for all groups: each number read by itself would be a GPU sync.
+        # One transfer for all groups: reading each number separately would sync the GPU each time.
         of_task, of_anchor = torch.stack((of_task, of_anchor)).tolist()
     for group, (task, pull), wg, wa in zip(groups, pairs, of_task, of_anchor, strict=True):
         combined = projection.apply(task, pull, wg, wa)
@@ -144,7 +145,7 @@ def combine_gradients(
 
 
 def _moves_idle(pairs: Sequence[tuple[projection.Gradients, projection.Gradients]]) -> bool:
-    """Whether the projection may move what the task does not.
+    """Whether the projection may move parameters that the task does not.
 
     Such a parameter gets a gradient only if the weight is not 0; without one the optimizer skips
     it. So the weight has to be read.
@@ -160,7 +161,7 @@ def _gram_of_rows(
     pairs: Sequence[tuple[projection.Gradients, projection.Gradients]],
     total: Callable[[Tensor], Tensor],
 ) -> Gram:
-    """The inner products of gradients of which each process has some rows, by one reduction."""
+    """The inner products of gradients that are sharded by rows, in one reduction."""
     here = []
     for task, anchor in pairs:
         here.append((_rows_here(task), _rows_here(anchor)))
@@ -173,11 +174,11 @@ def _rows_here(gradients: projection.Gradients) -> projection.Gradients:
 
 
 def recompile_for_two_backward_passes() -> None:
-    """If torch.compile was used: recompile, so that each graph allows a second backward pass.
+    """If torch.compile was used, recompile so that each graph allows a second backward pass.
 
     A graph compiled for one backward pass overwrites the buffers that the second needs.
     """
-    # Only where both are loaded: without them nothing is compiled, and they load slowly.
+    # Only if both are loaded: without them nothing is compiled, and importing them is slow.
     if not {"torch._functorch.config", "torch._dynamo"} <= sys.modules.keys():
         return
     import torch._dynamo as dynamo

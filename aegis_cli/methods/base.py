@@ -1,4 +1,4 @@
-"""A method as parts that combine freely, and what it is given."""
+"""A method as parts that combine freely, and the inputs that it gets."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ M = TypeVar("M", bound=nn.Module)
 class MethodContext(Generic[M]):
     """What a method is started with: model, options, anchor and data.
 
-    Every tensor is on the device where training runs. A method that the guard has takes any module
-    M; others may ask for a `Backbone`.
+    Every tensor is on the training device. A method that the guard offers takes any module M;
+    others may require a `Backbone`.
 
     Attributes:
-        backbone: adapted, its weights still the pre-trained ones.
-        groups: every parameter that learns in exactly one group, `layers.{i}` for each language
-            layer; under the guard, empty for a method that compares no layers.
+        backbone: already adapted, still with the pre-trained weights.
+        groups: every trainable parameter, in exactly one group; `layers.{i}` for each language
+            layer. Under the guard, empty for a method that compares no layers.
         sites: each map whose inputs an anchor can describe, or lone row that it has used -> its
-            kind: maps, norms, embeddings or stem. What the user has frozen is none of them.
+            kind: maps, norms, embeddings or stem. Sites that the user has frozen are left out.
         options: the method's own part of the recipe.
-        anchor: what was measured of the pre-trained backbone on VQA; None where the method needs
-            none of it.
+        anchor: measurements of the pre-trained backbone on VQA; None if the method needs none.
         vqa_loss: pass -> mean cross-entropy of an answer over a batch of training questions, with
             its graph; only for a method that trains on questions.
-        instructions: every text that the frames come with, so that a method which makes more text
-            of them can refuse it before any work; empty under the guard.
-        targets: robot frames -> what the expert has to predict of their actions, [B, H, A], on the
+        instructions: all instructions of the frames, so that a method which adds text to them can
+            refuse one that is too long before any work; empty under the guard.
+        targets: robot frames -> the actions as the expert has to predict them, [B, H, A], on the
             CPU; None under the guard.
-        actions: A, how many numbers an action has.
-        owners: the processes each of which has some rows of every weight; one where each has all.
+        actions: A, the number of values in an action.
+        owners: the processes that each have some rows of every weight; just one if each has all.
     """
 
     backbone: M
@@ -59,7 +58,7 @@ class MethodContext(Generic[M]):
         return {name: p for name, p in self.backbone.named_parameters() if p.requires_grad}
 
     def reference(self) -> dict[str, Tensor]:
-        """Copies of their pre-trained values."""
+        """Copies of the pre-trained values of these parameters."""
         return {name: p.detach().clone() for name, p in self.learning().items()}
 
 
@@ -67,20 +66,19 @@ class MethodContext(Generic[M]):
 class Pass:
     """One forward pass over robot frames.
 
-    Several processes may make one pass together, over a share of its frames each. Then what a
-    method measures is that of all shares, and a loss is what this share contributes to it.
+    Several processes may make one pass together, each over a share of its frames. Then a method
+    measures statistics over all shares, and a loss is the contribution of this share.
 
     Attributes:
         step: number of the step, from 0.
-        inputs: what the backbone's `encode` was given.
+        inputs: the input of the backbone's `encode`.
         hidden: residual stream after each layer, L tensors [B, T, D].
         mask: [B, T] bool; padding is False.
         image: [T] or [B, T] bool; True at image tokens.
-        frames: what the inputs were prepared from, and the actions that follow; None under the
-            guard.
-        share: which of the step's frames.
-        total: a tensor -> its sum over the processes that make this pass; None for one process.
-        prepared: what the method's own `prepare` has made of the frames; None where nobody has.
+        frames: the frames behind the inputs, and the actions that follow; None under the guard.
+        share: which of the step's frames this pass covers.
+        total: sums a tensor over the processes that make this pass; None for one process.
+        prepared: the result of the method's own `prepare` for the frames; None if it was not run.
     """
 
     step: int
@@ -96,20 +94,20 @@ class Pass:
 
 @dataclass(frozen=True)
 class Update:
-    """What the optimizer has just done, over as many steps as the method's `every`.
+    """The optimizer's most recent update, over the number of steps given by the method's `every`.
 
     A method constrains it by changing the parameters in place; their `.grad` still holds the
-    gradient (clipped) that the last step was made from.
+    (clipped) gradient of the last step.
 
     Attributes:
         before: value of each trainable parameter of the backbone before the first of these steps,
             by name; empty for a method that does not compare.
         anchor_gradient: gradient of the penalty before the last step, by name; empty without a
             penalty.
-        steps: how many of these steps have moved anything. A tensor [] float64 where a step may
-            have moved nothing and reading that would wait; 0 of them change nothing.
-        rate_left: share of the peak learning rate that the schedule had left at the last of them; 1
-            until it has reached the peak, and under the guard. A tensor like `steps`.
+        steps: how many of these steps have moved anything. A tensor [] float64 if a step may have
+            moved nothing and reading that would force a sync; with 0, a method changes nothing.
+        rate_left: the learning rate at the last of these steps as a fraction of its peak; 1 until
+            the schedule has reached the peak, and under the guard. A tensor whenever `steps` is.
     """
 
     before: Mapping[str, Tensor]
@@ -120,30 +118,31 @@ class Update:
 
 @dataclass(frozen=True)
 class Parts:
-    """What a started method does at each stage of a step; what is left out costs nothing.
+    """What a started method does at each stage of a step; parts that are left out cost nothing.
 
     Attributes:
         penalty: pass -> (a scalar with its graph, whose gradient is the anchor gradient; the
             distance of each layer from the anchor [L], detached, which is W2^2 in `aegis`). It
             costs a second backward pass.
         combine: inner products of task and anchor gradient, per group -> their weights.
-        refresh: steps that share one anchor gradient, taken at the first of them.
-        fraction: share of the batch that the anchor gradient is taken on; below 1, from a graph of
-            its own.
-        keeps_idle: whether the anchor gradient counts only where the task's is not zero.
-        auxiliary: pass -> a loss that is added to the task's; the report's loss stays the task's
-            own.
-        prepare: robot frames -> what `auxiliary` finds in `Pass.prepared`, made on the CPU ahead of
-            a GPU's step; several threads may call it.
-        pull: adds to `.grad` after the backward, before the gradient is clipped.
-        shares: parameter -> the share of its learning rate that this step is to have, from the
-            gradients, a tensor [] where reading it would wait; others have all.
+        refresh: steps that share one anchor gradient, computed at the first of them.
+        fraction: fraction of the batch that the anchor gradient is computed on; below 1, it has a
+            graph of its own.
+        keeps_idle: whether the anchor gradient counts only where the task gradient is not zero.
+        auxiliary: pass -> a loss that is added to the task loss; the report still gives the task
+            loss alone.
+        prepare: robot frames -> the `Pass.prepared` that `auxiliary` reads, made on the CPU ahead
+            of a GPU step; it may be called from several threads.
+        pull: adds to `.grad` after the backward pass, before the gradient is clipped.
+        shares: returns, from the gradients, the fraction of its learning rate that each parameter
+            has in this step, as a tensor [] if reading it would force a sync; parameters that it
+            does not list have all of it.
         constrain: changes the applied update, after the optimizer's step.
         begin: called before the first of the steps that one call of `constrain` covers.
-        compares: whether `constrain` reads `Update.before`; where it does not that is empty, and
-            nothing is copied.
+        compares: whether `constrain` reads `Update.before`; if not, that is empty and nothing is
+            copied.
         every: steps that one call of `constrain` covers; fewer before a checkpoint or a validation,
-            so that neither sees an update that has not been constrained.
+            so that neither sees an unconstrained update.
     """
 
     penalty: Callable[[Pass], tuple[Tensor, Tensor]] | None = None
@@ -161,22 +160,22 @@ class Parts:
     every: int = 1
 
     def reuses(self, step: int) -> bool:
-        """Whether a step, from 0, takes the anchor gradient of one before it."""
+        """Whether a step (from 0) reuses the anchor gradient of an earlier one."""
         return step % self.refresh != 0
 
     @property
     def dual(self) -> bool:
-        """Whether a second backward pass is taken, so that a ledger has inner products."""
+        """Whether there is a second backward pass, so that a ledger has inner products."""
         return self.penalty is not None
 
     @property
     def constrains(self) -> bool:
-        """Whether the applied update is another than the optimizer's own."""
+        """Whether the applied update differs from the optimizer's own."""
         return self.constrain is not None or self.shares is not None
 
     @property
     def copies(self) -> bool:
-        """Whether weights have to be copied before a step, to be compared with those after."""
+        """Whether weights have to be copied before a step, for comparison afterwards."""
         return self.constrain is not None and self.compares
 
 
@@ -185,18 +184,17 @@ class Method:
     """One way to fine-tune a backbone under an action expert.
 
     Attributes:
-        name: as users write it; its options are the recipe's key of that name.
+        name: as users write it; its options are under the recipe key of that name.
         summary: one line for tables and help.
-        adapt: makes the backbone's trainable part trainable, given its language layers' linear maps
-            and the method's options; called once, before the optimizer is made.
-        start: the parts at work, from what the run has to offer; called once, after `adapt`.
+        adapt: sets up the backbone's trainable part, given the linear maps of its language layers
+            and the method's options; called once, before the optimizer is created.
+        start: returns the method's parts for a run; called once, after `adapt`.
         needs: which parts of an anchor (`moments`, `inputs`, `curvature`, `fisher`) it reads.
-        vqa_weight: its option that weighs a loss on VQA questions, if it has one. Above 0 it is a
-            ceiling (an upper bound): it trains on data that the others do without.
-        stop_gradient: the expert's gradient ends at the backbone's keys and values.
-        export: turns an adapted copy of the backbone into a plain one; None where it is one
-            already.
-        shards: whether it works where a process has only some rows of each weight.
+        vqa_weight: name of its option that weights a loss on VQA questions, if it has one. Above 0
+            the method is a ceiling (an upper bound): it trains on data that the others do not use.
+        stop_gradient: whether the expert's gradient stops at the backbone's keys and values.
+        export: turns an adapted copy of the backbone into a plain one; None if it is already plain.
+        shards: whether it works when each process has only some rows of each weight.
     """
 
     name: str
@@ -215,7 +213,7 @@ class Method:
         return "moments" in self.needs
 
     def trains_on_questions(self, options: Options) -> bool:
-        """Whether it trains on VQA data, with these options: then it is a ceiling."""
+        """Whether it trains on VQA data with these options, which makes it a ceiling."""
         return self.vqa_weight is not None and options[self.vqa_weight] > 0
 
 

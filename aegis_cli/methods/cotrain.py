@@ -1,7 +1,7 @@
 """Co-training: loss + weight x cross-entropy of VQA answers, one batch of questions per step.
 
-Robot policies with web data are trained so (RT-2, arXiv 2307.15818). It is a ceiling (an upper
-bound): it trains on data that the other methods do without.
+Robot policies are trained this way on web data (RT-2, arXiv 2307.15818). It is a ceiling (an upper
+bound), because it trains on data that the other methods do not use.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from aegis_cli.methods.base import Method, MethodContext, Parts, Pass, train_all
 
 
 def start(context: MethodContext) -> Parts:
-    """Add the questions' loss to every step; what is asked is the caller's choice."""
+    """Add the loss on questions to every step; the caller chooses the questions."""
     weight, vqa_loss = context.options["weight"], context.vqa_loss
     if weight == 0:
         return Parts()

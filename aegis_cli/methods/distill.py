@@ -1,12 +1,12 @@
-"""Feature distillation: on robot frames every layer's output is held to the pre-trained one's.
+"""Feature distillation: on robot frames, hold each layer's output to that of the pre-trained one.
 
-FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as Anchor-Align's
-vision-language anchoring has it (arXiv 2607.13429):
+FitNets (arXiv 1412.6550) with a frozen copy of the backbone as the teacher, as in Anchor-Align's
+vision-language anchoring (arXiv 2607.13429):
 
     loss + weight mean_l ( sum_t |h_l,t - h0_l,t|^2 / sum_t |h0_l,t - mean_t h0_l,t|^2 )
 
-over valid tokens t. Ours: each layer is divided by its teacher's variance, so that a deep residual
-stream does not drown a shallow one. No VQA data is read; every step pays for a forward pass of the
+over valid tokens t. Dividing each layer by the variance of the teacher is our choice: deep residual
+streams do not dominate shallow ones. No VQA data is read; every step costs a forward pass of the
 copy.
 """
 
@@ -25,9 +25,9 @@ from aegis_cli.models.backbones.base import Backbone
 
 
 def start(context: MethodContext[Backbone]) -> Parts:
-    """Copy what learns of the backbone, as it is now."""
+    """Copy the trainable part of the backbone, as it is now."""
     weight = context.options["weight"]
-    if weight == 0:  # naive, and no copy to pay for
+    if weight == 0:  # the same as naive, without the cost of a copy
         return Parts()
     backbone = context.backbone  # not the context, which would keep the whole anchor in memory
     frozen = _teacher(backbone)  # now, while the weights are still the pre-trained ones
@@ -42,17 +42,17 @@ def start(context: MethodContext[Backbone]) -> Parts:
 
 
 def _teacher(backbone: Backbone) -> Backbone:
-    """A frozen copy of the backbone, with which it shares the parameters that do not learn."""
+    """A frozen copy of the backbone that shares its frozen parameters."""
     shared = {id(p): p for p in backbone.parameters() if not p.requires_grad}
-    # deepcopy does not copy what is in its memo.
+    # deepcopy does not copy objects in its memo.
     return copy.deepcopy(backbone, shared).eval().requires_grad_(False)
 
 
 def _round_alike(frozen: nn.Module, backbone: nn.Module) -> None:
-    """Cast the teacher's weights to the dtypes that the backbone's have in this pass.
+    """Cast the teacher's weights to the dtypes of the backbone's weights in this pass.
 
-    With `train.weights: bf16-master` a pass sees rounded weights. A teacher in float32 would train
-    the student to undo the rounding.
+    With `train.weights: bf16-master` a pass uses rounded weights. A float32 teacher would train the
+    student to undo the rounding.
     """
     own = dict(backbone.named_parameters())
     for name, copied in frozen.named_parameters():
@@ -70,9 +70,9 @@ def relative_distance(
 
     Args:
         hidden, taught: L tensors [B, T, D] each, of the student and of the teacher.
-        mask: [B, T] bool; where it is false nothing counts.
-        total: a tensor -> its sum over the processes that have a share of the batch each; then the
-            result is what this share contributes.
+        mask: [B, T] bool; tokens where it is false do not count.
+        total: sums a tensor over the processes, each of which has a share of the batch; the result
+            is then the contribution of this share.
     """
     layers = []
     if devices.reading_stalls(mask.device):
@@ -80,7 +80,7 @@ def relative_distance(
         for h, h0 in zip(hidden, taught, strict=True):
             layers.append(_relative_padded(widened(h), widened(h0), mask[..., None], total))
         return torch.stack(layers).mean()
-    index = mask.flatten().nonzero().squeeze(1)  # numbers of the valid tokens in [B*T], [n]
+    index = mask.flatten().nonzero().squeeze(1)  # indices [n] of the valid tokens in [B*T]
     for h, h0 in zip(hidden, taught, strict=True):
         layers.append(_relative(_rows(h, index), _rows(h0, index), total))
     return torch.stack(layers).mean()
@@ -91,7 +91,7 @@ def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor
     off = (student - teacher).square().sum()
     if total is None:
         return off / (teacher - teacher.mean(0)).square().sum()
-    # The distance stays this share's; over the whole batch's variance, the shares add up.
+    # The distance is that of this share, the variance that of the whole batch: shares add up.
     count = total(teacher.new_tensor(len(teacher)))
     mean = total(teacher.sum(0)) / count
     return off / total((teacher - mean).square().sum())
@@ -100,13 +100,13 @@ def _relative(student: Tensor, teacher: Tensor, total: Callable[[Tensor], Tensor
 def _relative_padded(
     student: Tensor, teacher: Tensor, valid: Tensor, total: Callable[[Tensor], Tensor] | None
 ) -> Tensor:
-    """What `_relative` returns, of tokens [B, T, D], of which `valid` [B, T, 1] ones count."""
+    """Like `_relative`, but for tokens [B, T, D], of which those in `valid` [B, T, 1] count."""
     add_up = total or (lambda x: x)
     off = (student - teacher).masked_fill(~valid, 0).square().sum()
     shown = teacher.masked_fill(~valid, 0)
     count = add_up(valid.sum().to(shown.dtype))
     mean = add_up(shown.sum((0, 1))) / count  # [D]
-    # Masked again: padding is 0 by now, and 0 - mean would count.
+    # Masked again, because padding is 0 here, and 0 - mean would count.
     deviations = (shown - mean).masked_fill(~valid, 0)
     return off / add_up(deviations.square().sum())
 

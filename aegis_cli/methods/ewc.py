@@ -1,19 +1,20 @@
 """Elastic weight consolidation (Kirkpatrick et al. 2017, arXiv 1612.00796).
 
-What VQA needs most moves least. The loss is
+Parameters that matter most to VQA move least. The loss is
 
     loss + (weight / 2) sum_i F_i (theta_i - theta0_i)^2,
     that is g_i <- g_i + weight F_i (theta_i - theta0_i),
 
-with F the Fisher information's diagonal on VQA. Ours: F is divided by its mean over all that
-learns, so that the weight depends neither on the loss's scale nor on the number of parameters.
+where F is the diagonal of the Fisher information on VQA. As our choice, F is divided by its mean
+over all trainable parameters, so that the weight depends neither on the scale of the loss nor on
+the number of parameters.
 
-`step: proximal` takes the penalty's proximal step after the optimizer's instead,
+`step: proximal` takes the penalty's proximal step after the optimizer's step instead,
 
     theta_i - theta0_i <- (theta_i - theta0_i) / (1 + weight F_i),
 
-which no Adam rescales and which is stable for any weight. It is what `kfac` does, with a diagonal
-in place of a Kronecker product.
+which Adam does not rescale and which is stable for any weight. `kfac` does the same with a
+Kronecker product instead of a diagonal.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from aegis_cli.methods.base import Method, MethodContext, Parts, Update, train_a
 
 
 def start(context: MethodContext) -> Parts:
-    """Pull every parameter towards the value it has now, entry by entry.
+    """Pull every parameter towards its current value, entry by entry.
 
     Raises:
-        AegisError: an anchor without the Fisher information of what learns.
+        AegisError: the anchor lacks the Fisher information of a trainable parameter.
     """
     weight = context.options["weight"]
     if weight == 0:
@@ -52,7 +53,7 @@ def start(context: MethodContext) -> Parts:
         held.append(_Held(parameter, reference[name], importance[name]))
     if context.options["step"] == "gradient":
         return Parts(pull=_pull(held, weight))
-    # It compares with the start, not with the step before, so no step's weights are copied.
+    # The reference is the start, not the previous step, so no weights are copied per step.
     return Parts(constrain=_constrain(held, weight), compares=False)
 
 
@@ -62,7 +63,7 @@ class _Held:
 
     Attributes:
         origin: its pre-trained value.
-        importance: F, of its rows that this process has.
+        importance: F for the rows that this process has.
     """
 
     parameter: nn.Parameter
@@ -70,7 +71,7 @@ class _Held:
     importance: Tensor
 
     def moved(self) -> Tensor:
-        """How far its rows here are from where they began."""
+        """Displacement of the rows here from their pre-trained values."""
         return rows_here(self.parameter) - rows_here(self.origin)
 
 
@@ -92,7 +93,7 @@ def _constrain(held: Sequence[_Held], weight: float) -> Callable[[Update], None]
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        # Where nothing has moved, `steps` is 0, and so nothing is taken back.
+        # If nothing has moved, `steps` is 0, so nothing is pulled back.
         strength = bounded(weight * update.steps)
         for one in held:
             share = taken(strength * one.importance)
@@ -104,12 +105,12 @@ def _constrain(held: Sequence[_Held], weight: float) -> Callable[[Update], None]
 def relative_fisher(
     fisher: Mapping[str, Tensor], learning: Mapping[str, nn.Parameter]
 ) -> dict[str, Tensor]:
-    """Each learning parameter's Fisher information, scaled to mean 1 over all their entries.
+    """Fisher information of each trainable parameter, scaled to mean 1 over all entries of all.
 
     It has the parameter's shape and dtype.
 
     Raises:
-        AegisError: a parameter that was not measured, or a mean that is 0 or no number.
+        AegisError: a parameter was not measured, or the mean is 0 or NaN.
     """
     missing = next((name for name in learning if name not in fisher), None)
     if missing is not None:

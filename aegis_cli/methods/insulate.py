@@ -1,18 +1,18 @@
 """Knowledge insulation as published (Driess et al. 2025, arXiv 2505.23705).
 
-The expert's gradient ends at the backbone's keys and values, as under `stop-gradient`. The backbone
-still learns from robot frames, but with its pre-training loss: it is given the instruction, and has
-to answer with the actions as text,
+The expert's gradient stops at the backbone's keys and values, as under `stop-gradient`. The
+backbone still learns from robot frames, but with its pre-training loss: given the instruction, it
+has to answer with the actions as text,
 
     loss + weight * mean(-log p(actions as text | image, instruction)),
 
-in nats per number. The paper's third part is training on VQA data beside it: with `vqa_weight`, a
-batch of questions per step adds its cross-entropy, and the method is a ceiling.
+in nats per number. The third part of the paper is training on VQA data at the same time: with
+`vqa_weight`, a batch of questions per step adds its cross-entropy, and the method is a ceiling.
 
-Ours: the paper writes actions as FAST tokens. Here each normalised action falls into one of `bins`
-equal bins between -`limit` and `limit`, and is written as that bin's number, as RT-2 does
-(arXiv 2307.15818), for `horizon` steps of the chunk. `prompt` may ask for actions in other words
-than questions have. The text is a second pass over the image, where the paper shares one.
+Our differences: the paper writes actions as FAST tokens. Here each normalised action falls into one
+of `bins` equal bins between -`limit` and `limit` and is written as the number of that bin, as in
+RT-2 (arXiv 2307.15818), for `horizon` steps of the chunk. `prompt` may ask for actions in different
+words than questions use. The text needs a second pass over the image, where the paper shares one.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class _Written:
 
     Attributes:
         asked: the prompt of each frame.
-        texts: the answer to be learned for each.
-        numbers: how many numbers are in all texts together, int64 [].
-        answered: what `Backbone.prepare_answers` has made of them.
+        texts: the answer to be learned for each frame.
+        numbers: total count of numbers in all texts, int64 [].
+        answered: the result of `Backbone.prepare_answers` for them.
     """
 
     asked: Sequence[str]
@@ -48,11 +48,11 @@ class _Written:
 
 
 def start(context: MethodContext[Backbone]) -> Parts:
-    """Let the backbone learn actions as text, and questions if they have a weight.
+    """Let the backbone learn actions as text, and questions if `vqa_weight` is above 0.
 
     Raises:
-        AegisError: more bins than the backbone has texts for, or an instruction that leaves no room
-            for its actions.
+        AegisError: there are more bins than the backbone has texts for, or an instruction leaves no
+            room for its actions.
     """
     weight, vqa_weight = context.options["weight"], context.options["vqa_weight"]
     terms: list[Callable[[Pass], Tensor]] = []
@@ -77,19 +77,19 @@ def start(context: MethodContext[Backbone]) -> Parts:
 def _action_loss(
     context: MethodContext[Backbone], write: Callable[[RobotBatch], _Written]
 ) -> Callable[[Pass], Tensor]:
-    """A pass over robot frames -> mean cross-entropy of a number, in nats, with its graph."""
+    """A pass over robot frames -> mean cross-entropy per number, in nats, with its graph."""
     backbone = context.backbone
 
     def loss(seen: Pass) -> Tensor:
         frames = seen.frames
         assert frames is not None
-        written = seen.prepared or write(frames)  # None where nothing is prepared ahead
+        written = seen.prepared or write(frames)  # None if nothing was prepared ahead
         said = backbone.answer_log_likelihood(
             frames.images, written.asked, written.texts, written.answered
         )
         count = written.numbers
         if seen.total is not None:
-            # Over the numbers of all processes, so that their contributions add up to the mean.
+            # Divide by the count of all processes, so that their contributions add up to the mean.
             count = seen.total(count.to(said.device))
         return -said.sum() / count
 
@@ -97,19 +97,19 @@ def _action_loss(
 
 
 def _writing(context: MethodContext[Backbone]) -> Callable[[RobotBatch], _Written]:
-    """Robot frames -> their actions as text; on the CPU, so that reading numbers syncs no GPU."""
+    """Robot frames -> their actions as text; on the CPU, so reading them needs no GPU sync."""
     backbone, targets = context.backbone, context.targets
     limit, horizon, prompt = (context.options[name] for name in ("limit", "horizon", "prompt"))
     assert targets is not None
     numbers = _numbers(context)
-    # The last number has as many digits as any, so that no text of actions has more.
+    # No number has more digits than the last, so no text of actions is longer.
     longest = " ".join(numbers[-1:] * (horizon * context.actions))
     _check_room(context, longest)
 
     def write(frames: RobotBatch) -> _Written:
         chosen = spread(frames.actions.shape[1], horizon)
         bins = binned(targets(frames)[:, chosen], limit, len(numbers))  # [B, S, A]
-        # The actions past an episode's end were never shown.
+        # Actions past the end of an episode were never demonstrated.
         shown = ~frames.is_pad[:, chosen]  # [B, S]
         texts = as_texts(bins, shown, numbers)
         asked = [prompt.replace("{}", text) for text in frames.instructions]
@@ -120,30 +120,30 @@ def _writing(context: MethodContext[Backbone]) -> Callable[[RobotBatch], _Writte
 
 
 def spread(chunk: int, horizon: int) -> Tensor:
-    """Which steps of a chunk are written, int64: the first, and others evenly after it.
+    """Indices of the steps of a chunk that are written, int64: evenly spread from the first.
 
-    There are `horizon` of them, or all of a shorter chunk.
+    There are `horizon` of them, or all steps of a shorter chunk.
     """
     return torch.linspace(0, chunk - 1, min(horizon, chunk)).round().long()
 
 
 def binned(actions: Tensor, limit: float, count: int) -> Tensor:
-    """The bin of each normalised action, int64 from 0 to `count` - 1; the outer ones are open."""
+    """The bin of each normalised action, int64 from 0 to `count` - 1; the outer bins are open."""
     share = (actions + limit) / (2 * limit)  # 0 at -limit, 1 at limit
     return (share * count).floor().clamp(0, count - 1).long()
 
 
 def as_texts(bins: Tensor, shown: Tensor, numbers: Sequence[str]) -> list[str]:
-    """The numbers of each frame's actions, step after step, with spaces between.
+    """The numbers of each frame's actions, step by step, separated by spaces.
 
     Args:
         bins: [B, S, A] int64.
-        shown: [B, S] bool; where it is false, nothing is written.
+        shown: [B, S] bool; steps where it is false are not written.
         numbers: the text of each bin.
     """
     texts = []
     for steps, valid in zip(bins, shown, strict=True):
-        chosen = steps[valid].flatten().tolist()  # step after step, A numbers each
+        chosen = steps[valid].flatten().tolist()  # A numbers per step
         texts.append(" ".join(numbers[i] for i in chosen))
     return texts
 
@@ -162,7 +162,7 @@ def _numbers(context: MethodContext[Backbone]) -> Sequence[str]:
 
 
 def _check_room(context: MethodContext[Backbone], longest: str) -> None:
-    """Raise AegisError for an instruction with which the longest text of actions does not fit."""
+    """Raise AegisError if an instruction leaves no room for the longest text of actions."""
     for instruction in context.instructions:
         asked = context.options["prompt"].replace("{}", instruction)
         try:

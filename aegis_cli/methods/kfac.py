@@ -1,26 +1,27 @@
-"""A proximal penalty with the Kronecker-factored curvature of VQA's answers, map by map.
+"""A proximal penalty with the Kronecker-factored curvature of the answers to VQA, map by map.
 
-The proximal step of (w / 2) sum_ij h_ij (W - W0)_ij^2 in the eigenbases of the two factors of
-K-FAC (arXiv 1503.05671; see core/curvature.py): elastic weight consolidation with a
-Kronecker-factored Fisher information in place of a diagonal one (structured Laplace, Ritter et al.
+It takes the proximal step of (w / 2) sum_ij h_ij (W - W0)_ij^2 in the eigenbases of the two factors
+of K-FAC (arXiv 1503.05671; see core/curvature.py). This is elastic weight consolidation with a
+Kronecker-factored Fisher information instead of a diagonal one (structured Laplace, Ritter et al.
 2018, arXiv 1805.07810), applied to the weights as AdamW applies its decay, not to a gradient that
 Adam would rescale. It differs from `nullspace` in two ways: directions that VQA reads but that do
-not change its answers are freer, and it acts on all that has moved since the start, so that what
-the loss does not keep asking for returns.
+not change its answers are freer, and it acts on the whole displacement since the start, so that
+changes which the loss does not keep demanding are undone.
 
-Between two proximal steps the steepest directions drift, and the loss is taken at drifted weights:
-a lower `every` lets them drift less and costs more. Normalisations, tables and lone rows do not
-learn.
+Between two proximal steps the steepest directions drift, and the loss is computed at drifted
+weights: a lower `every` lets them drift less and costs more. Normalisations, tables and lone rows
+do not learn.
 
 Two options measure what that choice is worth. `step: gradient` adds the penalty's gradient to the
-task's instead, as elastic weight consolidation does. `growth` lets the weight grow as the learning
-rate falls from its peak, weight (peak / rate)^growth. With weight alone the proximal step already
-gains on the optimizer's steps as these get shorter; this says how much more it does.
+task gradient instead, as elastic weight consolidation does. `growth` lets the weight grow as the
+learning rate falls from its peak, weight (peak / rate)^growth. Even with a constant weight, the
+proximal step gains on the optimizer's steps as these get shorter; `growth` sets how much more it
+does.
 
-`balance` undoes one thing that Adam does. Each of its updates has the same size in every tensor,
-however small the tensor's gradient; a map with little to learn moves as far as the others, by
-noise, and VQA pays for it. So a map's learning rate is multiplied by r / (r + balance R), r being
-the root mean square of its gradient and R that of all maps' together.
+`balance` undoes one effect of Adam. Its updates have the same size in every tensor, however small
+the tensor's gradient, so a map with little to learn moves as far as the others, driven by noise,
+and VQA suffers. So the learning rate of a map is multiplied by r / (r + balance R), where r is the
+root mean square of its gradient and R that of the gradients of all maps together.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ from aegis_cli.core.spectrum import DENSE
 from aegis_cli.methods.base import Method, MethodContext, Options, Parts, Update
 from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
-_LEAST_RATE = 1e-6  # share of the peak learning rate
+_LEAST_RATE = 1e-6  # fraction of the peak learning rate
 
 
 def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
-    """Linear maps and convolutions learn; normalisations, tables and lone rows do not."""
+    """Train linear maps and convolutions; freeze normalisations, tables and lone rows."""
     backbone.requires_grad_(True)
     for module in backbone.modules():
         if not isinstance(module, DENSE):
@@ -81,13 +82,13 @@ def start(context: MethodContext) -> Parts:
 
 
 def _curvatures(context: MethodContext, maps: Mapping[str, Pair]) -> dict[str, Curvature]:
-    """The curvature of each map's rows that this process has."""
+    """The curvature of each map, for the rows that this process has."""
     owners = context.owners
     likes = {site: rows_here(weight) for site, (weight, _) in maps.items()}
     assert context.anchor is not None
     found = curvature.curvatures(context.anchor, likes, context.options["damping"])
     if owners.several:
-        # Map by map, so that only one map's rows are in memory twice.
+        # One map at a time, so that only one map's rows are in memory twice.
         for site, (weight, _) in maps.items():
             found[site] = found[site].of_rows(owners.rows(len(weight)), owners.total)
     return found
@@ -98,11 +99,11 @@ def _constrain(groups: Sequence[_Group], weight: float, growth: float) -> Callab
 
     @torch.no_grad()
     def constrain(update: Update) -> None:
-        # One proximal step stands for those after each of so many steps. It is as strong as all of
-        # them where the curvature is small: 1 + n w h instead of (1 + w h)^n.
+        # One proximal step stands for n of them, one after each of the n steps. Where the curvature
+        # is small it is as strong as all of them: 1 + n w h instead of (1 + w h)^n.
         strength = weight * update.steps
         if growth:
-            # weight (peak / rate)^growth, with `rate_left` the rate over its peak.
+            # weight (peak / rate)^growth, where `rate_left` is rate / peak.
             strength = strength / _shrunk(update.rate_left, growth)
         for group in groups:
             excess = group.curvature.excess(*group.moved(), strength)
@@ -121,7 +122,7 @@ def _pull(groups: Sequence[_Group], weight: float) -> Callable[[], None]:
             of_each = stacking.apart(added, group.here())
             for now, parts in zip(group.maps, of_each, strict=True):
                 for tensor, by in zip(now, parts, strict=True):
-                    # Without a gradient it has not moved.
+                    # A tensor without a gradient has not moved.
                     if tensor is not None and tensor.grad is not None and by is not None:
                         rows_here(tensor.grad).add_(by)
 
@@ -129,8 +130,8 @@ def _pull(groups: Sequence[_Group], weight: float) -> Callable[[], None]:
 
 
 def _shrunk(rate: float | Tensor, growth: float) -> float | Tensor:
-    """A share of the peak learning rate to the power of `growth`, above 0: it is divided by."""
-    # A schedule may end at 0, and a high power of a small share is 0 too.
+    """A fraction of the peak learning rate to the power `growth`, kept above 0 to divide by."""
+    # A schedule may end at 0, and a high power of a small fraction underflows to 0 too.
     return _at_least(_at_least(rate, _LEAST_RATE) ** growth, sys.float_info.min)
 
 
@@ -140,10 +141,10 @@ def _at_least(x: float | Tensor, least: float) -> float | Tensor:
 
 @dataclass(frozen=True)
 class _Group:
-    """Maps that are drawn back by one computation: one map, or on a GPU several of one shape.
+    """Maps that are drawn back in one computation: one map, or on a GPU several of one shape.
 
     Attributes:
-        origin: the weights and biases that they began with, stacked as `curvature` is.
+        origin: the initial weights and biases, stacked like `curvature`.
     """
 
     maps: Sequence[Pair]
@@ -151,18 +152,18 @@ class _Group:
     curvature: Curvature
 
     def here(self) -> list[Pair]:
-        """The rows of each that this process has."""
+        """The rows of each map that this process has."""
         return [pair_here(pair) for pair in self.maps]
 
     def moved(self) -> Pair:
-        """How far they are from where they began, stacked."""
+        """Displacement of the maps from their initial values, stacked."""
         return minus(stacking.stacked(self.here()), self.origin)
 
 
 def _grouped(
     maps: Mapping[str, Pair], found: Mapping[str, Curvature], owners: Ranks
 ) -> list[_Group]:
-    """The maps in groups, each with what it began with and its curvature."""
+    """The maps in groups, each with its initial values and its curvature."""
 
     def directions(site: str) -> int:
         return found[site].inputs.shape[-1]
@@ -172,7 +173,7 @@ def _grouped(
         own = [maps[name] for name in names]
         now = stacking.stacked([pair_here(pair) for pair in own])
         curved = curvature.stacked([found[name] for name in names])
-        # `stacked` leaves a single map its own tensors, which training changes in place.
+        # Copied, because `stacked` returns a single map's own tensors, which training changes.
         groups.append(_Group(own, copied_small(now), curved))
     return groups
 
@@ -180,11 +181,11 @@ def _grouped(
 def shares(
     maps: Mapping[str, Pair], balance: float, owners: Ranks = ALONE
 ) -> dict[Tensor, float | Tensor]:
-    """The share r / (r + balance R) of the learning rate that each map's weight and bias have.
+    """The fraction r / (r + balance R) of the learning rate for each map's weight and bias.
 
-    r is the root mean square of the map's gradient, R that of all maps'; without a gradient the
-    share is 0. `owners` are the processes that have some rows of each map. On a GPU the shares are
-    tensors [], which nobody reads.
+    r is the root mean square of the map's gradient, R that of all maps together; without a gradient
+    the fraction is 0. `owners` are the processes that each have some rows of every map. On a GPU
+    the fractions are tensors [], which are never read.
     """
     learning = [[t for t in pair if t is not None] for pair in maps.values()]
     found_squares = owners.total(_squares(learning))
@@ -193,11 +194,11 @@ def shares(
         return _unread_shares(learning, found_squares, entries, balance)
     # One transfer for all maps.
     squares = found_squares.tolist()
-    whole = math.sqrt(sum(squares) / sum(entries))  # R: every entry counts alike, not every map
+    whole = math.sqrt(sum(squares) / sum(entries))  # R: a mean over entries, not over maps
     found: dict[Tensor, float | Tensor] = {}
     for tensors, square, count in zip(learning, squares, entries, strict=True):
         rms = math.sqrt(square / count)  # r
-        # If no map has a gradient, R is 0 too: 0 / 0 is left out.
+        # If no map has a gradient, R is 0 too: avoid 0 / 0.
         share = rms / (rms + balance * whole) if rms else 0.0
         found |= dict.fromkeys(tensors, share)
     return found
@@ -206,7 +207,7 @@ def shares(
 def _unread_shares(
     learning: Sequence[Sequence[Tensor]], squares: Tensor, entries: Sequence[int], balance: float
 ) -> dict[Tensor, float | Tensor]:
-    """What `shares` returns, as tensors []: nothing is read, which would force a GPU sync."""
+    """The result of `shares` as tensors []; reading them would force a GPU sync."""
     counts = torch.tensor(entries, dtype=torch.float64, device="cpu")
     counts = devices.send(counts, squares.device)
     rms = (squares / counts).sqrt()
@@ -220,10 +221,10 @@ def _unread_shares(
 
 
 def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
-    """Sum of the squared gradients of each map's tensors, two at most, [maps] float64."""
+    """Sum of the squared gradients of each map's tensors (at most two), [maps] float64."""
     like = maps[0][0]
-    # Map i has the places 2 i and 2 i + 1, of its weight and of its bias; they are 0 where there is
-    # no gradient.
+    # Map i has the entries 2 i for its weight and 2 i + 1 for its bias; they are 0 without a
+    # gradient.
     places, gradients = [], []
     for number, tensors in enumerate(maps):
         for part, tensor in enumerate(tensors):
@@ -231,12 +232,12 @@ def _squares(maps: Sequence[Sequence[Tensor]]) -> Tensor:
                 places.append(2 * number + part)
                 gradients.append(rows_here(tensor.grad))
     norms = [torch.zeros((), device=like.device)] * (2 * len(maps))
-    # All in few kernels, where a GPU would start thousands.
+    # A few kernels instead of thousands.
     found = torch._foreach_norm(gradients) if gradients else ()
     for place, norm in zip(places, found, strict=True):
-        # In a user's own loop, the layers may be on several GPUs.
+        # In a user's own loop, the layers may be spread over several GPUs.
         norms[place] = norm.to(like.device)
-    # `to` launches nothing where a norm has the type already, as nearly always; `double` would.
+    # `to` launches nothing if a norm already has the dtype, as nearly always; `double` would.
     widest = reduce(torch.promote_types, (norm.dtype for norm in norms))
     both = torch.stack([norm.to(widest) for norm in norms]).double()
     return both.view(-1, 2).square().sum(1)  # [maps, 2] -> [maps]

@@ -1,4 +1,4 @@
-"""The parameters that a method was started with, and refusal where others learn instead.
+"""The parameters that a method was started with, and a check that no others learn instead.
 
 A method works on the parameters that it found at its start. If a wrapper has replaced them since,
 it would silently protect nothing.
@@ -21,24 +21,24 @@ _SHARDED = "weights that are whole in every process: one process, or Distributed
 
 
 class KnownParameters:
-    """What a model's parameters were when a method was started on it."""
+    """The parameters of a model at the time when a method was started on it."""
 
     def __init__(self, model: nn.Module, may_shard: bool = False) -> None:
         """Remember the parameters of a model.
 
         Args:
-            may_shard: whether the method knows sharded weights, and these are sharded already.
+            may_shard: whether the method supports sharded weights and these are already sharded.
 
         Raises:
-            AegisError: they are sharded.
+            AegisError: they are sharded, and `may_shard` is false.
         """
         self._model, self._may_shard = model, may_shard
         self._refuse_sharded()
-        # The parameters themselves are kept, so that no other object can take over an id.
+        # The parameters themselves are kept, so that no other object can reuse an id.
         self._known = {id(p): (p, p.shape) for p in model.parameters()}
 
     def check(self) -> None:
-        """Refuse a model in which something learns that was not there at the start.
+        """Refuse a model with trainable parameters that were not there at the start.
 
         Raises:
             AegisError: parameters were sharded, replaced, added or resized.
@@ -65,9 +65,9 @@ class KnownParameters:
             )
 
     def _unchanged(self) -> bool:
-        """Whether the same parameters learn as at the start, told without their names.
+        """Whether the trainable parameters are the same as at the start, without using names.
 
-        It is asked at every step, and the names of a thousand modules take milliseconds.
+        It is called at every step, and naming a thousand modules takes milliseconds.
         """
         sharding = () if self._may_shard else _sharding_modules()
         waiting: list[nn.Module] = [self._model]
@@ -77,7 +77,7 @@ class KnownParameters:
             if id(module) in seen:
                 continue
             seen.add(id(module))
-            if isinstance(module, sharding):  # () has no instances
+            if isinstance(module, sharding):  # always False for ()
                 return False
             for parameter in module._parameters.values():
                 if parameter is None or not parameter.requires_grad:
@@ -94,7 +94,7 @@ class KnownParameters:
 
 
 def refuse_sharded(model: nn.Module) -> None:
-    """Refuse a model of which a process holds only a part.
+    """Refuse a model that is split over processes.
 
     Raises:
         AegisError: a parameter is a DTensor, or a module is under FSDP.
@@ -111,7 +111,7 @@ def refuse_partly_sharded(model: nn.Module, count: int) -> None:
     """Refuse a model whose weights are not all sharded by rows over `count` processes.
 
     Raises:
-        AegisError: FSDP1, another layout, or something that learns and is whole.
+        AegisError: FSDP1, another layout, or a trainable parameter that is not sharded.
     """
     wrong = []
     for name, parameter in structure.learning(model).items():
@@ -134,7 +134,7 @@ def refuse_partly_sharded(model: nn.Module, count: int) -> None:
 def sharded(model: nn.Module) -> list[str]:
     """Names of the parameters and modules of which this process may hold only a part.
 
-    Neither class can occur where its module was not imported, so that nothing is imported here.
+    Neither class can occur unless its module was imported, so nothing is imported here.
     """
     tensors = sys.modules.get("torch.distributed.tensor")
     found = []
@@ -149,13 +149,13 @@ def sharded(model: nn.Module) -> list[str]:
 
 
 def _sharding_modules() -> tuple[type, ...]:
-    """What FSDP makes of a module that it shards; nothing where it was not imported."""
+    """The classes of modules that FSDP shards; empty if FSDP was not imported."""
     fsdp = sys.modules.get("torch.distributed.fsdp")
     return () if fsdp is None else (fsdp.FSDPModule, fsdp.FullyShardedDataParallel)
 
 
 def check_reached(parameters: Iterable[nn.Parameter]) -> None:
-    """Refuse a backward pass that went past all of the parameters.
+    """Refuse a backward pass that reached none of the parameters.
 
     Raises:
         AegisError: none of them has a gradient.
@@ -171,11 +171,11 @@ def check_reached(parameters: Iterable[nn.Parameter]) -> None:
 
 
 def check_row(gram: Gram, groups: Sequence[str]) -> None:
-    """Refuse a step whose anchor gradient is zero in every group, for it would hold nothing.
+    """Refuse a step whose anchor gradient is zero in every group, as it would protect nothing.
 
     Args:
         gram: inner products of task and anchor gradient [G].
-        groups: their names.
+        groups: names of the groups.
 
     Raises:
         AegisError: the anchor gradient reached no parameter.

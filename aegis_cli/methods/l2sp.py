@@ -1,8 +1,8 @@
 """L2-SP (arXiv 1802.01483): weight decay towards the pre-trained weights instead of zero.
 
 loss + (weight / 2) |theta - theta0|^2, that is g <- g + weight (theta - theta0). The paper's second
-term, decay towards zero of the weights that are not pre-trained, is the optimizer's own (the
-backbone has it too, as under naive).
+term, decay towards zero for weights that are not pre-trained, is the optimizer's own weight decay
+(which also acts on the backbone, as under naive).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from aegis_cli.methods.base import Method, MethodContext, Parts, train_all
 
 
 def start(context: MethodContext) -> Parts:
-    """Pull every parameter towards the value it has now."""
+    """Pull every parameter towards its current value."""
     weight = context.options["weight"]
     if weight == 0:
         return Parts()

@@ -1,4 +1,4 @@
-"""A ledger as a file: a row per optimizer step."""
+"""A ledger as a file, with one row per optimizer step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def save(
     """Write the ledger's rows with the names of its groups and layers.
 
     Args:
-        inputs: sha256 of what the run was made from, by a name for it.
+        inputs: sha256 of each input of the run, by name.
 
     Raises:
         AegisError: it cannot be written.
@@ -36,12 +36,12 @@ def save(
 
 
 class LedgerOutsideRuns(Ledger):
-    """A ledger in somebody else's loop, where no run folder says what it is of."""
+    """A ledger of a user's own loop, where no run folder describes the run."""
 
     def __init__(
         self, groups: Sequence[str], layers: Sequence[str], method: str, anchor: str
     ) -> None:
-        """Begin without a row.
+        """Create a ledger without rows.
 
         Args:
             method: name of the method.
@@ -51,7 +51,7 @@ class LedgerOutsideRuns(Ledger):
         self._method, self._anchor = method, anchor
 
     def save(self, path: str | Path) -> None:
-        """Write what `aegis inspect` reads.
+        """Write the file that `aegis inspect` reads.
 
         Raises:
             AegisError: it cannot be written.

@@ -15,7 +15,7 @@ from aegis_cli.methods.base import Method
 class LowRankLinear(nn.Module):
     """A frozen map with a trainable low-rank term.
 
-    A [rank, in] is drawn and B [out, rank] zero, so that at first nothing changes.
+    A [rank, in] is random and B [out, rank] zero, so that nothing changes at first.
     """
 
     def __init__(self, base: nn.Linear, rank: int, alpha: float) -> None:
@@ -23,8 +23,8 @@ class LowRankLinear(nn.Module):
         self.base, self.scale = base, alpha / rank
         # The term is small, and so are its steps: half precision would lose them.
         wide = wide_type(base.weight.dtype)
-        # Drawn on the CPU, so that a seed begins alike on every device; uniform in +-1/sqrt(in), as
-        # the paper's own code has it.
+        # Drawn on the CPU, so that a seed gives the same start on every device; uniform in
+        # +-1/sqrt(in), as in the paper's own code.
         drawn = nn.init.kaiming_uniform_(
             torch.empty(rank, base.in_features, dtype=wide), a=math.sqrt(5)
         )
@@ -32,14 +32,14 @@ class LowRankLinear(nn.Module):
         self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
 
     def forward(self, x: Tensor) -> Tensor:
-        # Two thin products; B A x with the product B A would cost as much as W x again.
+        # Two thin products: forming B A first would cost as much as W x again.
         code = nn.functional.linear(x, self.a.to(x.dtype))  # [..., rank]
         low = nn.functional.linear(code, self.b.to(x.dtype))
         return self.base(x) + self.scale * low
 
     @property
     def weight(self) -> Tensor:
-        """[out, in]: what it is in effect."""
+        """The effective weight [out, in]."""
         return self.base.weight + self.scale * (self.b @ self.a)
 
     @property
@@ -69,8 +69,8 @@ def inject(
 
 
 def merge(backbone: nn.Module) -> None:
-    """Write every low-rank term into its weight, in place, which changes no output."""
-    # A list, because the loop replaces modules of what it walks through.
+    """Merge every low-rank term into its weight, in place; outputs do not change."""
+    # A list, because the loop replaces modules while iterating.
     for name, module in list(backbone.named_modules()):
         if isinstance(module, LowRankLinear):
             _replace(backbone, name, module.merged())

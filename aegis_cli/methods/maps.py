@@ -1,17 +1,17 @@
-"""MAPS (arXiv 2511.19878): hold modules near the pixels closest to their pre-trained weights.
+"""MAPS (arXiv 2511.19878): hold modules to their pre-trained weights, most firmly near the pixels.
 
-Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step: where c = -<g,
-theta_before - theta0> < 0, that is where a step along -g leads back towards theta0, although
+It applies Selective Projection Decay (SPD, arXiv 2411.01713) after the optimizer's step. If
+c = -<g, theta_before - theta0> < 0, that is, if a step along -g leads back towards theta0 although
 momentum may have carried the weights further away,
 
     theta <- theta - lambda_k r (theta - theta0),
     r = max(0, |theta - theta0| - |theta_before - theta0|) / |theta - theta0|.
 
-From SPD: condition and ratio; each tensor has its own, as in its authors' code. lambda = 1 keeps
-the distance from before the step. From MAPS: lambda_k = weight (1 - k / (K - 1)), linear from the
-first of K modules to 0 at the last, with weights of 0.5 to 3.2. Ours: the order of the modules,
-which are this backbone's parameter groups (any vision first, then embeddings, the layers, the final
-norm and a head), and lambda_k r at most 1, so that theta0 is never overshot.
+Condition and ratio are those of SPD; each tensor has its own, as in its authors' code. lambda = 1
+keeps the distance from before the step. From MAPS comes lambda_k = weight (1 - k / (K - 1)), linear
+from the first of K modules to 0 at the last, with weights of 0.5 to 3.2. Our choices are the order
+of the modules, which are this backbone's parameter groups (any vision first, then embeddings, the
+layers, the final norm and a head), and a cap of 1 on lambda_k r, so that theta0 is never overshot.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from aegis_cli.models.backbones.base import Backbone
 
 
 def start(context: MethodContext[Backbone]) -> Parts:
-    """Hold every parameter to the value it has now, with the strength of its group."""
+    """Hold every parameter to its current value, with the strength of its group."""
     weight = context.options["weight"]
     if weight == 0:
         return Parts()
     learning, reference = context.learning(), context.reference()
     owners = context.owners  # not the context, which would keep the whole anchor in memory
-    # All groups count, so that what is frozen does not change how the others are held.
+    # All groups count, so that freezing one does not change how the others are held.
     groups = context.backbone.parameter_groups()
     of_group = schedule(groups, weight)
     strengths: dict[int, float] = {}
@@ -60,7 +60,7 @@ def start(context: MethodContext[Backbone]) -> Parts:
 
 
 def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
-    """lambda_k of each group: `weight` at the first, falling linearly to 0 at the last.
+    """lambda_k of each group: `weight` at the first, decreasing linearly to 0 at the last.
 
     A single group has `weight`.
     """
@@ -73,7 +73,7 @@ def schedule(groups: Iterable[str], weight: float) -> dict[str, float]:
 
 
 def _depth(group: str) -> tuple[int, int]:
-    """Sorts groups from the pixels to the answer; a name that is not known counts as vision."""
+    """Sort key of a group, from the pixels to the answer; an unknown name counts as vision."""
     if group.startswith("layers."):
         return 2, int(group.removeprefix("layers."))
     return {"embeddings": 1, "final_norm": 3, "head": 4}.get(group, 0), 0
@@ -83,19 +83,19 @@ def _products(parameter: nn.Parameter, gradient: Tensor, before: Tensor, origin:
     """<now, now>, <was, was> and <gradient, was> [3] of the displacements now and before."""
     here, start = rows_here(parameter), rows_here(origin)
     now, was = here - start, rows_here(before) - start
-    # These are float64: the two distances differ by one step in thousands.
+    # In float64, because the two distances differ by only one step in thousands.
     pairs = ((now, now), (was, was), (rows_here(gradient), was))
     return torch.stack([projection.dot(x, y) for x, y in pairs])
 
 
 def _project(parameter: nn.Parameter, origin: Tensor, products: Tensor, strength: float) -> None:
-    """Take SPD's share of a parameter's displacement back, by its `_products`."""
+    """Undo SPD's share of a parameter's displacement, given its `_products`."""
     now = rows_here(parameter) - rows_here(origin)
     far, near = products[:2].sqrt()  # |theta - theta0|, |theta_before - theta0|
     uphill = products[2]  # -c
-    # r; a parameter that has not left theta0 has nothing to take back.
+    # r; 0 for a parameter that has not left theta0.
     grown = ratio(torch.relu(far - near), far)
-    # Above 1 it would overshoot the pre-trained value.
+    # A share above 1 would overshoot the pre-trained value.
     share = torch.where(uphill > 0, (strength * grown).clamp(max=1), 0.0)
     rows_here(parameter).sub_(share * now)
 

@@ -1,18 +1,18 @@
-"""Keep the applied update out of what VQA inputs span, map by map.
+"""Keep the applied update out of the span of VQA inputs, map by map.
 
-For each map, D <- D - D U U^T, with D the update that was just applied and U the leading
-eigenvectors of the uncentred second moment of the map's inputs on VQA (Adam-NSCL, arXiv 2103.07113,
-and GPM, arXiv 2103.09762, in continual learning; there of the previous tasks' classifiers, and of
-the gradient or its Adam direction alone). Weight decay is part of D. Nothing is frozen by hand:
-biases read a constant 1, normalisations (x^, 1) in each channel, tables one-hot rows, and a tied
-head guards the embedding's other side; a lone row (a separator of image rows, say) is a table's row
-that every question reads, and stays as it is. `soft` is ours, and `every`: the projection is
-linear, so that of a sum of updates is the sum of theirs, and once in a few steps costs a few times
-less.
+For each map, D <- D - D U U^T, where D is the update that was just applied and U holds the leading
+eigenvectors of the uncentred second moment of the map's inputs on VQA. In continual learning this
+is Adam-NSCL (arXiv 2103.07113) and GPM (arXiv 2103.09762), which use the inputs of previous tasks'
+classifiers and project only the gradient or its Adam direction. Here weight decay is part of D.
+Nothing is frozen by hand: biases read a constant 1, normalisations (x^, 1) in each channel, tables
+one-hot rows, and a tied head protects the other side of the embedding. A lone row (a separator of
+image rows, say) is a table's row that every question reads, and stays as it is. `soft` and `every`
+are ours: the projection is linear, so projecting a sum of updates is the same as summing their
+projections, and projecting once in a few steps costs a few times less.
 
 What an update has changed along U is the change of the coordinates W U. `keeps: coordinates`
-remembers these [o, k] in place of the weights [o, d] before the steps that a projection covers. It
-leaves the unstored directions free, of which `soft` otherwise removes a small share.
+remembers these [o, k] instead of the weights [o, d] before the steps that a projection covers. It
+leaves the unstored directions free, along which `soft` otherwise removes a small share.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def start(context: MethodContext) -> Parts:
     hard = options["energy"]
     if hard == 0:
         return Parts()
-    # Either a share of the energy is held wholly, or every direction softly.
+    # Either a fraction of the energy is protected completely, or every direction softly.
     strength = Strength(soft=options["soft"]) if hard is None else Strength(hard)
     assert context.anchor is not None
     # The others learn unprotected, as under `naive`.
@@ -46,7 +46,7 @@ def start(context: MethodContext) -> Parts:
     here = {site: rows_here(like) for site, like in likes.items()}
     protections = nullspace.protections(context.anchor, here, strength)
     if context.owners.several:
-        # Every row is projected by itself, so that sharded weights need nothing of each other.
+        # Every row is projected independently, so sharded weights need no communication.
         for site, like in likes.items():
             protections[site] = protections[site].of_rows(context.owners.rows(len(like)))
     groups = _grouped(context.backbone, protections, context.owners)
@@ -62,7 +62,7 @@ def start(context: MethodContext) -> Parts:
 
 
 def _by_coordinates(groups: Sequence[_Group], every: int) -> Parts:
-    """The method with coordinates of the weights before, in place of copies."""
+    """The method with coordinates of the earlier weights instead of copies."""
     before: dict[str, Remembered] = {}  # by each group's first site
 
     @torch.no_grad()
@@ -81,11 +81,11 @@ def _by_coordinates(groups: Sequence[_Group], every: int) -> Parts:
 
 @dataclass(frozen=True)
 class _Group:
-    """Sites that are projected by one computation: one site, or on a GPU several of one shape.
+    """Sites that are projected in one computation: one site, or on a GPU several of one shape.
 
     Attributes:
-        backbone: it, and not the context, which would keep the whole anchor in memory.
-        protection: that of all of them, stacked.
+        backbone: not the context, which would keep the whole anchor in memory.
+        protection: that of all sites, stacked.
     """
 
     backbone: nn.Module
@@ -93,15 +93,15 @@ class _Group:
     protection: Protection
 
     def pairs(self) -> list[Pair]:
-        """Each site's weight and bias; sharded ones as DTensors."""
+        """Weight and bias of each site, as DTensors if they are sharded."""
         return [weights(self.backbone, site) for site in self.sites]
 
     def here(self) -> list[Pair]:
-        """The rows of each that this process has."""
+        """The rows of each site that this process has."""
         return [pair_here(pair) for pair in self.pairs()]
 
     def project(self, update: Update) -> None:
-        """Take the protected part of an update out of the weights."""
+        """Remove the protected part of an update from the weights."""
         before = []
         for site, pair in zip(self.sites, self.pairs(), strict=True):
             before.append(pair_here(_before(site, pair, update)))
@@ -112,7 +112,7 @@ class _Group:
         stacking.subtract(self.here(), self.protection.removed(*moved))
 
     def hold(self, before: Remembered) -> None:
-        """Take what has changed along the protected directions out of the weights."""
+        """Remove the change along the protected directions from the weights."""
         here = self.here()
         if len(here) == 1:
             weight, bias = here[0]
@@ -132,7 +132,7 @@ def _grouped(
         return len(protection.factor) if isinstance(protection, Dense) else 0
 
     def alone(site: str) -> bool:
-        # Each table has rows of its own that are read.
+        # Each table has its own set of rows that are read.
         return isinstance(protections[site], TableRows)
 
     pairs = {site: weights(backbone, site) for site in protections}
@@ -144,9 +144,9 @@ def _grouped(
 
 
 def _before(site: str, now: Pair, update: Update) -> Pair:
-    """The weight and bias that were there before the update.
+    """Weight and bias from before the update.
 
-    A lone row goes by the site's own name.
+    A lone row is listed under the site's own name.
     """
     if site in update.before:
         return update.before[site], None
@@ -157,8 +157,8 @@ def _before(site: str, now: Pair, update: Update) -> Pair:
 
 def _project(now: Pair, before: Pair, protection: Protection) -> None:
     (weight, bias), (old_weight, old_bias) = now, before
-    # What is allowed is added to the old values, so that a row that may not change keeps its bits:
-    # to subtract the rest from the new values would round.
+    # The allowed part is added to the old values, so that a row that may not change keeps its bits:
+    # subtracting the protected part from the new values would round.
     moved, shifted = nullspace.allowed(protection, minus(now, before))
     torch.add(old_weight, moved, out=weight.data)
     if bias is not None:

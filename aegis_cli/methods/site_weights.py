@@ -1,4 +1,4 @@
-"""A site's weight and bias, and which sites one computation constrains."""
+"""The weight and bias of a site, and which sites are constrained in one computation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aegis_cli.core.pairs import Pair
 
 
 def weights(backbone: nn.Module, site: str) -> Pair:
-    """A site's weight and bias: its module's, or the parameter of that name without a bias."""
+    """Weight and bias of a site: those of its module, or the parameter of that name and None."""
     found = attrgetter(site)(backbone)
     if isinstance(found, Tensor):
         return found, None
@@ -22,7 +22,7 @@ def weights(backbone: nn.Module, site: str) -> Pair:
 
 
 def pair_here(pair: Pair) -> Pair:
-    """The rows of a weight and a bias that this process has; all where they are not sharded."""
+    """The rows of a weight and a bias that this process has; all if they are not sharded."""
     weight, bias = pair
     return rows_here(weight), None if bias is None else rows_here(bias)
 
@@ -33,7 +33,7 @@ def stackable(
     directions: Callable[[str], int],
     alone: Callable[[str], bool] = lambda _: False,
 ) -> list[list[str]]:
-    """Sites in groups that one computation constrains: each by itself, or on a GPU several.
+    """Group sites that one computation constrains: each alone, or on a GPU several together.
 
     Args:
         pairs: each site's weight and bias.
@@ -41,7 +41,7 @@ def stackable(
         alone: whether a site is never stacked with others.
     """
     waits = any(devices.reading_stalls(weight.device) for weight, _ in pairs.values())
-    # Stacking saves kernel launches, for which only a GPU waits. Sharded maps stay apart, since a
+    # Stacking saves kernel launches, which only matter on a GPU. Sharded maps stay apart, because a
     # stack of curvatures has no sum over the processes.
     if owners.several or not waits:
         return [[site] for site in pairs]

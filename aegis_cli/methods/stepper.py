@@ -15,10 +15,10 @@ from aegis_cli.models import structure
 class Stepper:
     """Takes an optimizer's steps and lets the method constrain them, `every` steps at a time.
 
-    Training's loop and the guard take their steps through it. They differ in how a step moves the
-    weights, which is why `step` is given that as `move`: training owns its optimizer and sets the
-    learning rate of each parameter before it; the guard leaves somebody else's optimizer as it is
-    and interpolates after it.
+    The training loop and the guard take their steps through it. They differ in how a step moves the
+    weights, so `step` takes that as `move`: training owns its optimizer and sets the learning rate
+    of each parameter beforehand; the guard leaves a user's optimizer as it is and interpolates
+    afterwards.
 
     Attributes:
         known: the parameters that the method was started with.
@@ -26,20 +26,20 @@ class Stepper:
     """
 
     def __init__(self, model: nn.Module, parts: Parts, may_shard: bool = False) -> None:
-        """Begin without a step.
+        """Create a stepper that has taken no step yet.
 
         Args:
-            model: the backbone, adapted; what learns in it now is what is constrained.
-            parts: the method at work on it.
-            may_shard: whether the method knows sharded weights, and these are sharded already.
+            model: the adapted backbone; the parameters that are trainable now are constrained.
+            parts: the started method.
+            may_shard: whether the method supports sharded weights and these are already sharded.
 
         Raises:
-            AegisError: the weights are sharded.
+            AegisError: the weights are sharded, and `may_shard` is false.
         """
         self.known = KnownParameters(model, may_shard)
         self._parts = parts
         self._learning = structure.learning(model)
-        # A model of which nothing learns has a device all the same.
+        # A model without trainable parameters still has a device.
         parameters = (*self._learning.values(), *model.parameters())
         self._device = next(iter(parameters)).device.type
         self._before: dict[str, Tensor] = {}
@@ -59,15 +59,15 @@ class Stepper:
         """Move the weights once; after every `parts.every`-th step the method constrains.
 
         Args:
-            number: of the step, from 1, so that a resumed run constrains after the same steps as an
-                uninterrupted one.
+            number: number of the step, from 1, so that a resumed run constrains after the same
+                steps as an uninterrupted one.
             move: takes the optimizer's step.
             anchor: gradient of the method's penalty before the step, by the parameters' names; the
-                method is given that of the last step.
-            rate_left: share of the peak learning rate that the schedule has left at this step; the
-                method is given that of the last step that moves the weights.
-            moves: 1, or 0 where `move` leaves all weights as they are, [] on their device, since to
-                read it would be to wait; None: it moves them.
+                method gets that of the last step.
+            rate_left: the learning rate at this step as a fraction of its peak; the method gets
+                that of the last step that moves the weights.
+            moves: 1, or 0 if `move` leaves all weights as they are; [] on their device, because
+                reading it would force a sync. None: it moves them.
 
         Raises:
             AegisError: parameters learn that the method does not know; nothing has moved.
@@ -82,9 +82,9 @@ class Stepper:
         rate_left: float = 1.0,
         moves: Tensor | None = None,
     ) -> None:
-        """Prepare for a step that somebody else takes; `end` follows it, and both are as `step`."""
+        """Prepare for a step that the caller takes before `end`; arguments as in `step`."""
         self.known.check()
-        # Only at the first of the steps that one constraint covers, which is what it compares with.
+        # Only at the first of the steps that one constraint covers: it compares with these values.
         if not self.pending and self._parts.copies:
             self._before = self._copies()
         if not self.pending and self._parts.begin is not None:
@@ -94,7 +94,7 @@ class Stepper:
             self._moved, self._rate_left = self._moved + 1, rate_left
         else:
             self._moved = self._moved + moves
-            # A choice by arithmetic, because to branch on `moves` would be to read it.
+            # Chosen by arithmetic, because branching on `moves` would read it.
             self._rate_left = moves * rate_left + (1 - moves) * self._rate_left
         self.pending += 1
 
@@ -104,16 +104,16 @@ class Stepper:
             self.settle()
 
     def cancel(self) -> None:
-        """Undo `begin` of a step that has moved nothing."""
+        """Undo `begin` for a step that has moved nothing."""
         self.pending -= 1
         self._moved = self._moved - 1
         if not self.pending:
             self._before, self._anchor = {}, {}
 
     def settle(self) -> None:
-        """Let the method constrain the pending steps now; without one, nothing happens."""
+        """Let the method constrain the pending steps now; if there are none, nothing happens."""
         begun, update = self.pending, self._update()
-        # Emptied first, so that the step is over even if the method raises.
+        # Cleared first, so that the step is over even if the method raises.
         self._before, self._anchor, self._moved, self.pending = {}, {}, 0, 0
         if begun and self._parts.constrain is not None:
             # A loop may step inside an autocast of its own.
@@ -131,7 +131,7 @@ class Stepper:
 
     def _copies(self) -> dict[str, Tensor]:
         """The parameters' values by all their names, each copied once."""
-        # By id: tied weights have several names, and so one copy.
+        # By id: tied weights have several names but need only one copy.
         own = {id(p): p for p in self._learning.values()}
         copies = {one: torch.empty_like(p, requires_grad=False) for one, p in own.items()}
         structure.copy_all(list(copies.values()), [p.detach() for p in own.values()])

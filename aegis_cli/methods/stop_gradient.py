@@ -1,4 +1,4 @@
-"""A frozen backbone: no gradient of the action loss reaches it, and it never changes."""
+"""A frozen backbone: no gradient from the action loss reaches it, and it never changes."""
 
 from aegis_cli.methods.base import Method, freeze
 

@@ -1,4 +1,4 @@
-"""A policy acts in episodes of a simulated task; what came of them, as success or as return."""
+"""Run a policy in episodes of a simulated task, and report its success or return."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DEFAULT = "seen"  # the default, and the only choice for a task without colours
 
 @dataclass(frozen=True)
 class PartSuccess:
-    """What a policy did in some of the episodes."""
+    """A policy's success in some of the episodes."""
 
     success: float
     interval: tuple[float, float]
@@ -46,17 +46,18 @@ class PartSuccess:
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutReport:
-    """What a policy did in closed loop: shares in [0, 1] with the 95 % interval of the success.
+    """A policy's closed-loop results: shares in [0, 1], and the 95 % interval of the success.
 
-    The distance is the mean at the episodes' ends; only a task with coloured targets has one.
-    `tasks` has the success in each task of a set, and `suites` in each suite of several. Where the
-    episodes differ in them, `target_colors` has that by the target's colour, and `instructions`
-    that by the instruction, in which `{color}` stands for the colour.
+    The distance is the mean at the end of the episodes; only a task with coloured targets has one.
+    `tasks` has the success in each task of a set, and `suites` in each suite if there are several.
+    If the episodes differ in them, `target_colors` has it by the target's colour, and
+    `instructions` by the instruction, in which `{color}` stands for the colour.
 
     `outcomes` has one character per episode, 1 for a success and 0 otherwise.
 
-    A task measured by its return has none of these. It has the mean return, its 95 % interval
-    (Student's t; None for one episode), and its share of the highest possible return, 1 per step.
+    A task measured by its return has none of these. It has the mean return, the 95 % interval of
+    that (Student's t; None for one episode), and its share of the highest possible return, 1 per
+    step.
 
     `action_change` is the root mean square of the difference between one executed action and the
     next, as a share of a full action: how much the robot jerks. Episodes of one step have none.
@@ -82,23 +83,23 @@ class RolloutReport:
     video: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON-ready values."""
+        """The report as values that JSON can hold."""
         return asdict(self)
 
 
 @dataclass
 class _PlayedEpisode:
-    """One environment with what has become of it so far.
+    """One environment with its episode so far.
 
-    An episode that is filmed keeps as many `moments` per second as a video shows,
-    `media.FRAMES_PER_S`. Of others, `moments` is None.
+    A filmed episode keeps `media.FRAMES_PER_S` `moments` per second, as many as the video shows.
+    For other episodes `moments` is None.
     """
 
     env: TaskEnv
     observation: Observation
     moments: list[media.Moment] | None
     ensemble: TemporalEnsemble | None = None
-    left: np.ndarray | None = None  # what is left of its last chunk [n, A]
+    left: np.ndarray | None = None  # the rest of its last chunk [n, A]
     executed: np.ndarray | None = None  # the last action [A]
     changes: list[float] = field(default_factory=list)  # mean squares over the dimensions
     last: Step | None = None
@@ -118,13 +119,13 @@ class _PlayedEpisode:
 
 @dataclass(frozen=True)
 class _Played:
-    """What has become of an episode, as plain JSON: it can be kept.
+    """The result of an episode as plain JSON values, so that it can be stored.
 
     Attributes:
-        distance_m: from the effector to the target at the end, in a task with coloured ones.
+        distance_m: from the effector to the target at the end, in a task with coloured targets.
         longest: how many steps the episode could have had.
-        jerks, jerked: the sum of the mean squares by which one executed action differs from the
-            next, and how many there are.
+        jerks, jerked: the sum of the mean squared differences between consecutive executed actions,
+            and their number.
     """
 
     success: bool
@@ -144,9 +145,9 @@ class _Pace:
 
     Attributes:
         replan: actions between two predictions.
-        delay: actions that a prediction takes, in which the chunk before is executed; None: the
+        delay: how many actions of the previous chunk are executed during a prediction; None: the
             robot stands still meanwhile.
-        guided: whether a delayed chunk continues the one before (see `core.continuation`).
+        guided: whether a delayed chunk continues the previous one (see `core.continuation`).
     """
 
     replan: int
@@ -154,7 +155,7 @@ class _Pace:
     guided: bool = False
 
 
-# (height, width) of the pictures that each camera showed in training; empty where nobody knows.
+# (height, width) of each camera's pictures in training; empty if unknown.
 Sizes = tuple[tuple[int, int], ...]
 
 
@@ -162,14 +163,14 @@ class Acting(NamedTuple):
     """A policy ready to act in a task; `replan` actions of each predicted chunk are executed.
 
     `ensemble` is the decay of its temporal ensemble, which predicts at every step. The task's
-    pictures are fitted to `sizes`, wherever training showed others. `rate` is known of a policy
-    that was trained in no task: the actions per second that it means.
+    pictures are resized to `sizes` if training used others. `rate`, the actions per second that the
+    policy was trained for, is known if it was not trained on a simulated task.
     """
 
     policy: Policy
     task: str
     replan: int
-    cameras: tuple[str, ...] = ()  # by which it looks; empty for the task's own
+    cameras: tuple[str, ...] = ()  # that it sees through; empty for the task's own
     ensemble: float | None = None
     sizes: Sizes = ()
     rate: float | None = None
@@ -189,17 +190,17 @@ def play(
 ) -> RolloutReport:
     """Let a policy act in `episodes` episodes of its task.
 
-    The episodes are the same for every policy: they depend on the task, the seed, the stream and
-    their number alone. With the decay of a temporal ensemble the policy predicts at every step,
+    The episodes are the same for every policy: they depend only on the task, the seed, the stream
+    and their number. With the decay of a temporal ensemble the policy predicts at every step,
     whatever `replan` is.
 
     Args:
-        colors: one of TARGET_COLORS; a task without coloured targets has the default only.
-        delay: steps that a prediction takes, in which the robot goes on with the chunk before;
-            None: it waits.
-        guided: whether a delayed chunk continues the one before.
-        kept: what was played before under the same circumstances, and is not played again; what is
-            played is added. None keeps nothing.
+        colors: one of TARGET_COLORS; only the default for a task without coloured targets.
+        delay: steps that a prediction takes, during which the robot continues with the previous
+            chunk; None: it waits.
+        guided: whether a delayed chunk continues the previous one.
+        kept: stored results of the same setting, which are not played again; new results are added.
+            None stores nothing.
     """
     task, pace = acting.task, _Pace(acting.replan, delay, guided)
     started = time.perf_counter()
@@ -224,7 +225,7 @@ def play(
             group = _begun(acting, simulators, seed, stream, numbers, colors, clips, on_event)
             longest = group[0].env.spec.max_steps
             for _ in _play(acting, simulators, group, pace, first, seed):
-                # An episode that ended early counts in full, so that the progress reaches its end.
+                # An episode that ended early counts in full, so that the progress reaches 100 %.
                 in_group = sum(longest if e.done else e.steps for e in group)
                 done = first * longest + in_group
                 on_event(Progress(stage, done, episodes * longest, "steps"))
@@ -247,7 +248,7 @@ def play(
 
 
 def _played(episode: _PlayedEpisode) -> _Played:
-    """What an episode that is over leaves."""
+    """The result of a finished episode."""
     return _Played(
         success=bool(episode.end.success),
         wrong_target=bool(episode.end.wrong_target),
@@ -269,39 +270,39 @@ class _Group(NamedTuple):
 
 
 def _line(first: int, group: _Group) -> dict[str, Any]:
-    """A group as it is kept: an episode's noise depends on how many are played with it."""
+    """A group as a stored line: an episode's noise depends on how many are played with it."""
     episodes = [asdict(episode) for episode in group.episodes]
     return {"first": first, "seconds": group.seconds, "episodes": episodes}
 
 
 def _kept(kept: KeptLines) -> dict[tuple[int, int], _Group]:
-    """The groups that are kept, by their first episode and how many there are."""
+    """The stored groups, by their first episode and the number of episodes."""
     found = {}
     for line in kept.read():
         try:
             episodes = [_Played(**episode) for episode in line["episodes"]]
             found[line["first"], len(episodes)] = _Group(episodes, float(line["seconds"]))
-        except (KeyError, TypeError, ValueError):  # a foreign line: that group is played
+        except (KeyError, TypeError, ValueError):  # an unreadable line: that group is played again
             continue
     return found
 
 
 def _simulators(acting: Acting, episodes: int) -> AbstractContextManager[Simulators]:
-    """What makes the task's environments, in this process or in several.
+    """The maker of the task's environments, in this process or in several.
 
     Raises:
-        AegisError: a task that cannot be made, before any process starts.
+        AegisError: the task cannot be made; raised before any process starts.
     """
     workers = sim.workers(acting.task, episodes)
-    if workers > 1:  # what a benchmark writes or fetches when it is first used, it does once
+    if workers > 1:  # so that first-use writes and downloads of a benchmark happen once
         sim.make(acting.task, seen_by=acting.cameras)
     return opened(workers, sim.lockstep(acting.task))
 
 
 def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int) -> float:
-    """About how many seconds `play` takes if no episode ends early, by its second chunk.
+    """About how many seconds `play` takes if no episode ends early, from its second chunk.
 
-    The first one also pays for what is done once.
+    The first chunk includes one-time work.
     """
     numbers = range(min(episodes, sim.lockstep(acting.task)))
     placing = time.perf_counter()
@@ -318,17 +319,17 @@ def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int
 
 
 def _action_change(finished: Sequence[_Played]) -> float | None:
-    """The root mean square over the steps of all episodes; None where all had one."""
+    """The root mean square over the steps of all episodes; None if each had a single step."""
     count = sum(episode.jerked for episode in finished)
     return math.sqrt(sum(episode.jerks for episode in finished) / count) if count else None
 
 
 def _measured(task: str, colors: str, finished: Sequence[_Played]) -> dict[str, Any]:
-    """The report's figures that a task of this kind has."""
+    """The figures of the report for this kind of task."""
     if sim.is_suite(task):
         return _returns(finished)
     found: dict[str, Any] = {**vars(_success(finished))}
-    del found["episodes"]  # which every report has, also one of returns
+    del found["episodes"]  # every report has this, including one of returns
     found["outcomes"] = "".join(str(int(e.success)) for e in finished)
     if sim.has_colors(task):
         wrong = sum(e.wrong_target for e in finished) / len(finished)
@@ -336,8 +337,8 @@ def _measured(task: str, colors: str, finished: Sequence[_Played]) -> dict[str, 
         found |= {"colors": colors, "wrong_target": wrong, "final_distance_m": distance}
     tasks = sim.members(task)
     if tasks != (task,):
-        # The tasks take turns: episode i is of task i mod n. With few episodes, not every one has
-        # its turn.
+        # The tasks take turns: episode i is of task i mod n. With few episodes, some tasks have
+        # none.
         turns = {name: finished[turn :: len(tasks)] for turn, name in enumerate(tasks)}
         found["tasks"] = {name: _success(played) for name, played in turns.items() if played}
         found["suites"] = _by_suite(task, turns)
@@ -347,7 +348,7 @@ def _measured(task: str, colors: str, finished: Sequence[_Played]) -> dict[str, 
 
 
 def _by_suite(task: str, turns: Mapping[str, Sequence[_Played]]) -> dict[str, PartSuccess] | None:
-    """The success in each suite of a set, of the episodes by their tasks; None for one suite."""
+    """The success in each suite of a set, from the episodes by task; None if there is one suite."""
     found = {}
     for suite in sim.suites(task):
         played = [episode for name in sim.members(suite) for episode in turns[name]]
@@ -359,7 +360,7 @@ def _by_suite(task: str, turns: Mapping[str, Sequence[_Played]]) -> dict[str, Pa
 def _apart(
     finished: Sequence[_Played], part_of: Callable[[_Played], str | None]
 ) -> dict[str, PartSuccess] | None:
-    """The success in each part of the episodes; None where they are all of one."""
+    """The success in each part of the episodes; None if there is only one part."""
     parts: dict[str, list[_Played]] = {}
     for episode in finished:
         if (name := part_of(episode)) is not None:
@@ -395,7 +396,7 @@ def _begun(
     filmed: int,
     on_event: OnEvent = ignore,
 ) -> list[_PlayedEpisode]:
-    """The episodes of these numbers at their beginning, those below `filmed` for a video."""
+    """Start the episodes of these numbers; those below `filmed` are filmed."""
     begun: dict[int, _PlayedEpisode] = {}
 
     def begin(number: int) -> None:
@@ -403,7 +404,7 @@ def _begun(
         begun[number] = _begin(acting, simulators, seed, stream, number, colors, shown)
 
     def told(done: int) -> None:
-        if sim.of_datasets(acting.task) is not None:  # elsewhere nobody has to wait
+        if sim.of_datasets(acting.task) is not None:  # other simulators start at once
             on_event(Progress(PLACING, done, len(numbers), "episodes"))
 
     told(0)
@@ -436,8 +437,8 @@ def _play(
     first: int,
     seed: int,
 ) -> Iterator[None]:
-    """Run a group to its end in lockstep, chunk by chunk; episodes that are done drop out."""
-    # Seeded by the group, so that the noise does not depend on how the groups before it ended.
+    """Run a group to its end in lockstep, chunk by chunk; finished episodes drop out."""
+    # Seeded by the group, so that the noise does not depend on how earlier groups ended.
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
     while active := [e for e in group if not e.done]:
         continued = _continued(active, pace)
@@ -451,20 +452,20 @@ def _play(
 
 
 def _continued(active: Sequence[_PlayedEpisode], pace: _Pace) -> Continued | None:
-    """What the next chunks continue; None where they need not, as the first ones of episodes."""
+    """The actions that the next chunks continue; None at the start of episodes, or unguided."""
     left = [e.left for e in active if e.left is not None and len(e.left)]
     if pace.delay is None or not pace.guided or not left:
         return None
-    # In lockstep all have as many actions left, so that they stack to [B, n, A].
+    # In lockstep all have equally many actions left, so they stack to [B, n, A].
     return Continued(torch.from_numpy(np.stack(left)), pace.delay)
 
 
 def _to_execute(episode: _PlayedEpisode, chunk: np.ndarray, pace: _Pace) -> np.ndarray:
-    """The actions [*, A] until the next prediction: of a chunk [H, A], or of the ensemble's."""
+    """The actions [*, A] until the next prediction: from a chunk [H, A], or from the ensemble."""
     if episode.ensemble is not None:
         return episode.ensemble.next(torch.from_numpy(chunk))[None].numpy()  # one action, [1, A]
     if pace.delay and episode.left is not None:
-        # While the policy predicted, the robot went on with the old chunk for so many steps.
+        # While the policy predicted, the robot took `delay` steps of the old chunk.
         chunk = np.concatenate([episode.left[: pace.delay], chunk[pace.delay :]])
     episode.left = chunk[pace.replan :]
     return chunk[: pace.replan]
@@ -484,7 +485,7 @@ def _decide(
 
 
 def _images(observations: list[Observation], sizes: Sizes) -> Images:
-    """[B, H, W, 3], or of several cameras B tuples of [H, W, 3]."""
+    """[B, H, W, 3] or, with several cameras, B tuples of [H, W, 3]."""
     rows = [_fitted((o.image, *o.more), sizes) for o in observations]
     if not observations[0].more:
         return torch.from_numpy(np.stack([image for (image,) in rows]))
@@ -492,7 +493,7 @@ def _images(observations: list[Observation], sizes: Sizes) -> Images:
 
 
 def _fitted(pictures: Sequence[np.ndarray], sizes: Sizes) -> Sequence[np.ndarray]:
-    """One picture of each camera, in the sizes of the training where these are known."""
+    """One picture of each camera, resized to the sizes of the training if these are known."""
     if not sizes:
         return pictures
     return [fit(picture, *size) for picture, size in zip(pictures, sizes, strict=True)]
@@ -501,17 +502,17 @@ def _fitted(pictures: Sequence[np.ndarray], sizes: Sizes) -> Sequence[np.ndarray
 def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
     """Execute a chunk of actions.
 
-    The policy looks after the last of them; whoever films, after each.
+    An observation is rendered after the last action; for a film, after each.
     """
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for number, action in enumerate(actions, 1):
         look = number == len(actions) or episode.moments is not None
-        # Actions are defined in [-1, 1]; a flow may end a little outside.
+        # Actions are defined in [-1, 1]; a flow may end slightly outside.
         given = np.clip(action, -1, 1)
         if episode.executed is not None:
             episode.changes.append(float(np.square(given - episode.executed).mean()))
         episode.executed = given
-        # To look is to render; without it a step has no observation.
+        # `look` renders an observation; without it a step has none.
         episode.last = step = episode.env.step(given, look)
         episode.steps += 1
         episode.observation = step.observation or episode.observation
@@ -523,7 +524,7 @@ def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
 
 
 def _moment(episode: _PlayedEpisode, step: Step) -> media.Moment:
-    """What a video shows of a step; the outcome is open until the episode is over."""
+    """What a video shows of a step; the outcome is unknown until the episode is over."""
     note = f"step {episode.steps}"
     if step.success is None:
         note += f"   return {episode.total_reward:.1f}"

@@ -1,17 +1,22 @@
-"""How far the actions that a policy predicts are from those that were recorded.
+"""Errors of a policy's predicted actions against the recorded ones (open loop).
 
-Each prediction begins at a recorded frame, and nothing is executed.
+Each prediction starts from a recorded frame, and nothing is executed.
 """
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
+from aegis_cli.common import kept_lines
 from aegis_cli.common.estimates import t_quantile
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa.metrics import clustered_error
 from aegis_cli.models.policy import Policy
@@ -26,26 +31,60 @@ def predict(
     batch_size: int,
     stage: str,
     on_event: OnEvent = ignore,
+    kept: KeptLines | None = None,
 ) -> torch.Tensor:
-    """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise."""
+    """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise.
+
+    Args:
+        kept: what was predicted before at these frames under the same circumstances, batch by
+            batch, and is not predicted again; what is predicted is added. None keeps nothing.
+    """
     # All noise is drawn at once: drawn by parts, it would depend on the size of the parts.
     noise = policy.draw_noise(len(at), torch.Generator().manual_seed(seed))
-    found = []
-    on_event(Progress(stage, 0, len(at), "frames"))
+    found = {} if kept is None else dict(_kept(kept))  # chunks by their first frame's place
+    done = sum(map(len, found.values()))
+    on_event(Progress(stage, done, len(at), "frames"))
     for first in range(0, len(at), batch_size):
+        if first in found:
+            continue
         part = slice(first, first + batch_size)
         batch = shown.batch(at[part], 1)
         acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
-        found.append(acted.cpu())
-        on_event(Progress(stage, min(first + batch_size, len(at)), len(at), "frames"))
-    return torch.cat(found)
+        found[first] = acted.cpu()
+        if kept is not None:
+            kept.add([_line(first, found[first])])
+        done += len(acted)
+        on_event(Progress(stage, done, len(at), "frames"))
+    return torch.cat([found[first] for first in sorted(found)])
+
+
+def _line(first: int, chunks: torch.Tensor) -> dict[str, Any]:
+    """A batch's chunks as they are kept, bit for bit."""
+    raw = chunks.contiguous().view(torch.uint8).numpy().tobytes()
+    line = {
+        "first": first,
+        "shape": list(chunks.shape),
+        "dtype": str(chunks.dtype).removeprefix("torch."),
+        "chunks": base64.b64encode(raw).decode(),
+    }
+    return kept_lines.sealed(line)
+
+
+def _kept(kept: KeptLines) -> Iterator[tuple[int, torch.Tensor]]:
+    """The batches that are kept whole, by the place of the first frame; others are left out."""
+    for line in kept.read():
+        said = kept_lines.unsealed(line)
+        if said is not None:
+            raw = bytearray(base64.b64decode(said["chunks"]))
+            flat = torch.frombuffer(raw, dtype=getattr(torch, said["dtype"]))
+            yield said["first"], flat.view(said["shape"])
 
 
 def training_std(policy: Policy, meta: PolicyMeta) -> np.ndarray:
     """Each action's standard deviation [A] over the frames that the policy was trained on.
 
-    It is the policy's scale, unless that is one of relative actions or of quantiles, and `meta`
-    tells the deviations.
+    It is the policy's scale, unless that is a scale of relative actions or of quantiles: then
+    `meta` has the deviations.
     """
     told = meta.get("action_std")
     if told is not None:
@@ -58,14 +97,14 @@ class ActionErrors:
     """Errors of chunks that were predicted at N frames.
 
     Attributes:
-        recorded: [N, H, A], what was done, in raw units.
-        error: [N, H, A], what was predicted less what was done.
-        hold: [N, H, A], the position at the frame less what was done; None where actions are no
+        recorded: [N, H, A], the recorded actions, in raw units.
+        error: [N, H, A], prediction minus recording.
+        hold: [N, H, A], the position at the frame minus the recording; None if actions are not
             positions.
-        valid: [N, H], whether the step is of the frame's episode, and not past its end.
+        valid: [N, H], whether the step lies within the frame's episode, not past its end.
         episode_of: [N].
-        training_std: [A], the standard deviations that errors are relative to; 0 of an action that
-            never varied there.
+        training_std: [A], the standard deviations that errors are relative to; 0 for an action that
+            never varied in training.
     """
 
     recorded: np.ndarray
@@ -89,14 +128,14 @@ class ActionErrors:
         error = predicted.double().numpy() - recorded
         hold, places = None, _places(shown)
         if places is not None:
-            # The position at the frame, for every step of the chunk: [N, 1, A] less [N, H, A].
+            # The position at the frame, for every step of the chunk: [N, 1, A] minus [N, H, A].
             hold = shown.tensors["proprio"][at][:, places].double().numpy()[:, None] - recorded
         episode_of = shown.episode_of[at].numpy()
         return cls(recorded, error, hold, ~is_pad.numpy(), episode_of, training_std)
 
     @property
     def relative(self) -> np.ndarray | None:
-        """Squared error over the training's variance [N, H]; None where nothing varied there.
+        """Squared error over the training's variance [N, H]; None if nothing varied in training.
 
         It is the mean over the dimensions that varied.
         """
@@ -104,7 +143,7 @@ class ActionErrors:
 
     @property
     def held(self) -> np.ndarray | None:
-        """The same of repeating the current position; None where actions are no positions."""
+        """The same for repeating the current position; None if actions are not positions."""
         return None if self.hold is None else self._relative(self.hold)
 
     def _relative(self, error: np.ndarray) -> np.ndarray | None:
@@ -114,7 +153,7 @@ class ActionErrors:
         return np.square(error[..., varies] / self.training_std[varies]).mean(axis=-1)
 
     def interval(self) -> tuple[float, float] | None:
-        """95 % interval of the mean relative error over all steps; None of a single episode."""
+        """95 % interval of the mean relative error over all steps; None for a single episode."""
         relative = self.relative
         if relative is None:
             return None
@@ -124,14 +163,14 @@ class ActionErrors:
 
 
 def mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
-    """The mean of what is valid; None where nothing is."""
+    """The mean of the valid entries; None if there are none."""
     return None if values is None or not valid.any() else float(values[valid].mean())
 
 
 def interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] | None:
-    """95 % interval of the mean of errors [n], by Student's t over episodes; None of a single one.
+    """95 % interval of the mean of errors [n], by Student's t over episodes; None for one episode.
 
-    Steps of an episode are alike, and episodes are few.
+    The steps of an episode are correlated, and episodes are few.
     """
     error, episodes = clustered_error(errors, episode_of.tolist())
     if episodes == 1:
@@ -141,15 +180,15 @@ def interval(errors: np.ndarray, episode_of: np.ndarray) -> tuple[float, float] 
 
 
 def _places(shown: Demonstrations) -> list[int] | None:
-    """The position that each action says to take, which is that of its name; None where one lacks.
+    """The index of the position of the same name as each action; None if one is missing.
 
-    A robot may tell more of itself than it is told to do, such as velocities or efforts.
+    A robot may report more than it is commanded, such as velocities or efforts.
     """
     names, positions = shown.action_names, shown.proprio_names
     named = any(names) and len(names) == shown.tensors["actions"].shape[1]
     if not named or len(positions) != shown.tensors["proprio"].shape[1]:
         return None
-    if names == positions:  # in one order, even where two arms use one name
+    if names == positions:  # in the same order, even if two arms share a name
         return list(range(len(names)))
     if any(names.count(name) != 1 or positions.count(name) != 1 for name in names):
         return None

@@ -1,4 +1,4 @@
-"""A backbone is asked questions, by one process or by several that have a share of them each."""
+"""Ask a backbone questions, in one process or divided among several."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def ask(
 ) -> list[Graded]:
     """Every question's answer, graded.
 
-    The arithmetic is in float32, so that neither the batch size nor the number of processes shows
-    in the result.
+    The arithmetic is in float32, so neither the batch size nor the number of processes affects the
+    result.
 
     Args:
-        ranks: the processes that ask a part of the questions each.
+        ranks: the processes that share the questions.
     """
     own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
-    # Not inference mode: a model that goes on to learn may keep a tensor of this pass.
+    # Not inference mode: a model that is trained afterwards may keep a tensor of this pass.
     with torch.no_grad():
         graded = grade(
             model.answers,
@@ -36,5 +36,5 @@ def ask(
             batch_size,
             on_event,
         )
-    # Shares follow each other as the processes do, so that answers come in the questions' order.
+    # Shares are in the order of the processes, so the answers are in the order of the questions.
     return [one for part in ranks.gathered(graded) for one in part]

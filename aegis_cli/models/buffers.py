@@ -1,6 +1,6 @@
-"""Which parts of a model its own passes write to, as batch normalisations average what they read.
+"""Detect buffers that a model's own passes change, such as the running averages of BatchNorm.
 
-No method holds what is written so: it is no parameter and has no gradient.
+No method constrains these: they are not parameters and have no gradient.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from aegis_cli.models.wrappers import plain_names
 
 
 class WrittenBuffers:
-    """The buffers of a model as they are now, to see which of them change later."""
+    """A snapshot of a model's buffers, to find out which of them change later."""
 
     def __init__(self, model: nn.Module) -> None:
-        """Copy them."""
+        """Copy the buffers."""
         self._model = model
         self._then = {name: [_Then.of(b) for b in own] for name, own in _kept(model)}
 
     def modules(self) -> list[str]:
-        """Plain names of the modules that have buffers with other values than then."""
+        """Plain names of the modules whose buffers have changed since."""
         found, plain = [], plain_names(self._model)
         for name, own in _kept(self._model):
             then = self._then.get(name, [])
@@ -34,7 +34,7 @@ class WrittenBuffers:
 
 @dataclass(frozen=True)
 class _Then:
-    """A buffer, how often it had been written to as PyTorch counts it, and its values then."""
+    """A buffer with its version (PyTorch's count of writes) and its values at the snapshot."""
 
     buffer: Tensor
     version: int
@@ -46,10 +46,11 @@ class _Then:
 
 
 def _changed(own: Sequence[Tensor], then: Sequence[_Then]) -> bool:
-    """Whether any buffer of a module has other values than then.
+    """Whether any buffer of a module has changed since the snapshot.
 
-    What nobody wrote to is not read, for which a GPU would wait: of BatchNorm only the number of
-    batches counts as written to. DistributedDataParallel writes equal values before each pass.
+    Buffers whose version is unchanged are not read, since reading would wait for the GPU; of
+    BatchNorm's only the number of batches counts as written to. DistributedDataParallel writes
+    equal values before each pass.
     """
     pairs = list(zip(own, then, strict=True))
     if all(now is before.buffer and now._version == before.version for now, before in pairs):
@@ -58,16 +59,16 @@ def _changed(own: Sequence[Tensor], then: Sequence[_Then]) -> bool:
 
 
 def _kept(model: nn.Module) -> Iterator[tuple[str, list[Tensor]]]:
-    """The buffers of each module that are written into checkpoints, by its name.
+    """The persistent buffers of each module, by the module's name.
 
-    The others are made anew, as tables of positions are for longer texts.
+    The others may be rebuilt, as position tables are for longer texts.
     """
     for name, module in model.named_modules():
         own = []
         for leaf, buffer in module._buffers.items():
             lasts = buffer is not None and leaf not in module._non_persistent_buffers_set
-            # A tensor that was made in inference mode has no count of writes, and PyTorch refuses
-            # to write to it in training.
+            # A tensor made in inference mode has no version, and PyTorch refuses to write to it in
+            # training.
             if lasts and not buffer.is_inference():
                 own.append(buffer)
         if own:

@@ -1,4 +1,4 @@
-"""A policy on the hub, as `aegis push` sends it, downloaded into the hub's own cache."""
+"""Download a policy that `aegis push` has sent to the hub, into the hub's own cache."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ from pathlib import Path
 from aegis_cli.common import files, hub
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models import lerobot_folder
+from aegis_cli.models.backbones import model_folder
 
 _EXPERT = "expert.safetensors"  # of a checkpoint's layout
-# All of a checkpoint's layout, and of LeRobot's what is small. Of any other repository it is hardly
-# more than a configuration.
+# All files of a checkpoint's layout, and the small ones of LeRobot's. In any other repository these
+# match hardly more than a configuration.
 _PARTS = (lerobot_folder.CONFIG, _EXPERT, f"{lerobot_folder.BACKBONE}/*")
 _CARDS = ("*.md",)
 
 
 def locate(name: str | Path) -> Path:
-    """The folder of a run, a checkpoint or an exported policy, or of the copy of one on the hub.
+    """The folder of a run, a checkpoint or an exported policy, downloaded from the hub if needed.
 
-    A path that is not there and can be no id stays as it is: whoever reads it says what is missing.
+    A path that does not exist and cannot be an id is returned unchanged: its reader reports what is
+    missing.
 
     Args:
-        name: a path as somebody wrote it, or the id of a policy on the hub, which is downloaded.
+        name: a path as the user wrote it, or the id of a policy on the hub, which is downloaded.
 
     Raises:
-        AegisError: neither here nor to be had, or a repository without a policy of ours.
+        AegisError: it is neither here nor can be downloaded, or the repository has no policy of
+            Aegis.
     """
-    # What is on the disk goes before an id of the same name, which is asked for over a network.
+    # A path on the disk takes precedence over a hub id of the same name, which needs the network.
     path = Path(name)
     return path if path.exists() or hub.is_local(str(name)) else fetch(str(name))
 
@@ -51,17 +54,22 @@ def fetch(name: str) -> Path:
         return _snapshot(name, (*_PARTS, lerobot_folder.MODEL))
     if (folder / _EXPERT).is_file() and (folder / lerobot_folder.BACKBONE).is_dir():
         return folder
+    fix = (
+        "check the name; where the policy lies in a folder of it: "
+        f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER"
+    )
+    if model_folder.foreign_policy(folder) is not None:
+        fix += f"; {model_folder.take_out(name)}"
     raise AegisError(
         f"the repository '{name}' of the hub has no policy of Aegis{_instead(config)}",
         f"what aegis push sends: {_EXPERT} and {lerobot_folder.BACKBONE}/, or LeRobot's layout "
         f"with {lerobot_folder.CONFIG} of the type {lerobot_folder.TYPE}",
-        "check the name; where the policy lies in a folder of it: "
-        f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER",
+        fix,
     )
 
 
 def _instead(config: Path) -> str:
-    """What a repository of something else says that it is."""
+    """What a repository without a policy of Aegis contains instead, by its configuration."""
     if not config.is_file():
         return f", nor a {config.name}"
     try:

@@ -2,9 +2,9 @@
 
 Each expert layer attends to its own action tokens and to the keys and values of the backbone layer
 at the same depth. The K flow samples of one frame are K blocks over the same prefix: the backbone,
-which is the cost, runs once. Where the backbone rotates its keys by position, the action tokens
-take the positions after the prefix, by the same rotary embedding. Where the backbone has fewer
-heads of keys than of queries, the expert has too.
+which is the cost, runs once. If the backbone rotates its keys by position, the action tokens take
+the positions after the prefix, with the same rotary embedding. If the backbone has fewer key heads
+than query heads, so does the expert.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class ExpertShape:
 
     Attributes:
         depth, heads, head_dim, kv_heads: those of the backbone that it reads; kv_heads None means
-            as many as `heads`.
-        proprio, actions: P and A of the robot with the most.
-        chunk: H, the actions that one prediction has.
+            the same as `heads`.
+        proprio, actions: P and A, or the largest of them if it serves several robots.
+        chunk: H, the number of actions in one prediction.
         width: size of the residual stream.
         mlp_ratio: hidden units of an MLP per unit of width.
     """
@@ -49,7 +49,7 @@ class ExpertShape:
     kv_heads: int | None = None
 
     def to_json(self) -> dict[str, int | None]:
-        """The sizes as JSON-ready values."""
+        """The sizes as values that JSON can hold."""
         return asdict(self)
 
 
@@ -88,7 +88,7 @@ class ExpertLayer(nn.Module):
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (self.heads + 2 * self.kv_heads, -1))
         qkv = qkv.permute(0, 3, 1, 2, 4)  # [B, heads + 2 kv_heads, K, H, head_dim]
         query, key, value = qkv.split([self.heads, self.kv_heads, self.kv_heads], dim=1)
-        # The backbone's keys come rotated: they stand at the positions before these.
+        # The backbone's keys are already rotated, for the positions before these.
         if rotation is not None:
             query, key = rotate(query, rotation), rotate(key, rotation)
         mixed = self._grouped(query, KeyValue(key, value), prefix, prefix_mask)
@@ -98,17 +98,17 @@ class ExpertLayer(nn.Module):
     def _grouped(
         self, query: Tensor, own: KeyValue, prefix: KeyValue, prefix_mask: Tensor
     ) -> Tensor:
-        """Grouped-query attention: each head of keys serves `heads / kv_heads` heads of queries.
+        """Grouped-query attention: each key head serves `heads / kv_heads` query heads.
 
-        The queries of a group are made more blocks of their head of keys.
+        The query heads of a group are treated as further blocks of their key head.
         """
-        # A backbone may pass in another type than the expert, whose queries decide here.
+        # The backbone may use another dtype than the expert, whose queries decide here.
         prefix = KeyValue(prefix.key.to(query.dtype), prefix.value.to(query.dtype))
         groups, blocks = self.heads // self.kv_heads, query.shape[2]
         if groups == 1:
             return block_attention(query, own, None, prefix, prefix_mask)
         query = query.unflatten(1, (self.kv_heads, groups)).flatten(2, 3)  # [B, kv, groups*K, H, d]
-        # The prefix is shared by all blocks; only a block's own keys have to be there again.
+        # The prefix is shared by all blocks; only a block's own keys have to be repeated.
         own = KeyValue(*(t.repeat(1, 1, groups, 1, 1) for t in own))
         mixed = block_attention(query, own, None, prefix, prefix_mask)
         return mixed.unflatten(2, (groups, blocks)).flatten(1, 2)  # [B, heads, K, H, d]
@@ -117,15 +117,15 @@ class ExpertLayer(nn.Module):
 class ActionExpert(nn.Module):
     """Velocity field over action chunks.
 
-    It is given proprioception, the flow time and a backbone's keys and values.
+    It is conditioned on proprioception, the flow time and a backbone's keys and values.
 
     Attributes:
-        recomputes: whether a layer's activations are not kept for the backward pass but made anew
-            in it. They grow with flow samples x chunk x (chunk + the backbone's tokens).
+        recomputes: whether a layer's activations are recomputed in the backward pass instead of
+            kept. They grow with flow samples x chunk x (chunk + the backbone's tokens).
     """
 
     def __init__(self, shape: ExpertShape) -> None:
-        """Draw the weights, in float32 whatever `torch.set_default_dtype` says."""
+        """Initialize the weights in float32, whatever the default dtype is."""
         super().__init__()
         self.shape, self.recomputes = shape, False
         width = shape.width
@@ -142,9 +142,9 @@ class ActionExpert(nn.Module):
 
     @torch.no_grad()
     def of_robot(self, proprio: int, actions: int) -> ActionExpert:
-        """The expert of a robot with the first so many positions and actions alone.
+        """The expert for a robot that has only the first `proprio` positions and `actions` actions.
 
-        It predicts what this one does where the others are 0.
+        It predicts what this expert does if the others are 0.
         """
         found = ActionExpert(replace(self.shape, proprio=proprio, actions=actions))
         tensors = self.state_dict()
@@ -156,7 +156,7 @@ class ActionExpert(nn.Module):
         return found
 
     def compile_layers(self, backend: str = "inductor") -> None:
-        """Compile the layers, which share what was compiled for the first of them."""
+        """Compile the layers, which share the compiled code of the first one."""
         compiling.compile_layers(self.layers, backend, keeps_keys=False)
 
     def forward(
@@ -175,8 +175,8 @@ class ActionExpert(nn.Module):
             times: [B, K] flow times.
             proprio: [B, P] normalised proprioception.
             prefix: the backbone's keys and values of each layer.
-            prefix_mask: [B, T] bool, where padding is False; or one [B, H, T] per layer, which
-                says what each action token sees.
+            prefix_mask: [B, T] bool, False at padding; or one [B, H, T] per layer that says what
+                each action token sees.
             rotation: the rotary embedding of the action tokens, [B, H, head_dim], for all layers
                 or one per layer; None for a backbone without one.
 
@@ -197,11 +197,11 @@ class ActionExpert(nn.Module):
                 tokens = checkpoint(layer, tokens, keys_values, mask, own, use_reentrant=False)
             else:
                 tokens = layer(tokens, keys_values, mask, own)
-        # Loss and integration take the velocity in float32, also under autocast.
+        # Loss and integration use the velocity in float32, even under autocast.
         return self.action_out(self.final_norm(tokens)).float()
 
     def _masks(self, prefix_mask: Tensor | Sequence[Tensor]) -> list[Tensor]:
-        """Each layer's mask as numbers to be added to scores [B, h, K, H, T]."""
+        """Each layer's mask in additive form, for scores [B, h, K, H, T]."""
         if isinstance(prefix_mask, Tensor):
             for_all = additive(prefix_mask)[:, None, None, None]  # [B, 1, 1, 1, T]
             return [for_all] * len(self.layers)

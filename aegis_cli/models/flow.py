@@ -1,7 +1,7 @@
-"""Flow matching over action chunks, by openpi's convention: t = 1 is noise and t = 0 the action.
+"""Flow matching over action chunks in openpi's convention: t = 1 is noise, t = 0 is the action.
 
-The equations are those of pi0 (arXiv 2410.24164) as openpi and LeRobot implement them; the paper
-itself lets time run the other way.
+The equations are those of pi0 (arXiv 2410.24164) as openpi and LeRobot implement them; in the paper
+itself time runs the other way.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def draw_times(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
 
 
 def draw_noise(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    """Standard normal noise, float32 on the CPU whatever a program's default type is."""
+    """Standard normal noise, float32 on the CPU, whatever the default dtype is."""
     return torch.randn(shape, generator=generator, dtype=torch.float32)
 
 
@@ -40,24 +40,24 @@ def interpolate(actions: Tensor, noise: Tensor, times: Tensor) -> tuple[Tensor, 
         times: t [...].
     """
     t = times[..., None, None]
-    # The path is a straight line, so that its velocity is the same at every t.
+    # The path is a straight line, so its velocity is the same at every t.
     return t * noise + (1 - t) * actions, noise - actions
 
 
 def masked_mse(
     velocity: Tensor, target: Tensor, is_pad: Tensor, shown: int | None = None
 ) -> Tensor:
-    """Mean squared error over valid action entries alone, so that padding never dilutes it.
+    """Mean squared error over valid action entries only, so that padding never dilutes it.
 
     Args:
         velocity, target: [B, K, H, A].
         is_pad: [B, H] bool; True where the chunk runs past its episode's end.
-        shown: valid steps of the larger batch that this one is a share of; then the result is what
-            the share contributes to that batch's mean.
+        shown: number of valid steps of the larger batch that this one is a share of; the result is
+            then the share's contribution to that batch's mean.
     """
     valid = (~is_pad)[:, None, :, None].expand_as(target)  # [B, 1, H, 1] -> [B, K, H, A]
     squares = (velocity - target).square() * valid
-    # A mean over all entries would shrink with the padding, and with it each frame's gradient.
+    # A mean over all entries, and so each frame's gradient, would shrink with the padding.
     entries = valid.sum() if shown is None else shown * target.shape[1] * target.shape[3]
     return squares.sum() / entries
 
@@ -68,7 +68,7 @@ def integrate(
 ) -> Tensor:
     """Euler integration of dx/dt = v(x, t) from t = 1 (noise [B, H, A]) to t = 0 (actions)."""
     x = noise
-    # From noise to action the time falls, so that a step goes against the velocity.
+    # Time decreases from noise to action, so a step goes against the velocity.
     for i in range(steps):
         t = torch.full((len(x),), 1 - i / steps, dtype=x.dtype, device=x.device)
         x = x - velocity(x, t) / steps

@@ -1,8 +1,8 @@
-"""A policy as a folder in the layout of LeRobot's policies, which is not needed for it.
+"""A policy as a folder in the layout of LeRobot's policies; LeRobot itself is not needed.
 
-config.json                what LeRobot has to know: features, chunk, actions that are executed
+config.json                what LeRobot needs to know: features, chunk, executed actions
 model.safetensors          all tensors of the policy, under the names of its modules; the header has
-                           its sizes, its task and what else its user has to know
+                           its sizes, its task and what else a user needs to know
 policy_preprocessor.json   LeRobot's steps before and after the policy. They change no number,
 policy_postprocessor.json  because the policy has its own scales.
 backbone/                  a Hugging Face model's configuration and its processor's files
@@ -33,11 +33,11 @@ TYPE, KIND = "aegis", "policy"  # LeRobot's name for the policy, and ours for it
 MODEL, CONFIG, BACKBONE = "model.safetensors", "config.json", "backbone"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
-_OBSERVED = "observation."  # what whole names of LeRobot's begin with
-CAMERA = "top"  # that of our own tasks
-# LeRobot wants a size. A policy that was exported before sizes were kept does not know its own.
+_OBSERVED = "observation."  # the prefix of LeRobot's full names
+CAMERA = "top"  # the camera of our own tasks
+# LeRobot requires a size, which a policy exported before sizes were kept does not know.
 _ANY_SIZE = 224
-# What is kept of a checkpoint's meta.
+# The entries of a checkpoint's meta that are kept.
 _SAID = (
     "method",
     "task",
@@ -66,13 +66,13 @@ is_policy, is_own_config = model_folder.is_policy, model_folder.is_own_config
 
 
 def write(folder: Path, policy: Policy, meta: PolicyMeta, cameras: Sequence[str] = ()) -> None:
-    """Write everything into an existing folder.
+    """Write the policy and LeRobot's files into an existing folder.
 
     Args:
-        cameras: other names of the pictures, in the order in which the backbone takes them.
+        cameras: other names for the pictures, in the backbone's order.
     """
     named = cameras or meta.get("cameras") or (CAMERA,)
-    # A LeRobot dataset's own names begin so already.
+    # The names in a LeRobot dataset already have this prefix.
     named = [name.removeprefix(IMAGES) for name in named]
     write_model(folder, policy, cast(PolicyMeta, {**meta, "cameras": named}))
     config = _config(policy, meta, named)
@@ -82,10 +82,10 @@ def write(folder: Path, policy: Policy, meta: PolicyMeta, cameras: Sequence[str]
 
 
 def write_model(folder: Path, policy: Policy, meta: PolicyMeta) -> None:
-    """Write the policy itself into an existing folder; a file that is there is replaced.
+    """Write only the policy itself into an existing folder, replacing existing files.
 
-    The backbone's weights are written in the type that they are in, which the header names as
-    `stored` if it is not float32.
+    The backbone's weights are written in their present dtype, which the header names as `stored` if
+    it is not float32.
     """
     described = outline.describe(policy.backbone, folder / BACKBONE)
     tensors = {f"model.{name}": tensor for name, tensor in own_tensors(policy).items()}
@@ -105,10 +105,10 @@ def write_model(folder: Path, policy: Policy, meta: PolicyMeta) -> None:
 
 
 def load(folder: Path) -> tuple[Policy, PolicyMeta]:
-    """The policy in a folder, ready to act, and what its user has to know.
+    """Load the policy in a folder, ready to act, and its meta.
 
     Raises:
-        AegisError: a file that is missing or damaged, or other tensors than the policy's.
+        AegisError: a file is missing or damaged, or holds other tensors than the policy's.
     """
     path = folder / MODEL
     artifact = artifacts.load(path, KIND)
@@ -124,7 +124,7 @@ def load(folder: Path) -> tuple[Policy, PolicyMeta]:
         relative = relative_of(meta, int(sizes["actions"]), int(sizes["positions"]))
         stored = STORED_TYPES[meta.get("stored", FLOAT32)]
     policy = Policy(backbone, ActionExpert(shape), positions, actions, relative)
-    # `fill` wants the file's own types. Then all is float32, as of any backbone that is loaded.
+    # `fill` needs the file's own dtypes. Afterwards all is float32, as in any loaded backbone.
     backbone.round_weights(stored)
     fill(policy, {n.removeprefix("model."): t for n, t in artifact.tensors.items()}, f"'{path}'")
     backbone.round_weights(torch.float32)
@@ -140,29 +140,29 @@ def load(folder: Path) -> tuple[Policy, PolicyMeta]:
 
 
 def picture_key(name: str) -> str:
-    """LeRobot's name of a picture; a dataset's own, such as `observation.image`, stays."""
+    """LeRobot's name of a picture; a dataset's own name, such as `observation.image`, is kept."""
     return name if name.startswith(_OBSERVED) else f"{IMAGES}{name}"
 
 
 def own_tensors(policy: Policy) -> dict[str, Tensor]:
-    """What a policy is made of by name; a tensor with several names goes by the first."""
+    """A policy's parameters and buffers by name; a tied tensor appears under its first name."""
     named = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
     return {name: tensor for name, tensor in policy.state_dict().items() if name in named}
 
 
 def fill(policy: Policy, tensors: Mapping[str, Tensor], source: str) -> None:
-    """Put exactly the policy's own tensors into it.
+    """Load tensors into a policy, which must be exactly its own.
 
     Raises:
-        AegisError: one is missing, left over, or of another shape or type; nothing was put in.
+        AegisError: one is missing, left over, or of another shape or dtype; nothing was loaded.
     """
     check_state(source, tensors, own_tensors(policy))
-    # Further names of a tied tensor are missing, and it is there by its first.
+    # A tied tensor is there under its first name; its further names are missing.
     policy.load_state_dict(tensors, strict=False)
 
 
 def _unit(size: int) -> Normalizer:
-    """A normalizer of that many numbers, whose scales are still to be filled in."""
+    """A normalizer of `size` numbers, whose scales are still to be loaded."""
     if size < 1:
         raise ValueError(f"a size of {size}")
     zeros = torch.zeros(size, dtype=torch.float32)
@@ -182,7 +182,7 @@ def _config(policy: Policy, meta: PolicyMeta, cameras: Sequence[str]) -> dict[st
     }
     return {
         "type": TYPE,
-        "n_obs_steps": 1,  # a policy sees the frame of now alone
+        "n_obs_steps": 1,  # a policy sees only the current frame
         "input_features": {
             **pictures,
             STATE: _feature("STATE", len(policy.proprio_scale.mean)),
@@ -200,10 +200,10 @@ def _feature(kind: str, *shape: int) -> dict[str, Any]:
 
 
 def _processors(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """LeRobot's default steps by their file.
+    """LeRobot's default processing steps, by file.
 
-    LeRobot's programs override settings of these steps by their names, and refuse a policy that
-    lacks one of them.
+    LeRobot's programs override settings of these steps by name, and refuse a policy that lacks one
+    of them.
     """
     outputs = config["output_features"]
     before = [

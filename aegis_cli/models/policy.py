@@ -23,10 +23,10 @@ from aegis_cli.models.structure import digest
 
 
 def check_actions(actions: Tensor) -> Tensor:
-    """The actions of any shape that are about to be sent to a robot.
+    """Return actions of any shape, once they are checked to be safe to send to a robot.
 
     Raises:
-        AegisError: some are not finite.
+        AegisError: some actions are not finite.
     """
     if not (finite := actions.isfinite()).all():
         raise AegisError(
@@ -39,13 +39,13 @@ def check_actions(actions: Tensor) -> Tensor:
 
 
 class Policy(nn.Module):
-    """A backbone that sees image and instruction, and an expert that turns noise into actions.
+    """A backbone that reads image and instruction, and an expert that turns noise into actions.
 
     The split is that of pi0 (arXiv 2410.24164). A robot may have fewer positions and actions than
-    the expert; the normalizers know how many.
+    the expert; the normalizers have the robot's sizes.
 
     Attributes:
-        acts_in: the precision of `act`, as `devices.autocast` takes it.
+        acts_in: the precision of `act`, as passed to `devices.autocast`.
     """
 
     def __init__(
@@ -56,13 +56,13 @@ class Policy(nn.Module):
         action: Normalizer,
         relative: Places = (),
     ) -> None:
-        """Put the parts together.
+        """Assemble the policy.
 
         Args:
-            proprio: of the robot's positions.
-            action: of its actions, less what they are relative to.
-            relative: the place of the position that each action is predicted relative to, None for
-                an absolute one; empty where all are absolute.
+            proprio: scale of the robot's positions.
+            action: scale of its actions minus what they are relative to.
+            relative: for each action, the index of the position that it is predicted relative to,
+                or None if it is absolute; empty if all are absolute.
         """
         super().__init__()
         self.backbone, self.expert = backbone, expert
@@ -71,17 +71,17 @@ class Policy(nn.Module):
         self.acts_in = "float32"
 
     def encode(self, images: Images, instructions: Sequence[str]) -> Encoding:
-        """The backbone's pass over B images (or B tuples of several cameras') and instructions."""
+        """Encode B images (or B tuples of several cameras' images) and instructions."""
         return self.backbone.encode(self.backbone.prepare(images, instructions))
 
     def targets(self, batch: RobotBatch) -> Tensor:
-        """What the expert has to predict of a batch's actions: [B, H, A], in normalised units."""
+        """The expert's targets for a batch's actions: [B, H, A], in normalised units."""
         device = self.backbone.device
         origins = self.origins(send(batch.proprio, device))
         return self.action_scale(send(batch.actions, device) - origins)
 
     def targets_on_cpu(self) -> Callable[[RobotBatch], Tensor]:
-        """What `targets` finds, but without the device: for threads that prepare batches."""
+        """A function like `targets` that runs on the CPU, for threads that prepare batches."""
         scale, origins = (copy.deepcopy(m).cpu() for m in (self.action_scale, self.origins))
         return lambda batch: scale(batch.actions - origins(batch.proprio))
 
@@ -105,12 +105,12 @@ class Policy(nn.Module):
             of: the batch that this one is a share of.
 
         Returns:
-            A scalar, in normalised units; of a share, what it contributes to the whole batch's.
+            A scalar, in normalised units; for a share, its contribution to the whole batch's loss.
         """
         of = of or WholeBatch(len(batch), int((~batch.is_pad).sum()))
         shape = (of.frames, samples, *batch.actions.shape[1:])  # (B, K, H, A)
-        # Both are drawn on the CPU, so that they are the same whatever the device, and for the
-        # whole batch, so that they are the same whatever the shares.
+        # Both are drawn on the CPU, so that they do not depend on the device, and for the whole
+        # batch, so that they do not depend on the shares.
         rows = of.share.rows(of.frames)
         times = flow.draw_times(shape[:2], generator)[rows]
         noise = flow.draw_noise(shape, generator)[rows]
@@ -125,11 +125,11 @@ class Policy(nn.Module):
         shown: int | None = None,
         detach: bool = False,
     ) -> Tensor:
-        """What `flow_loss` finds at these flow times [B, K] and noises [B, K, H, A].
+        """The loss of `flow_loss` at these flow times [B, K] and noises [B, K, H, A].
 
         Args:
-            shown: steps of the chunks that are no padding, of the batch that this one is a share
-                of; None: of this one.
+            shown: number of steps in the chunks that are not padding, counted over the batch that
+                this one is a share of; None: over this one.
         """
         device = self.backbone.device
         actions = self.targets(batch)[:, None]  # [B, 1, H, A]
@@ -137,8 +137,8 @@ class Policy(nn.Module):
         noisy, target = flow.interpolate(actions, noise, times)
         prefix: Sequence[KeyValue] = encoding.keys_values
         if detach:
-            # Keys and values are all that the expert reads of the backbone: without their graph
-            # none of the loss's gradient reaches it.
+            # The expert reads only keys and values of the backbone: if they are detached, no
+            # gradient of the loss reaches it.
             prefix = [KeyValue(key.detach(), value.detach()) for key, value in prefix]
         proprio = self.proprio_scale(send(batch.proprio, device))
         suffix = self.backbone.suffix(encoding, noise.shape[2])
@@ -146,7 +146,7 @@ class Policy(nn.Module):
         return flow.masked_mse(velocity, target, send(batch.is_pad, device), shown)
 
     def fingerprint(self) -> str:
-        """sha256 of all weights, and of what else decides how it acts."""
+        """sha256 of all weights and of the settings that affect how the policy acts."""
         settings = {
             "acts_in": self.acts_in,
             "expert": repr(self.expert.shape),
@@ -169,14 +169,14 @@ class Policy(nn.Module):
             images: the images of B frames.
             instructions: B texts.
             proprio: [B, P] in raw units.
-            generator: draws the noise that the flow begins with, on the CPU.
-            continued: what the chunks continue, in raw units; None: nothing.
+            generator: draws the initial noise of the flow, on the CPU.
+            continued: the actions that the chunks continue, in raw units; None: nothing.
         """
         noise = self.draw_noise(len(images), generator)
         return self.act_from(images, instructions, proprio, noise, continued)
 
     def draw_noise(self, frames: int, generator: torch.Generator) -> Tensor:
-        """The noise [frames, H, A] that the flow begins with, on the CPU."""
+        """The initial noise [frames, H, A] of the flow, on the CPU."""
         size = len(self.action_scale.mean)
         return flow.draw_noise((frames, self.expert.shape.chunk, size), generator)
 
@@ -189,7 +189,7 @@ class Policy(nn.Module):
         noise: Tensor,
         continued: Continued | None = None,
     ) -> Tensor:
-        """What `act` returns for that noise [B, H, A]."""
+        """The result of `act` for this noise [B, H, A]."""
         with autocast(self.backbone.device, self.acts_in):
             return self._acted(images, instructions, proprio, noise, continued)
 
@@ -214,11 +214,11 @@ class Policy(nn.Module):
         field: continuation.Velocity = velocity
         origins = self.origins(proprio)
         if continued is not None:
-            # In the flow's units, which are relative to where the robot is now.
+            # In the flow's units, which are relative to the robot's current positions.
             old = self.action_scale(continued.actions.to(state.device) - origins)
             field = continuation.guided(velocity, Continued(old, continued.delay), noise.shape[1])
         predicted = flow.integrate(field, noise.to(state.device))
-        # `targets` backwards.
+        # The inverse of `targets`.
         return self.action_scale.invert(predicted) + origins
 
     def _velocity(
@@ -226,7 +226,7 @@ class Policy(nn.Module):
     ) -> Tensor:
         """The expert's velocity at noisy chunks [B, K, H, A], in the same shape.
 
-        Positions and actions that the expert has and the robot lacks are 0.
+        Positions and actions that the robot lacks are set to 0.
         """
         shape, actions = self.expert.shape, x.shape[-1]
         wide = nn.functional.pad(x, (0, shape.actions - actions))

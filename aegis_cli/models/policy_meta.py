@@ -1,4 +1,4 @@
-"""What a policy's user has to know beside its weights, as the headers of its files say it."""
+"""What a user of a policy needs besides its weights, as stored in the headers of its files."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES
 
 
 class PolicyMeta(TypedDict, total=False):
-    """What a policy was trained as and on; a key that is not there is not known, or at its default.
+    """How a policy was trained, and on what; a missing key is unknown, or at its default.
 
     Attributes:
-        method: by which it was trained.
-        task: that it was trained on; None for one that is not simulated.
+        method: the method that it was trained with.
+        task: the simulated task that it was trained on; None if it was not simulated.
         replan: how many actions of a chunk are executed.
         ensemble: the decay of its temporal ensemble, if it has one.
         normalization: of positions and actions.
-        relative: for each action the place of the position that it is predicted relative to, or
-            None; not there where all are absolute.
-        only, state, action, rename: what was learned of the demonstrations, as the recipe's section
-            `demos` has it.
+        relative: for each action the index of the position that it is predicted relative to, or
+            None; missing if all are absolute.
+        only, state, action, rename: the part of the demonstrations that was used, as in the
+            recipe's section `demos`.
         action_names, proprio_names: a name for each number.
         fps: frames per second of the demonstrations.
-        action_std: the actions' standard deviations, where one of the policy's scales is another.
-        dataset: the id on the hub of the demonstrations, or the ids of several.
-        base_model: the id on the hub of the model that the backbone began as.
-        began_as: of a run that began with another run's backbone, the name of the model that this
-            one began with, without a folder.
-        cameras: in their order, if they are several, or not the task's own.
-        pictures: (height, width) of what each camera showed, for a backbone that reads pictures of
+        action_std: the actions' standard deviations, if the policy's scales are not these.
+        dataset: the id on the hub of the demonstrations, or the ids of several sets.
+        base_model: the id on the hub of the original model of the backbone.
+        began_as: if the run began with another run's backbone, the name of the model that that run
+            began with, without its folder.
+        cameras: in order, if there are several or they are not the task's own.
+        pictures: (height, width) of each camera's pictures, for a backbone that accepts pictures of
             any size.
-        stored: the type that the backbone's weights came in, if it is not float32.
-        merge: by what rule `aegis merge` has moved the backbone back, and how far.
+        stored: the dtype in which the backbone's weights were stored, if it is not float32.
+        merge: the rule by which `aegis merge` moved the backbone back, and how far.
     """
 
     method: Required[str]
@@ -59,14 +59,13 @@ class PolicyMeta(TypedDict, total=False):
 
 
 def check(meta: PolicyMeta, actions: int, positions: int) -> None:
-    """Check what a file says.
+    """Check the meta of a file.
 
     Args:
-        actions, positions: of how many numbers the policy's are.
+        actions, positions: how many numbers the policy's actions and positions have.
 
     Raises:
-        ValueError: no value where there has to be one, one of another type than its key has, or of
-            another robot.
+        ValueError: a required value is missing, has the wrong type, or belongs to another robot.
     """
     for name in ("method", "task", "replan"):
         if name not in meta:
@@ -76,7 +75,7 @@ def check(meta: PolicyMeta, actions: int, positions: int) -> None:
 
 
 def _check_types(meta: PolicyMeta) -> None:
-    """Raise ValueError unless what a policy's user has to know is of the types that they read."""
+    """Raise ValueError if a value has another type than its key requires."""
     kinds = {"method": str, "task": str | None, "replan": int}
     kinds |= dict.fromkeys(("normalization", "only", "began_as"), str)
     for name, kind in kinds.items():
@@ -96,7 +95,7 @@ def _check_types(meta: PolicyMeta) -> None:
 
 
 def check_view(meta: PolicyMeta) -> None:
-    """Raise ValueError unless cameras, picture sizes and new names are such, if there are any."""
+    """Raise ValueError unless cameras, picture sizes and renamings are valid, if present."""
     if not all(isinstance(camera, str) for camera in meta.get("cameras", [])):
         raise ValueError(f"'cameras' is {meta['cameras']!r}")
     for size in meta.get("pictures", []):
@@ -107,9 +106,9 @@ def check_view(meta: PolicyMeta) -> None:
 
 
 def check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:
-    """Raise ValueError unless names, spread and rate, where there are any, are of such a robot.
+    """Raise ValueError unless names, spread and rate, if present, fit a robot of these sizes.
 
-    Checkpoints that were written before these were kept have none of them.
+    Older checkpoints have none of them.
     """
     for key, count in (("action_names", actions), ("proprio_names", positions)):
         names = meta.get(key)

@@ -1,4 +1,4 @@
-"""What any model is made of: transformer layers, parameter groups, and maps with inputs."""
+"""The structure of any model: transformer layers, parameter groups, and maps with inputs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from aegis_cli.models.wrappers import PlainNames, plain_names
 
 
 def names(given: str | Sequence[str]) -> tuple[str, ...]:
-    """The names in what a user gave: one dotted name, or several."""
+    """The names that a user gave, as one dotted name or as several."""
     return (given,) if isinstance(given, str) else tuple(given)
 
 
 def plain_parts(model: nn.Module, given: str | Sequence[str]) -> tuple[str, ...]:
-    """Their plain names, whether they were given with the names of wrappers or without."""
+    """The plain names of parts that were given with or without the names of wrappers."""
     return tuple(map(plain_names(model), names(given)))
 
 
 def part_of(model: nn.Module, name: str | None) -> nn.Module:
-    """The part of this dotted name, without wrappers around it; None: the model itself.
+    """The part of this dotted name, without wrappers around it; for None the model itself.
 
     Raises:
-        AegisError: no such part, or no model.
+        AegisError: there is no such part, or this is no model.
     """
     if not isinstance(model, nn.Module):
         raise AegisError(
@@ -56,10 +56,10 @@ def part_of(model: nn.Module, name: str | None) -> nn.Module:
 
 
 def refuse_offloaded(model: nn.Module) -> None:
-    """Refuse weights that are fetched only for the moment in which a layer is called.
+    """Refuse weights that are only loaded while their layer is called.
 
     Raises:
-        AegisError: there are some, as `device_map` leaves what no device has room for.
+        AegisError: there are some, as `device_map` leaves weights that fit on no device.
     """
     away = [name for name, parameter in model.named_parameters() if parameter.is_meta]
     if away:
@@ -82,14 +82,14 @@ def compiled(model: nn.Module) -> list[str]:
 
 
 def fingerprint(model: nn.Module, adapters: bool = False, within: str = "") -> str:
-    """sha256 of the weights; for an embedded VLM the same as its own method gives.
+    """sha256 of the weights; for an embedded VLM the same as from its own method.
 
-    Wrappers around the model or its parts do not show in it. Neither do adapters that change
-    nothing, as a fresh LoRA.
+    Wrappers around the model or its parts do not affect it. Neither do adapters that change
+    nothing, such as a fresh LoRA.
 
     Args:
         adapters: whether adapters count even then.
-        within: what stands before each name, as where the model is a part of another: `vlm.`.
+        within: a prefix of each name, such as `vlm.` for a model that is part of another.
     """
     plain = plain_names(model)
     left_out: set[str] = set()
@@ -109,12 +109,12 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
     """The transformer layers in order, by their dotted names in the model.
 
     Args:
-        layers: dotted name of their list, with the names of wrappers or without, or the modules
+        layers: dotted name of their list, with or without the names of wrappers, or the modules
             themselves; None: the model's only list of equal blocks.
 
     Raises:
-        AegisError: no such list or none at all, more than one that it could be, or a module that is
-            not the model's.
+        AegisError: there is no such list or none at all, several lists are possible, or a module is
+            not part of the model.
     """
     candidates = _block_lists(model)
     if layers is None:
@@ -145,7 +145,7 @@ def find_layers(model: nn.Module, layers: str | Sequence[nn.Module] | None) -> d
 
 
 def around_blocks(model: nn.Module) -> list[str]:
-    """Plain names of the parts that lists of blocks lie in, the outer ones first."""
+    """Plain names of the parts that contain lists of blocks, the outer ones first."""
     found = dict[str, None]()
     for name in _block_lists(model):
         words = name.split(".")[:-1]
@@ -154,7 +154,7 @@ def around_blocks(model: nn.Module) -> list[str]:
 
 
 def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
-    """Lists of two or more blocks of one type, each made of parts, by their plain names.
+    """Lists of two or more blocks of one type, which have submodules, by plain name.
 
     Lists inside the blocks of another list do not count.
     """
@@ -169,7 +169,7 @@ def _block_lists(model: nn.Module) -> dict[str, nn.ModuleList]:
 
 
 def _are_blocks(modules: nn.ModuleList) -> bool:
-    """Whether there are several modules of one type, made of parts, with parameters."""
+    """Whether these are several modules of one type, with submodules and parameters."""
     blocks = [wrappers.unwrapped(module) for module in modules]
     if len(blocks) < 2 or len({type(block) for block in blocks}) != 1:
         return False
@@ -214,22 +214,24 @@ def parameter_groups(
 ) -> dict[str, list[nn.Parameter]]:
     """Every parameter in exactly one group.
 
-    Each layer has the group `layers.{i}`. Outside the layers, all tables together are the group
-    `embeddings`, and each largest part without a layer in it is a group by its dotted name. A
-    parameter that several parts share belongs to the first of them.
+    Each layer is the group `layers.{i}`. Outside the layers, all embedding tables together are the
+    group `embeddings`, and each largest part that contains no layer is a group named by its dotted
+    name. A parameter that several parts share belongs to the first of them.
     """
     inside = [(f"layers.{i}", layer.parameters()) for i, layer in enumerate(layers.values())]
-    # A module around a layer is no part of its own: the walk goes on below it.
+    # A module around a layer is no group of its own: the walk continues below it.
     ancestors = {id(module) for name in layers for module in _path(model, name)}
     plain = plain_names(model)
     outside = _outside("", model, ancestors, {id(layer) for layer in layers.values()}, plain)
     groups: dict[str, list[nn.Parameter]] = {}
     seen: set[int] = set()
-    # The layers come first, so that what one shares with a part outside belongs to the layer.
+    # The layers come first, so parameters that a layer shares with a part outside belong to the
+    # layer.
     for name, parameters in [*inside, *outside]:
         fresh = {id(p): p for p in parameters if id(p) not in seen}
         seen |= fresh.keys()
-        # A layer keeps its group even if all of it belongs to an earlier one: groups are counted.
+        # A layer keeps its group even if all its parameters belong to earlier ones: layer groups
+        # are counted.
         if fresh or name.startswith("layers."):
             groups.setdefault(name, []).extend(fresh.values())
     return groups
@@ -238,12 +240,12 @@ def parameter_groups(
 def learning_groups(
     model: nn.Module, layers: Mapping[str, nn.Module]
 ) -> dict[str, list[nn.Parameter]]:
-    """What learns of each of `parameter_groups`, without the groups of which nothing does."""
+    """The trainable parameters of each of `parameter_groups`, without groups that have none."""
     return what_learns(parameter_groups(model, layers))
 
 
 def what_learns(groups: Mapping[str, Sequence[nn.Parameter]]) -> dict[str, list[nn.Parameter]]:
-    """What learns of each group, without the groups of which nothing does."""
+    """The trainable parameters of each group, without groups that have none."""
     found = {}
     for name, group in groups.items():
         if learning := [p for p in group if p.requires_grad]:
@@ -252,7 +254,7 @@ def what_learns(groups: Mapping[str, Sequence[nn.Parameter]]) -> dict[str, list[
 
 
 def _path(model: nn.Module, name: str) -> Iterator[nn.Module]:
-    """The modules around the module of this name, beginning with the model."""
+    """The modules around the module of this name, starting with the model."""
     parts = name.split(".")
     for i in range(len(parts)):
         yield model.get_submodule(".".join(parts[:i]))
@@ -263,11 +265,11 @@ def _outside(
 ) -> Iterator[tuple[str, Iterator[nn.Parameter]]]:
     if id(module) in layers:
         return
-    if id(module) not in ancestors:  # no layer in it: the whole part is one group
+    if id(module) not in ancestors:  # contains no layer: the whole part is one group
         group = "embeddings" if isinstance(module, nn.Embedding) else plain(name)
         yield group, module.parameters()
         return
-    # What lies around layers is a group of what it owns itself, and its parts are looked at.
+    # A part that contains layers is a group of its direct parameters; its children are visited.
     yield plain(name) or "model", module.parameters(recurse=False)
     for child, part in module.named_children():
         yield from _outside(f"{name}.{child}" if name else child, part, ancestors, layers, plain)
@@ -278,12 +280,12 @@ def _outside(
 
 @dataclass(frozen=True)
 class Maps:
-    """The modules that own parameters, by what can be measured at them.
+    """The modules that own parameters, by what can be measured on them.
 
     Attributes:
         kinds: the kind (maps, norms, embeddings or stem) of each module whose inputs can be
-            measured; lone rows stand there by their own names.
-        twins: for a module that has exactly the parameters of one in `kinds`, the name of that one.
+            measured; lone rows are listed under their own names.
+        twins: for a module with exactly the parameters of one in `kinds`, the name of that one.
         heads: for a table in `kinds`, the linear map without bias that scores against its rows.
         unknown: for every other module with parameters, why it cannot be measured.
     """
@@ -295,13 +297,13 @@ class Maps:
 
 
 def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
-    """Find what can be measured and what cannot; modules in parts of `vision` are of kind stem.
+    """Find what can be measured and what cannot; modules in the parts `vision` are of kind stem.
 
     Args:
         vision: their plain names.
 
     Raises:
-        AegisError: a part of `vision` that the model does not have.
+        AegisError: the model does not have one of the parts `vision`.
     """
     plain = plain_names(model)
     known = {plain(name) for name, _ in model.named_modules()}
@@ -314,7 +316,7 @@ def find_maps(model: nn.Module, vision: Sequence[str]) -> Maps:
     maps = Maps({}, {}, {}, {})
     first: dict[int, str] = {}  # the first owner of each parameter
     modules = owning(model).items()
-    # Tables come first, so that a head finds its table.
+    # Embedding tables come first, so that a head finds its table.
     for name, module in sorted(modules, key=lambda item: not isinstance(item[1], nn.Embedding)):
         own = [id(parameter) for parameter in module.parameters(recurse=False)]
         shared = next((first[parameter] for parameter in own if parameter in first), None)
@@ -357,14 +359,14 @@ def owners(model: nn.Module) -> dict[int, list[str]]:
 
 
 def under(name: str, parts: Sequence[str]) -> bool:
-    """Whether a module lies in one of these parts of the model, by their plain names."""
+    """Whether a module lies in one of these parts of the model, by plain names."""
     return any(f"{name}.".startswith(f"{part}.") for part in parts)
 
 
 def _note_shared(maps: Maps, model: nn.Module, name: str, module: nn.Module, owner: str) -> None:
     other = model.get_submodule(owner)
     alike = type(module) is type(other) and _same(module, other)
-    # A tied head scores what it reads against the table's rows; a bias would be its own.
+    # A tied head scores its input against the table's rows; a bias would be its own parameter.
     scores = isinstance(other, nn.Embedding) and type(module) is nn.Linear and module.bias is None
     if owner in maps.kinds and alike:
         maps.twins[name] = owner
@@ -387,11 +389,11 @@ def _problem(module: nn.Module) -> str:
 
 
 def frozen(model: nn.Module, site: str) -> bool:
-    """Whether nothing of a site's own learns.
+    """Whether none of a site's own parameters is trainable.
 
     Raises:
-        AegisError: the site's weight or its bias alone learns; a bias that is held still cannot
-            make up for its weight.
+        AegisError: only the site's weight or only its bias is trainable; a frozen bias cannot
+            compensate for its weight.
     """
     module = attrgetter(site)(model)
     if isinstance(module, Tensor):
@@ -408,7 +410,7 @@ def frozen(model: nn.Module, site: str) -> bool:
 
 
 def averaging(model: nn.Module) -> dict[str, nn.Module]:
-    """The modules by name that keep a running average of what they read, as BatchNorm does."""
+    """The modules, by name, that keep a running average of their inputs, as BatchNorm does."""
     found = {}
     for name, module in model.named_modules():
         kept = getattr(module, "track_running_stats", False)
@@ -426,7 +428,7 @@ def learning(model: nn.Module) -> dict[str, nn.Parameter]:
 
 # --- sites: modules whose inputs say what they do -------------------------------------------------
 
-# What a module does to tokens is linear in its own parameters, so its inputs tell which part of the
+# What a module does to tokens is linear in its own parameters, so its inputs show which part of the
 # module VQA uses.
 SITES: dict[type[nn.Module], str] = {
     nn.Linear: "maps",
@@ -437,12 +439,12 @@ SITES: dict[type[nn.Module], str] = {
 
 @contextlib.contextmanager
 def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Generator[None]:
-    """Let parameters have another type inside the block, and then their own values again.
+    """Give parameters another dtype inside the block, and their own values afterwards.
 
-    They must have no gradient, which is of a parameter's type.
+    They must have no gradients, which have the parameter's dtype.
     """
     own = [p.data for p in parameters]
-    # By `.data`: the parameters stay the same objects, which optimizers and methods hold on to.
+    # Through `.data`: optimizers and methods hold references to the parameter objects.
     for parameter, values in zip(parameters, of_one_type(own, dtype), strict=True):
         parameter.data = values
     try:
@@ -454,7 +456,7 @@ def of_type(parameters: Sequence[nn.Parameter], dtype: torch.dtype) -> Generator
 
 @torch.no_grad()
 def of_one_type(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
-    """Copies in a type, or the tensor itself where it has that; a GPU makes all in few kernels."""
+    """Copies with a dtype, or the tensor itself if it has it; on a GPU in few kernels."""
     found = [t if t.dtype == dtype else torch.empty_like(t, dtype=dtype) for t in tensors]
     changed = [pair for pair in zip(found, tensors, strict=True) if pair[0] is not pair[1]]
     copy_all([copy for copy, _ in changed], [tensor for _, tensor in changed])
@@ -463,21 +465,21 @@ def of_one_type(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
 
 @torch.no_grad()
 def copy_all(into: Sequence[Tensor], tensors: Sequence[Tensor]) -> None:
-    """Copy tensors into others, in few kernels where a GPU would else start one for each."""
+    """Copy tensors into others, on a GPU in few kernels instead of one for each."""
     if tensors:
         torch._foreach_copy_([rows_here(t) for t in into], [rows_here(t) for t in tensors])
 
 
 def widest(parameters: Iterable[Tensor]) -> torch.dtype:
-    """The type that holds the values of all of them."""
+    """The dtype that can hold the values of all of them."""
     return reduce(torch.promote_types, {p.dtype for p in parameters})
 
 
 def digest(state: Mapping[str, Tensor]) -> str:
     """sha256 of weights: names, shapes and values in float32."""
     found = hashlib.sha256()
-    # Sorted by name and widened, so that neither the order of the parts nor a narrower type of the
-    # same values makes another digest.
+    # Sorted by name and widened, so the digest depends neither on the order of the parts nor on a
+    # narrower dtype of the same values.
     for name, tensor in sorted(state.items()):
         values = whole(tensor.detach()).float().cpu().contiguous()
         found.update(f"{name} {tuple(tensor.shape)}".encode())
@@ -486,7 +488,7 @@ def digest(state: Mapping[str, Tensor]) -> str:
 
 
 def outermost_lists(module: nn.Module) -> list[nn.ModuleList]:
-    """The lists of modules that lie in no other list, such as a transformer's layers."""
+    """The lists of modules that are inside no other list, such as a transformer's layers."""
     if isinstance(module, nn.ModuleList):
         return [module]
     return [found for child in module.children() for found in outermost_lists(child)]
@@ -508,11 +510,11 @@ def owning_modules(model: nn.Module) -> dict[str, nn.Module]:
 
 
 def lone_rows(name: str, module: nn.Module) -> list[str]:
-    """Names of the lone rows of a module that is made of others and owns nothing else itself.
+    """Names of the lone rows of a module that has submodules and owns nothing else itself.
 
-    No input says what such a row does. It is the same for every question, so to hold it still keeps
-    all that depends on it. A row that scales something is thereby protected more than it has to be,
-    never less. A table of rows [1, N, D], as of positions, is held still as a whole.
+    No input shows what such a row does. It is the same for every question, so freezing it keeps all
+    that depends on it. A row that scales something is thereby protected more than necessary, never
+    less. A table of rows [1, N, D], such as of positions, is frozen as a whole.
     """
     own = dict(module.named_parameters(recurse=False))
     made_of_others = next(module.children(), None) is not None
@@ -524,10 +526,10 @@ def lone_rows(name: str, module: nn.Module) -> list[str]:
 def _is_same_for_all(parameter: nn.Parameter) -> bool:
     """Whether it is a row, or a table that is added to the tokens of every image of a batch.
 
-    A row has all its entries along one dimension, and such a table is a batch of one.
+    A row has all its entries along one dimension; such a table has a leading dimension of 1.
     """
     shape = parameter.shape
-    is_row = parameter.numel() == max(shape, default=1)  # a number by itself too
+    is_row = parameter.numel() == max(shape, default=1)  # includes a scalar
     is_table_for_all = len(shape) == 3 and shape[0] == 1
     return is_row or is_table_for_all
 
@@ -535,31 +537,31 @@ def _is_same_for_all(parameter: nn.Parameter) -> bool:
 def site_kind(module: nn.Module) -> str | None:
     """The kind of a site: maps, norms or embeddings.
 
-    None stands for a module whose inputs do not say what it does to tokens.
+    None for a module whose inputs do not show what it does to tokens.
     """
     if isinstance(module, nn.Conv2d | nn.Conv3d):
         plain = module.groups == 1 and module.padding_mode == "zeros" and module.padding != "same"
-        return "maps" if plain else None  # else what it reads is not the unfolded patch
+        return "maps" if plain else None  # otherwise its input is not the unfolded patch
     if type(module) in SITES:
         return SITES[type(module)]
-    if isinstance(module, nn.Embedding):  # some scale the row they look up: still linear in it
+    if isinstance(module, nn.Embedding):  # subclasses may scale the row: still linear in it
         return "embeddings"
     return "norms" if is_rms_norm(module) else None
 
 
 @torch.no_grad()
 def is_rms_norm(module: nn.Module) -> bool:
-    """Whether all the module does is to scale x / rms(x) by its weight, or by 1 + its weight."""
+    """Whether the module only scales x / rms(x) by its weight, or by 1 + its weight."""
     parameters = dict(module.named_parameters())
     if parameters.keys() != {"weight"} or rms_epsilon(module, torch.float32) is None:
         return False
     if parameters["weight"].ndim != 1:
         return False
     weight = whole(parameters["weight"])
-    # Every family has a class of its own for it, so what the module does decides, not its type.
-    # The test row has a mean that is not 0: a layer norm would take it away.
+    # Every family has its own class for it, so the module's output decides, not its type. The test
+    # row has a non-zero mean, which a layer norm would remove.
     x = torch.linspace(-1, 2, len(weight), dtype=weight.dtype, device=weight.device)[None]
-    # Where the weight is sharded, the module by itself has only some of it.
+    # If the weight is sharded, the module itself holds only part of it.
     found = functional_call(module, {"weight": weight}, (x,)).float()
     normed = rms_normed(module, x).float()
     # Gemma scales by 1 + its weight. The tolerance is wide enough for a module in bfloat16.
@@ -570,10 +572,10 @@ def is_rms_norm(module: nn.Module) -> bool:
 
 
 def rms_epsilon(module: nn.Module, dtype: torch.dtype) -> float | None:
-    """The epsilon under its root, if it names one.
+    """The epsilon under the module's root, if it has one.
 
     Args:
-        dtype: of its arithmetic, whose smallest step is the epsilon of PyTorch's by default.
+        dtype: of its arithmetic, whose machine epsilon is the default of PyTorch's RMSNorm.
     """
     if isinstance(module, nn.RMSNorm) and module.eps is None:
         return torch.finfo(dtype).eps

@@ -1,8 +1,8 @@
-"""What others put around a model and its parts: DistributedDataParallel, FSDP, PEFT, torch.compile.
+"""Wrappers around a model and its parts: DistributedDataParallel, FSDP, PEFT, torch.compile.
 
-A wrapper holds the wrapped module under a name of its own. Users, anchors and ledgers call a part
-by its plain name, the one that it has without wrappers. Wrappers are known by their classes and
-never by the names alone, since a model may call a part of its own `module`.
+A wrapper holds the wrapped module under an additional name. Users, anchors and ledgers refer to a
+part by its plain name, the one that it has without wrappers. Wrappers are recognized by class,
+never by the name alone, since a model may call one of its own parts `module`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 PlainNames = Callable[[str], str]
 
-# The class of each wrapper -> the name under which it holds what it wraps. They are told by their
-# dotted names, so that none of their packages has to be installed.
+# The class of each wrapper -> the name under which it holds the wrapped module. Classes are given
+# by dotted names, so that their packages need not be installed.
 _HOLDS = {
     "torch._dynamo.eval_frame.OptimizedModule": "_orig_mod",
     "torch.nn.parallel.distributed.DistributedDataParallel": "module",
@@ -32,12 +32,12 @@ _HOLDS = {
     "peft.tuners.tuners_utils.BaseTunerLayer": "base_layer",
     "peft.utils.other.AuxiliaryTrainingWrapper": "original_module",
 }
-# Those that hold weights of their own beside what they wrap.
+# Those with their own weights beside the wrapped module.
 _ADAPTERS = {"base_layer", "original_module"}
 
 
 def _held(module: nn.Module) -> str | None:
-    """The name under which a wrapper holds what it wraps; None for any other module."""
+    """The name under which a wrapper holds the wrapped module; None for any other module."""
     for kind in type(module).__mro__:
         name = _HOLDS.get(f"{kind.__module__}.{kind.__qualname__}")
         if name is not None and isinstance(getattr(module, name, None), nn.Module):
@@ -53,12 +53,12 @@ def unwrapped(module: nn.Module) -> nn.Module:
 
 
 def plain_names(model: nn.Module) -> PlainNames:
-    """A function that takes the name of a part or parameter and gives it without wrappers.
+    """A function that removes wrappers from the name of a part or parameter.
 
-    What does not begin with the name of a module stays as it is.
+    A name that does not begin with the name of a module is returned unchanged.
     """
     table = {"": ""}
-    # `named_modules` gives a module before what it holds, whose own name builds on it.
+    # `named_modules` yields a module before its children, whose names build on its own.
     for name, module in model.named_modules():
         held = _held(module)
         for child, _ in module.named_children():
@@ -66,8 +66,8 @@ def plain_names(model: nn.Module) -> PlainNames:
             table[_joined(name, child)] = plain
 
     def plain(name: str) -> str:
-        # The longest beginning that names a module; what follows it, as `weight`, stays. The empty
-        # name is in the table, so that this ends.
+        # The longest prefix that names a module; the rest, such as `weight`, is kept. The loop
+        # ends, since the empty name is in the table.
         known, rest = name, ""
         while known not in table:
             known, _, last = known.rpartition(".")
@@ -86,7 +86,7 @@ def innermost(model: nn.Module, name: str) -> nn.Module | None:
     plain = plain_names(model)
     modules = dict(model.named_modules())
     wanted = plain(name) if name in modules else name
-    # A wrapper has the plain name of what it holds, and comes before it.
+    # A wrapper has the same plain name as the module it holds, and comes before it.
     found = [module for known, module in modules.items() if plain(known) == wanted]
     return found[-1] if found else None
 
@@ -95,17 +95,17 @@ def innermost(model: nn.Module, name: str) -> nn.Module | None:
 
 
 def adapted(model: nn.Module) -> dict[str, nn.Module]:
-    """The modules of PEFT that hold adapters, by name."""
+    """The PEFT modules that hold adapters, by name."""
     return {name: m for name, m in model.named_modules() if _held(m) in _ADAPTERS}
 
 
 def adapter_weights(model: nn.Module) -> set[str]:
-    """Names of the state that belongs to adapters and not to what they adapt."""
+    """Names of the state entries that belong to adapters, not to the modules they adapt."""
     held = {name: _held(module) for name, module in adapted(model).items()}
     found = set()
     for name in model.state_dict():
         parts = name.split(".")
-        # Below a module that adapts, whatever is not in what it adapts is its own.
+        # Below an adapting module, everything outside the adapted module is the adapter's.
         for i, part in enumerate(parts):
             outer = ".".join(parts[:i])
             if outer in held and part != held[outer]:
@@ -115,20 +115,20 @@ def adapter_weights(model: nn.Module) -> set[str]:
 
 @torch.no_grad()
 def adapters_are_idle(model: nn.Module) -> bool:
-    """Whether the model does what it would do without its adapters.
+    """Whether the model behaves as it would without its adapters.
 
-    A fresh LoRA is idle, because its second factor is zero. An adapter that cannot say what it adds
-    to the weights counts as one that changes something.
+    A fresh LoRA is idle, because its second factor is zero. An adapter that cannot report what it
+    adds to the weights counts as one that changes something.
     """
     return all(_is_idle(module) for module in adapted(model).values())
 
 
 class _Adapting(Protocol):
-    """A layer that can say what its adapters add to the weights.
+    """A layer that can report what its adapters add to the weights.
 
     Attributes:
         active_adapters: their names.
-        adapter_layer_names: its attributes that hold weights by the adapters' names.
+        adapter_layer_names: the names of its attributes that hold weights by adapter name.
     """
 
     @property
@@ -142,7 +142,7 @@ class _Adapting(Protocol):
 
 def _is_idle(module: nn.Module) -> bool:
     if _held(module) == "original_module":
-        # `map` ends with the copies; of originals there is no end.
+        # `map` ends with the copies; the iterator of originals is endless.
         return all(map(_equal_weights, _copies(module), _originals(module)))
     if not _says(module):
         return False
@@ -155,13 +155,13 @@ def _says(module: nn.Module) -> TypeGuard[_Adapting]:
 
 
 def _known_adapters(layer: _Adapting) -> set[str]:
-    """The adapters that a layer has weights of; others may be active elsewhere in the model."""
+    """The adapters that this layer has weights for; others may be active elsewhere in the model."""
     parts = [getattr(layer, name) for name in layer.adapter_layer_names]
     return {key for part in parts for key in part}
 
 
 def _copies(wrapper: nn.Module) -> Iterator[nn.Module]:
-    """What learns in the place of a module that is to be saved with the adapters."""
+    """The trainable copies of a module that is saved with the adapters."""
     for name, part in wrapper.named_children():
         if name != "original_module":
             yield from part.children()

@@ -1,4 +1,4 @@
-"""`aegis pretrain` of the embedded dual encoder: a contrastive loss on pictures and captions."""
+"""`aegis pretrain` for the embedded dual encoder: a contrastive loss on pictures and captions."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from aegis_cli.pretraining import loop
 from aegis_cli.recipes import DualRecipe, digest
 from aegis_cli.training.schedule import BatchOrder
 
-VALIDATION_PICTURES = 1000  # held out, of the corpus's own kinds, for the retrieval figures
+VALIDATION_PICTURES = 1000  # held-out pictures of the corpus's own kinds, for retrieval figures
 
 
 @dataclass(frozen=True)
 class DualReport:
-    """What came out; all shares in [0, 1].
+    """The result; all fractions are in [0, 1].
 
     Attributes:
         zero_shot: accuracy on the validation part of each stream task, by name.
-        accuracy: the mean of these.
-        image_to_text: share of held-out pictures whose nearest caption of all is true.
-        text_to_image: share of captions that are true of their nearest picture, among those that
-            are true of a held-out picture.
+        accuracy: mean of these accuracies.
+        image_to_text: fraction of held-out pictures whose nearest caption is true.
+        text_to_image: fraction of captions that are true of their nearest picture, among those that
+            are true of any held-out picture.
     """
 
     zero_shot: dict[str, float]
@@ -46,7 +46,7 @@ class DualReport:
 
 @dataclass
 class _DualPretraining:
-    """Everything the loop needs, built once."""
+    """Everything that the loop needs, built once."""
 
     recipe: DualRecipe
     model: EmbeddedDual
@@ -67,7 +67,7 @@ def run(
     """Train on `recipe.pictures` pictures, write `out/model.safetensors` with its provenance.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another
+        AegisError: `out` holds an earlier run and `resume` is off, or its state belongs to another
             recipe.
     """
     out = Path(out)
@@ -88,7 +88,7 @@ def _build(recipe: DualRecipe, on_event: OnEvent) -> _DualPretraining:
     texts = [opening + text for opening in corpus.OPENINGS for text in said.texts]
     ids = model.ids(texts).view(len(corpus.OPENINGS), len(said.texts), -1)
     order = BatchOrder(recipe.pictures, recipe.batch_size, recipe.seed)
-    # Muon is for matrices between hidden states; embeddings and the stem are none.
+    # Muon is for matrices between hidden states, which embeddings and the stem are not.
     inside = [*model.image.layers.parameters(), *model.text.layers.parameters()]
     matrices = [parameter for parameter in inside if parameter.ndim == 2]
     optimizers = loop.optimizers(matrices, list(model.parameters()), recipe)
@@ -100,14 +100,14 @@ def _loss_of(run: _DualPretraining, step: int) -> Tensor:
 
 
 def _loss(run: _DualPretraining, rows: np.ndarray, rng: np.random.Generator) -> Tensor:
-    """The loss of one batch, with one caption drawn for each picture.
+    """The loss of one batch, with one random caption for each picture.
 
-    Each of the captions is compared with every picture of the batch.
+    Each caption is compared with every picture in the batch.
     """
     model, facts = run.model, run.pictures.facts[rows]
     true = corpus.true_of(run.says, facts)  # [B, captions]
     drawn = np.array([rng.choice(np.flatnonzero(row)) for row in true])
-    # A caption that was drawn for several pictures is one column, with several positives.
+    # A caption that was drawn for several pictures is one column with several positives.
     chosen = np.unique(drawn)
     openings = rng.integers(len(run.ids), size=len(chosen))
     ids = run.ids[openings, chosen]  # [N, words]
@@ -120,11 +120,11 @@ def _loss(run: _DualPretraining, rows: np.ndarray, rng: np.random.Generator) -> 
 
 
 def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
-    """CLIP's symmetric loss (arXiv 2103.00020), where several captions may be true of a picture.
+    """CLIP's symmetric loss (arXiv 2103.00020) with possibly several true captions per picture.
 
-    A caption may also be true of several pictures. The target of a row, or column, is uniform over
-    its positives, as in UniCL (arXiv 2204.03610), so a true caption is no negative, though it was
-    written for another picture of the batch.
+    A caption may also be true of several pictures. The target of a row or column is uniform over
+    its positives, as in UniCL (arXiv 2204.03610), so a true caption is never a negative, even if it
+    was drawn for another picture in the batch.
 
     Args:
         logits: [B, N], scaled cosines of pictures and captions.
@@ -137,7 +137,7 @@ def contrastive(logits: Tensor, positive: Tensor) -> Tensor:
 
 
 def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
-    """Round the weights to what ships, measure those, write them with their provenance."""
+    """Round the weights to the shipped precision, measure them, write them with provenance."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
     found: dict[str, float] = {}
@@ -161,10 +161,10 @@ def _finish(run: _DualPretraining, out: Path, on_event: OnEvent) -> DualReport:
 
 @torch.inference_mode()
 def _retrieval(run: _DualPretraining, on_event: OnEvent) -> tuple[float, float]:
-    """Shares of true answers in retrieval, from pictures to captions and back.
+    """Fractions of correct retrievals, from pictures to captions and back.
 
-    The answer is the nearest caption of each held-out picture, and the nearest picture of each
-    caption that is true of one.
+    Retrieved are the nearest caption of each held-out picture, and the nearest picture of each
+    caption that is true of any.
     """
     pictures = corpus.render(run.recipe.seed, VALIDATION_PICTURES, "validation", on_event)
     model, true = run.model, torch.from_numpy(corpus.true_of(run.says, pictures.facts))
@@ -174,7 +174,7 @@ def _retrieval(run: _DualPretraining, on_event: OnEvent) -> tuple[float, float]:
     cosines = (images @ captions.T).cpu()  # [pictures, captions]
     nearest_caption = cosines.argmax(1, keepdim=True)
     nearest_picture = cosines.argmax(0, keepdim=True)
-    asked = true.any(0)  # a caption that is true of no picture has no right answer
+    asked = true.any(0)  # a caption that is true of no picture has no correct answer
     to_text = true.gather(1, nearest_caption).float().mean()
     to_image = true.gather(0, nearest_picture)[0, asked].float().mean()
     return float(to_text), float(to_image)

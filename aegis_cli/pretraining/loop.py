@@ -1,4 +1,4 @@
-"""What both pre-trainings have in common: two optimizers, a resumable loop, and one state file."""
+"""The common parts of both pre-trainings: two optimizers, a resumable loop, and one state file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CLIP_NORM = 1.0
 class Pretraining(Protocol):
     """One run of pre-training.
 
-    `parameters` are all that learn, also those that are no part of the finished model.
+    `parameters` are all trainable ones, including those that are not part of the finished model.
     """
 
     optimizers: list[torch.optim.Optimizer]
@@ -43,11 +43,11 @@ class Pretraining(Protocol):
 
 
 def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
-    """Make the folder, and return the path where the state is, or will be.
+    """Create the folder, and return the path where the state is or will be.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, its state is of another recipe,
-            or it holds a finished model without a state to go on from.
+        AegisError: `out` holds an earlier run and `resume` is off, its state belongs to another
+            recipe, or it holds a finished model without a state to resume from.
     """
     path = out / STATE
     if not path.exists() and (out / "model.safetensors").exists():
@@ -67,9 +67,9 @@ def begin(recipe: PretrainRecipe | DualRecipe, out: Path, resume: bool) -> Path:
 
 
 def _check_same(recipe: PretrainRecipe | DualRecipe, path: Path) -> None:
-    """Raise AegisError unless the state in `path` is of this recipe.
+    """Raise AegisError unless the state in `path` belongs to this recipe.
 
-    A state of an earlier version does not tell its recipe.
+    A state of an earlier version does not contain its recipe.
     """
     saved = artifacts.read_header(path, "training-state")
     if saved.inputs.get("recipe") == digest(recipe):
@@ -88,14 +88,14 @@ def optimizers(
     parameters: Sequence[nn.Parameter],
     recipe: PretrainRecipe | DualRecipe,
 ) -> list[torch.optim.Optimizer]:
-    """Muon for the layers' matrices, AdamW for the rest.
+    """Muon for the matrices of the layers, AdamW for the rest.
 
-    It takes fewer steps to the same accuracy than AdamW alone.
+    They reach the same accuracy in fewer steps than AdamW alone.
     """
     inside = {id(p) for p in matrices}
     rest = [p for p in parameters if id(p) not in inside]
     decay = recipe.weight_decay
-    # `match_rms_adamw` scales Muon's update to the size of AdamW's, so that one rate serves both.
+    # `match_rms_adamw` scales Muon's updates to the size of AdamW's, so one rate suits both.
     return [
         torch.optim.Muon(
             matrices, lr=recipe.lr, weight_decay=decay, adjust_lr_fn="match_rms_adamw"
@@ -113,14 +113,14 @@ def train(
     on_event: OnEvent,
     validate: Callable[[], dict[str, float]] = dict,
 ) -> None:
-    """Take all steps after those of the state in `path`, if there is one.
+    """Take all remaining steps, after those of the state in `path` if there is one.
 
     Args:
-        loss: gives the loss of a step by its number, with its graph.
-        validate: gives what to show beside the loss at every checkpoint.
+        loss: returns the loss of a step, given its number, with its graph.
+        validate: returns the metrics to show beside the loss at every checkpoint.
 
     Raises:
-        AegisError: a state that is damaged or not of this model, or a loss that is not finite.
+        AegisError: the state is damaged or not of this model, or a loss is not finite.
         KeyboardInterrupt: a signal has come, and the steps up to it are saved.
     """
     recipe = run.recipe
@@ -147,7 +147,7 @@ def train(
 
 
 def _restore(run: Pretraining, path: Path) -> int:
-    """Put the state in `path` back; returns how many steps it has behind it."""
+    """Restore the state in `path`; returns the number of steps that it has completed."""
     saved = artifacts.load(path, "training-state")
     with reading_meta(path):
         done = int(saved.header.meta["step"])
@@ -174,7 +174,7 @@ def _save(run: Pretraining, path: Path, steps: int) -> None:
 
 
 def save(model: EmbeddedModel, out: Path, provenance: Mapping[str, object]) -> Path:
-    """Write the finished model in bfloat16, which its weights have been rounded to."""
+    """Write the finished model in bfloat16, to which its weights have been rounded."""
     target = out / "model.safetensors"
     embedded_file.save(model, target, torch.bfloat16, provenance)
     return target
@@ -185,16 +185,16 @@ def _step(run: Pretraining, loss: Tensor, step: int) -> float:
     for optimizer in run.optimizers:
         optimizer.zero_grad()
     loss.backward()
-    # Not of the cell head, which is left behind in the end: the models that ship were made so.
+    # Without the cell head, which is dropped in the end: the shipped models were trained this way.
     norm = nn.utils.clip_grad_norm_(run.model.parameters(), CLIP_NORM)
-    _check_finite("gradient norm", norm, step)  # clipped by it, all weights would be NaN
+    _check_finite("gradient norm", norm, step)  # otherwise clipping would make all weights NaN
     for optimizer in run.optimizers:
         optimizer.step()
     return loss.item()
 
 
 def _check_finite(name: str, value: Tensor, step: int) -> None:
-    """Raise AegisError for a figure of a step that is not finite."""
+    """Raise AegisError for a value of a step that is not finite."""
     if not torch.isfinite(value):
         raise AegisError(
             f"{name} {value.item()} at step {step}",

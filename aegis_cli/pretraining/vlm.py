@@ -1,4 +1,4 @@
-"""`aegis pretrain`: an embedded VLM, from nothing, on rendered scenes, and easy-VQA if wished."""
+"""`aegis pretrain`: an embedded VLM from scratch, on rendered scenes and optionally easy-VQA."""
 
 from __future__ import annotations
 
@@ -31,26 +31,27 @@ from aegis_cli.training.schedule import BatchOrder
 
 BLOCKS = sum(TRAINING_MIX.values())
 BLOCK_TOKENS = 16
-# The shorter half of an image's questions runs apart from the longer, so that little padding is
-# computed.
+# The shorter half of an image's questions runs separately from the longer half, which saves
+# padding.
 SHARES = (slice(0, BLOCKS // 2), slice(BLOCKS // 2, BLOCKS))
 EVALUATION_BATCH = 200
 VALIDATION_QUESTIONS = 700
-# Besides the answers, the middle layer's image tokens learn what stands in their cell (detection
-# pre-training). Without it, the model needs a thousand steps to find out that the picture matters.
-# The head that tells it is no part of the model.
+# Besides the answers, the image tokens of the middle layer learn what is in their cell (detection
+# pre-training). Otherwise the model needs a thousand steps to discover that the picture matters.
+# The head for it is not part of the model.
 CELL_KINDS = 1 + len(COLORS) * len(SHAPES)
 CELL_LOSS = 0.5
 EMPTY_CELL_WEIGHT = 0.1
-# The label of a cell of which nobody knows what stands in it; it adds nothing to the loss.
+# The label of a cell with unknown content; it adds nothing to the loss.
 UNKNOWN_CELL = 255
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How the finished model answers probe questions.
+    """How well the finished model answers probe questions.
 
-    Accuracies are shares in [0, 1], overall and by family; the cross-entropy is in nats per answer.
+    Accuracies are fractions in [0, 1], overall and by family; the cross-entropy is in nats per
+    answer.
     """
 
     accuracy: float
@@ -61,10 +62,10 @@ class Scores:
 
 @dataclass(frozen=True)
 class PretrainReport:
-    """What came out, measured on probe scenes that no training seed touches.
+    """The result, measured on probe scenes that no training seed touches.
 
     Attributes:
-        easy_vqa: the same of easy-VQA's test part; None where the model has not learned it.
+        easy_vqa: the same for the test part of easy-VQA; None if the model was not trained on it.
     """
 
     accuracy: float
@@ -93,7 +94,7 @@ class _VlmPretraining:
     words: tuple[np.ndarray, np.ndarray]
 
     def rows(self, step: int) -> np.ndarray:
-        """The pictures of a step: scenes, then those of easy-VQA, which stand behind all scenes."""
+        """The picture indices of a step: scenes, then easy-VQA, which comes after all scenes."""
         scenes = self.order.rows(step)
         if self.easy_order is None:
             return scenes
@@ -112,7 +113,7 @@ def run(
     """Train on `recipe.scenes` scenes, write `out/model.safetensors` with its provenance.
 
     Raises:
-        AegisError: `out` holds an earlier run and `resume` is off, or its state is of another
+        AegisError: `out` holds an earlier run and `resume` is off, or its state belongs to another
             recipe.
     """
     out = Path(out)
@@ -161,10 +162,10 @@ def _build(recipe: PretrainRecipe, on_event: OnEvent) -> _VlmPretraining:
 
 
 def _begin(recipe: PretrainRecipe) -> EmbeddedVLM:
-    """The model before its first step; words that `recipe.start` does not know are drawn.
+    """The model before its first step; words that `recipe.start` lacks are initialised randomly.
 
     Raises:
-        AegisError: a start that is no embedded VLM, or is one of another shape.
+        AegisError: the start is not an embedded VLM, or has another shape.
     """
     words = (*SPECIAL, *(wide_vocabulary() if recipe.easy_vqa else vocabulary()))
     model = EmbeddedVLM(Shape(recipe.model.width, recipe.model.depth, recipe.model.heads), words)
@@ -188,9 +189,9 @@ def _begin(recipe: PretrainRecipe) -> EmbeddedVLM:
 
 
 def easy_training() -> Rendered:
-    """easy-VQA's pictures for training, whose cells are unknown.
+    """easy-VQA's training pictures, with unknown cells.
 
-    A picture with more questions than a row holds is there several times, each with a part of them.
+    A picture with more questions than fit in a row appears several times, each with a part of them.
 
     Raises:
         AegisError: the package with the questions is missing.
@@ -207,7 +208,7 @@ def easy_training() -> Rendered:
         rows += [image] * parts
         questions += [of_image[part::parts] for part in range(parts)]
     images = asked.images[np.array(rows)]
-    assert isinstance(images, np.ndarray)  # they have been brought to one size
+    assert isinstance(images, np.ndarray)  # all have been resized to one size
     cells = np.full((len(rows), GRID * GRID), UNKNOWN_CELL, np.uint8)
     return Rendered(images, cells, questions)
 
@@ -229,7 +230,7 @@ def _loss_of(run: _VlmPretraining, step: int) -> Tensor:
 def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     """Cross-entropy in nats per token over the answers of all blocks, plus the weighted cell loss.
 
-    The image is passed once for all its blocks.
+    The image is encoded once for all its blocks.
     """
     model = run.model
     images = run.images[rows]
@@ -252,7 +253,7 @@ def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
     weight[0] = EMPTY_CELL_WEIGHT
     answers = torch.stack([total for total, _ in parts]).sum() / sum(count for _, count in parts)
     in_cells = F.cross_entropy(kinds, cells, weight=weight, ignore_index=UNKNOWN_CELL)
-    # A model that begins with learned weights knows already that the picture matters.
+    # A model that starts from learned weights already knows that the picture matters.
     share = CELL_LOSS if run.recipe.start is None else 0.0
     return answers + share * in_cells
 
@@ -260,7 +261,7 @@ def _loss(run: _VlmPretraining, rows: np.ndarray, flip: np.ndarray) -> Tensor:
 def _answer_loss(
     model: EmbeddedVLM, ids: Tensor, prompt_length: Tensor, image: list[KeyValue]
 ) -> tuple[Tensor, int]:
-    """Summed cross-entropy of the answers' tokens in blocks [B, N, S], and their number."""
+    """Summed cross-entropy of the answer tokens in blocks [B, N, S], and their number."""
     hidden, _ = model.text_pass(ids, prompt_length, image)
     following = ids[..., 1:]
     asked = prompt_length.unsqueeze(-1)
@@ -271,7 +272,7 @@ def _answer_loss(
 
 
 def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainReport:
-    """Round the weights to what ships, grade them on probe questions, and write them."""
+    """Round the weights to their shipped precision, grade them on probe questions, write them."""
     recipe, model = run.recipe, run.model.eval()
     model.load_state_dict({name: t.bfloat16().float() for name, t in model.state_dict().items()})
     found = {}
@@ -298,7 +299,7 @@ def _finish(run: _VlmPretraining, out: Path, on_event: OnEvent) -> PretrainRepor
 
 
 def _sets_of(recipe: PretrainRecipe) -> tuple[str, ...]:
-    """The question sets that the model learns."""
+    """The question sets that the model is trained on."""
     return (sets.SCENES, easy.NAME) if recipe.easy_vqa else (sets.SCENES,)
 
 
@@ -316,7 +317,7 @@ def _grade(
     count: int,
     on_event: OnEvent = ignore,
 ) -> list[Graded]:
-    """Up to `count` questions of one part of a set, answered."""
+    """Answers to up to `count` questions of one part of a set, graded."""
     asked = sets.read(name).choose(part, count, seed=0, on_event=on_event)
     with torch.inference_mode(), devices.autocast(model.device, recipe.precision):
         return grade(

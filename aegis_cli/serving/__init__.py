@@ -8,7 +8,7 @@ from aegis_cli.common.errors import AegisError
 
 
 def require() -> None:
-    """Raise AegisError unless what a server needs is installed."""
+    """Raise AegisError unless the packages that a server needs are installed."""
     for package in ("websockets", "msgpack"):
         if find_spec(package) is None:
             raise AegisError(

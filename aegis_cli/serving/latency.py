@@ -14,7 +14,7 @@ from aegis_cli.deploy import DeployedPolicy, load_policy
 from aegis_cli.evaluation.bench_runs import INSTRUCTION
 
 _WARM_UP = 3  # predictions that are not timed: the first ones allocate and compile
-_SIDE = 224  # of the pictures, in pixels, for a backbone that takes any size
+_SIDE = 224  # of the pictures, in pixels, for a backbone that accepts any size
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class LatencyReport:
     """Milliseconds from pictures to actions, one observation at a time.
 
     Attributes:
-        precision: of the matrix products, as `load_policy` has it by itself.
-        p50_ms, p95_ms: half and 95 % of the predictions took at most so long.
-        chunk, replan: actions per prediction, and how many of them are executed.
+        precision: of the matrix products, the default of `load_policy`.
+        p50_ms, p95_ms: the median and the 95 % quantile of the predictions' times.
+        chunk, replan: actions per prediction, and the number of them that is executed.
         actions_per_s: `replan` actions per median prediction; a robot whose motion waits for the
             next prediction gets fewer.
     """
@@ -44,7 +44,7 @@ def run(run_path: Path, repeats: int = 50, on_event: OnEvent = ignore) -> Latenc
     """Time `repeats` predictions of a run's policy, on random pictures.
 
     Raises:
-        AegisError: no such run.
+        AegisError: there is no such run.
     """
     policy = load_policy(run_path)
     taken = 1000 * np.array(seconds(policy, repeats, on_event))  # [repeats] ms
@@ -63,11 +63,11 @@ def run(run_path: Path, repeats: int = 50, on_event: OnEvent = ignore) -> Latenc
 
 
 def seconds(policy: DeployedPolicy, repeats: int, on_event: OnEvent = ignore) -> list[float]:
-    """Seconds of each of `repeats` predictions.
+    """The seconds of each of `repeats` predictions.
 
-    The actions come back to the CPU, so a GPU has finished when the time is taken.
+    The actions are copied to the CPU, so a GPU has finished when the time is taken.
     """
-    # Random pictures: how long a prediction takes does not depend on what they show.
+    # Random pictures: the time of a prediction does not depend on their contents.
     rng = np.random.default_rng(0)
     side = policy.image_size or _SIDE
     names = policy.cameras or ("image",)

@@ -1,6 +1,6 @@
-"""What a client sends and is told: the keys of an observation, and of the greeting.
+"""Messages to and from clients: the keys of an observation, and of the greeting.
 
-The keys are openpi's. LeRobot's observation, and what a robot's `get_observation()` returns, are
+The keys are openpi's. LeRobot's observations, and those from a robot's `get_observation()`, are
 read as well.
 """
 
@@ -18,15 +18,15 @@ from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.deploy import DeployedPolicy, Pictures
 
 STATE, PROMPT, IMAGE = "observation/state", "prompt", "observation/image"
-PREVIOUS, DELAY = "previous_actions", "delay"  # of a client that moves while it waits
+PREVIOUS, DELAY = "previous_actions", "delay"  # from a client that moves while it waits
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy is given: its pictures, the instruction, and positions [P] float32.
+    """A policy's input: pictures, instruction, and positions [P] float32.
 
     Attributes:
-        previous, delay: as `DeployedPolicy.predict_action_chunk` takes them.
+        previous, delay: as in `DeployedPolicy.predict_action_chunk`.
     """
 
     pictures: Pictures
@@ -40,12 +40,12 @@ class Reader:
     """Reads the observations for one policy.
 
     Args:
-        prompt: the instruction for observations without one; None: each has to have its own.
+        prompt: the instruction for observations without one; None: each must have its own.
     """
 
     def __init__(self, policy: DeployedPolicy, prompt: str | None = None) -> None:
         self._policy, self._prompt = policy, prompt
-        names = policy.cameras or ("image",)  # openpi's name for the only one
+        names = policy.cameras or ("image",)  # openpi's name for a single camera
         self.images = {_key(name): name for name in names}
 
     def greeting(self) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class Reader:
             "default_prompt": self._prompt,
             "positions": policy.positions,
             "actions": policy.actions,
-            # An ensemble averages chunks on the server, and hands out one action at a time.
+            # An ensemble averages chunks on the server, and returns one action at a time.
             "chunk": policy.chunk if policy.ensemble is None else 1,
             "replan": policy.replan,
             "ensemble": policy.ensemble,
@@ -72,10 +72,10 @@ class Reader:
         }
 
     def read(self, message: Any) -> Observation:
-        """The observation of a message; keys that the policy has no use for are ignored.
+        """The observation of a message; keys that the policy does not need are ignored.
 
         Raises:
-            AegisError: a key that is missing, or has something else than it should.
+            AegisError: a key is missing, or has an invalid value.
         """
         if not isinstance(message, Mapping):
             raise self._wrong(f"a message that is {type(message).__name__}")
@@ -89,11 +89,11 @@ class Reader:
     def _seen(self, message: Mapping[Any, Any]) -> Observation:
         """The pictures, the instruction and the positions of a message."""
         policy = self._policy
-        # openpi's key decides: a client of its protocol may send other keys besides.
+        # openpi's key takes precedence: a client of its protocol may send other keys too.
         if STATE not in message and observation.is_one(message, policy.state_names, policy.state):
             return self._lerobots(message)
         sent = _sent(message)
-        if len(self.images) == 1 and IMAGE in message:  # whatever the only camera is called
+        if len(self.images) == 1 and IMAGE in message:  # whatever the name of the only camera
             message = {next(iter(self.images)): message[IMAGE], **message}  # its own key wins
         text = self._text(message)
         missing = [key for key in (*self.images, STATE) if key not in message]
@@ -116,7 +116,7 @@ class Reader:
         return Observation(seen.pictures, text, self._finite("positions", seen.positions))
 
     def _text(self, message: Mapping[Any, Any]) -> str | None:
-        """The message's instruction, or the server's where it has none or a blank one."""
+        """The message's instruction, or the server's if it is missing or blank."""
         text = message.get(PROMPT)
         if text is not None and not isinstance(text, str):
             raise self._wrong(f"'{PROMPT}' is {type(text).__name__}")
@@ -128,7 +128,7 @@ class Reader:
     def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
         if found.dtype.kind not in "biuf":
             raise self._wrong(f"{what} of type {found.dtype}, which is no number's")
-        # A policy would answer NaN with actions that are NaN.
+        # For NaN a policy would return actions that are NaN.
         is_finite = np.isfinite(found)
         if not is_finite.all():
             raise AegisError(
@@ -139,14 +139,14 @@ class Reader:
         return found.astype(np.float32)
 
     def _array(self, key: str, value: Any) -> np.ndarray:
-        """A value of a message as an array: clients may send lists of numbers."""
+        """A value of a message as an array; clients may send lists of numbers."""
         try:
             return np.asarray(value)
         except ValueError as error:  # lists of several lengths
             raise self._wrong(f"'{key}' is no array: {error}") from error
 
     def _wrong(self, found: str) -> AegisError:
-        """The error for a message that is no observation, with what one has to be like."""
+        """The error for a message that is no observation, with the expected form."""
         images = ", ".join(f"'{key}': [H, W, 3] uint8" for key in self.images)
         expected = f"{{{images}, '{STATE}': [{self._policy.positions}], '{PROMPT}': text}}"
         return AegisError(found, expected, "name and shape them as the server's metadata says")
@@ -167,10 +167,10 @@ def _without_instruction(message: Mapping[Any, Any], sent: str) -> AegisError:
 
 
 def _key(camera: str) -> str:
-    """A camera's key in an observation; that of a dataset's `observation.image` is as openpi's."""
+    """A camera's key in an observation; a dataset's `observation.image` gets openpi's key."""
     return f"observation/{layout.short(camera).removeprefix('observation.')}"
 
 
 def _listed(names: tuple[str, ...] | None) -> list[str] | None:
-    """The names as a client unpacks them."""
+    """The names as a list, as a client unpacks them."""
     return None if names is None else list(names)

@@ -1,8 +1,8 @@
 """`aegis serve`: a policy behind openpi's websocket protocol.
 
 A client gets metadata when it connects. Then each binary message is an observation, and each answer
-an action chunk, or a text that says what is wrong. `/healthz` answers plain HTTP. The protocol is
-that of openpi's `websocket_policy_server` (https://github.com/Physical-Intelligence/openpi).
+is an action chunk, or a text with an error. `/healthz` answers plain HTTP. The protocol is that of
+openpi's `websocket_policy_server` (https://github.com/Physical-Intelligence/openpi).
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from aegis_cli.serving import wire
 from aegis_cli.serving.observations import PREVIOUS, Observation, Reader
 
 HEALTH = "/healthz"
-LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed pictures of a camera are a tenth of it
-_LOOK_S = 0.2  # how often the server looks whether it is to end
+LARGEST_MESSAGE = 256 * 2**20  # bytes; several uncompressed camera pictures are a tenth of this
+_LOOK_S = 0.2  # interval at which the server checks whether to stop
 Tell = Callable[[str], object]
 
 
 def _silently(_: str) -> None:
-    """The default listener of what happens at the server."""
+    """The default for `tell`: ignore all messages."""
 
 
 @dataclass(frozen=True)
 class Serving:
-    """A server that listens, and what it tells each client."""
+    """The address of a listening server, and the metadata that it sends to clients."""
 
     url: str
     health: str
@@ -64,28 +64,29 @@ def run(
         task: which policy, if the run is a stream of robot tasks.
         port: 0 takes a free one.
         prompt: the instruction for observations without one.
-        seed: seeds the noise of every connection alike.
+        seed: seed of the noise, the same for every connection.
         precision, ensemble: see `load_policy`.
-        on_ready: is told where, once the server listens.
-        tell: is told in a line what is loaded, who connects, what is refused, and who has gone.
+        on_ready: called with the address once the server listens.
+        tell: called with a line about what is loaded, who connects, what is refused, and who
+            disconnects.
 
     Raises:
-        AegisError: no such run, an address that cannot be listened at, or a prompt that the
-            policy cannot read.
-        KeyboardInterrupt: a signal has come, and the connections are closed.
+        AegisError: there is no such run, the address cannot be bound, or the policy cannot read the
+            prompt.
+        KeyboardInterrupt: a signal was received, and the connections are closed.
     """
-    if not host.strip():  # which would listen at every address there is
+    if not host.strip():  # it would listen on all addresses
         raise AegisError("an empty --host", "an address of this machine", "--host 127.0.0.1")
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
-    tell(f"loading '{run_path}'")  # of a large VLM for a minute and longer
+    tell(f"loading '{run_path}'")  # a large VLM takes a minute or more
     policy = load_policy(run_path, task, seed, precision, ensemble=ensemble)
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:
 
         def ends() -> bool:
-            return signaled.number is not None  # noted, not raised: connections close in order
+            return signaled.number is not None  # noted, not raised: connections close properly
 
         asyncio.run(listen(policy, host, port, prompt, on_ready, ends, tell))
 
@@ -99,14 +100,14 @@ async def listen(
     ends: Callable[[], bool],
     tell: Tell = _silently,
 ) -> None:
-    """Serve a loaded policy until `ends` is true; then the connections are closed."""
+    """Serve a loaded policy until `ends()` is True; then close the connections."""
     answering = _Answering(policy, prompt, tell)
     try:
         server = await serve(
             answering.handle,
             host,
             port,
-            compression=None,  # pictures' bytes hardly shrink, and a robot waits
+            compression=None,  # pictures hardly compress, and the robot waits
             max_size=LARGEST_MESSAGE,
             process_request=_health,
         )
@@ -123,7 +124,7 @@ async def listen(
 
 
 def _where(server: Server, reader: Reader) -> Serving:
-    # What was listened at: with port 0 the system has chosen one.
+    # The actual address: for port 0 the system has chosen a port.
     host, port = next(iter(server.sockets)).getsockname()[:2]
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     return Serving(f"ws://{address}", f"http://{address}{HEALTH}", reader.greeting())
@@ -137,36 +138,36 @@ def _health(connection: ServerConnection, request: Request) -> Response | None:
 
 
 class _Visit:
-    """What is told of one connection."""
+    """Reports on one connection."""
 
     def __init__(self, connection: ServerConnection, tell: Tell) -> None:
-        address = connection.remote_address  # none of a client that is gone already
+        address = connection.remote_address  # None if the client is already gone
         self._name = "a client" if address is None else f"{address[0]}:{address[1]}"
         self._tell = tell
         self._chunks, self._seconds, self._refused = 0, 0.0, ""
         tell(f"{self._name} has connected")
 
     def answered(self, seconds: float) -> None:
-        """A chunk was sent, so many seconds after its observation had come."""
+        """A chunk was sent `seconds` after its observation arrived."""
         self._chunks, self._seconds, self._refused = self._chunks + 1, self._seconds + seconds, ""
 
     def refused(self, error: AegisError) -> None:
-        """Tell of an error once: a robot that goes on asking has the same one at every step."""
+        """Report an error once: a robot that keeps asking causes the same one at every step."""
         if str(error) != self._refused:
             self._refused = str(error)
             self._tell(f"{self._name} was refused: {'; '.join(self._refused.splitlines())}")
 
     def ended(self) -> None:
-        """Tell how many chunks the client was sent, and how long each took."""
+        """Report how many chunks the client was sent, and the mean time of each."""
         each = f", {1000 * self._seconds / self._chunks:.0f} ms each" if self._chunks else ""
         chunks = "1 chunk" if self._chunks == 1 else f"{self._chunks:,} chunks"
         self._tell(f"{self._name} has gone after {chunks}{each}")
 
 
 class _Answering:
-    """Answers all connections; each has a policy of its own, which shares the weights.
+    """Answers all connections; each has its own policy object, which shares the weights.
 
-    One chunk is predicted at a time: two at once would both take twice as long.
+    One chunk is predicted at a time: two at once would each take twice as long.
     """
 
     def __init__(self, policy: DeployedPolicy, prompt: str | None, tell: Tell) -> None:
@@ -174,7 +175,7 @@ class _Answering:
         self._turn, self._tell = asyncio.Lock(), tell
 
     async def handle(self, connection: ServerConnection) -> None:
-        """Greet, then answer until the client has gone."""
+        """Greet, then answer until the client disconnects."""
         visit = _Visit(connection, self._tell)
         try:
             with contextlib.suppress(ConnectionClosed):
@@ -191,13 +192,13 @@ class _Answering:
             started = time.perf_counter()
             try:
                 answer = await self._answer(policy, message)
-            except AegisError as error:  # the client's mistake, after which it may go on
+            except AegisError as error:  # the client's mistake; it may continue
                 visit.refused(error)
                 await connection.send(str(error))
                 continue
             except Exception as error:
                 await connection.send(f"{type(error).__name__}: {error}")
-                raise  # websockets logs it and closes this connection alone
+                raise  # websockets logs it and closes only this connection
             if previous_s is not None:
                 answer["server_timing"]["prev_total_ms"] = 1000 * previous_s
             await connection.send(wire.encode(answer))
@@ -207,16 +208,16 @@ class _Answering:
     async def _answer(self, policy: DeployedPolicy, message: str | bytes) -> dict[str, Any]:
         """Actions [H, A] for an observation, with the milliseconds that they took.
 
-        With a temporal ensemble they are [1, A], since each observation of a connection is the next
+        With a temporal ensemble they are [1, A], since each observation is the connection's next
         step.
 
         Raises:
-            AegisError: a message that is no observation of this policy.
+            AegisError: the message is no observation for this policy.
         """
         if isinstance(message, str):
             fix = "send it with openpi_client.websocket_client_policy"
             raise AegisError("a text message", "an observation in msgpack, as bytes", fix)
-        # Read before the turn: a bad message need not wait for it.
+        # Read before taking the lock: a bad message need not wait.
         seen = self.reader.read(wire.decode(message))
         async with self._turn:
             started = time.perf_counter()

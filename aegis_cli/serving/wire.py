@@ -17,21 +17,21 @@ from aegis_cli.common.errors import AegisError
 
 _ARRAY, _NUMBER = b"__ndarray__", b"__npgeneric__"
 _DATA, _DTYPE, _SHAPE = b"data", b"dtype", b"shape"
-_KINDS = "biuf"  # truth values, integers and floats; no objects, which would have to be programs
+_KINDS = "biuf"  # booleans, integers and floats; no objects, which would need pickle
 
 
 def encode(value: Any) -> bytes:
     """A message of nested mappings, lists, texts, numbers and arrays."""
     packed = msgpack.packb(value, default=_marked)
-    assert packed is not None  # as it would be of a packer that gathers messages
+    assert packed is not None  # it is None only for a buffering packer
     return packed
 
 
 def decode(data: bytes) -> Any:
-    """What a message holds; its arrays are copies that may be written to.
+    """The contents of a message; its arrays are writable copies.
 
     Raises:
-        AegisError: bytes that are no such message.
+        AegisError: the bytes are no such message.
     """
     try:
         return msgpack.unpackb(data, object_hook=_unmarked)
@@ -40,7 +40,7 @@ def decode(data: bytes) -> Any:
         TypeError,
         KeyError,
         OverflowError,
-        SyntaxError,  # of a type's name, which NumPy reads as a piece of a program
+        SyntaxError,  # from a dtype's name, which NumPy may parse as Python
         msgpack.UnpackException,
     ) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
@@ -62,9 +62,9 @@ def _marked(value: Any) -> Any:
 
 def _unmarked(value: Mapping[Any, Any]) -> Any:
     if _ARRAY in value:
-        # The buffer is the message's own memory, which may not be written to.
+        # The buffer is the message's own read-only memory.
         array, shape = np.frombuffer(value[_DATA], _type(value[_DTYPE])), value[_SHAPE]
-        if any(side < 0 for side in shape):  # which NumPy would take for "as many as there are"
+        if any(side < 0 for side in shape):  # NumPy would infer this dimension
             raise ValueError(f"an array of shape {shape}")
         return array.reshape(shape).copy()
     if _NUMBER in value:
@@ -73,10 +73,10 @@ def _unmarked(value: Mapping[Any, Any]) -> Any:
 
 
 def _type(name: str) -> np.dtype:
-    """The type of an array's numbers.
+    """The dtype of an array.
 
     Raises:
-        ValueError, TypeError: a type that is none, or not of numbers.
+        ValueError, TypeError: the dtype is invalid, or not numeric.
     """
     found = np.dtype(name)
     if found.kind not in _KINDS:

@@ -1,4 +1,4 @@
-"""The tasks by name. A task's module, and MuJoCo with it, is imported when the task is made."""
+"""The tasks by name. A task's module, and with it MuJoCo, is imported when the task is created."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.sim import libero_table, metaworld_table
 from aegis_cli.sim.contract import LIBERO, METAWORLD, SUITE, TOP, TaskEnv, TaskSpec
 
-# The class of each task by its name; every class follows `contract.TaskEnv`.
+# The class of each task by name; every class implements `contract.TaskEnv`.
 TASKS: dict[str, str] = {
     "reach": "aegis_cli.sim.reach:Reach",
     "point": "aegis_cli.sim.point:Point",
@@ -20,23 +20,23 @@ TASKS: dict[str, str] = {
 
 
 def is_suite(name: str) -> bool:
-    """Whether the name is that of a suite task, which is measured by its return."""
+    """Whether the name is that of a dm_control suite task, which is measured by its return."""
     return name.startswith(SUITE)
 
 
 def has_colors(name: str) -> bool:
-    """Whether the task has coloured targets, as our own have."""
+    """Whether the task has coloured targets, as our own tasks do."""
     return name in TASKS
 
 
 def of_datasets(name: str) -> TaskSpec | None:
-    """The facts of a task that is learned from data sets alone; None of one that has an expert.
+    """The facts of a task that is learned only from data sets; None for one that has an expert.
 
-    LIBERO's demonstrations are people's, and its data sets do not say that they are of it: a recipe
-    does.
+    LIBERO's demonstrations were made by people, and its data sets do not name LIBERO, so a recipe
+    has to.
 
     Raises:
-        AegisError: a task that LIBERO does not have.
+        AegisError: LIBERO has no such task.
     """
     if not name.startswith(LIBERO):
         return None
@@ -46,15 +46,15 @@ def of_datasets(name: str) -> TaskSpec | None:
 
 
 def lockstep(name: str) -> int:
-    """How many of the task's episodes are played at once; a simulator of LIBERO's is large."""
+    """How many of the task's episodes are played at once; a LIBERO simulator is large."""
     return 10 if name.startswith(LIBERO) else 64
 
 
 def workers(name: str, episodes: int) -> int:
-    """How many processes simulate the task's episodes at once; 1: that which asks alone.
+    """How many processes simulate the task's episodes at once; 1: only the calling process.
 
-    A step of LIBERO's takes tens of milliseconds of Python, and other tasks do not repay a process.
-    One of a study's processes simulates alone, since the others take the other cores.
+    A LIBERO step takes tens of milliseconds of Python; for other tasks a process does not pay off.
+    A process of a study simulates alone, because the others use the other cores.
     """
     if not name.startswith(LIBERO) or multiprocessing.parent_process() is not None:
         return 1
@@ -62,52 +62,52 @@ def workers(name: str, episodes: int) -> int:
 
 
 def members(name: str) -> tuple[str, ...]:
-    """The tasks of a set; of a task itself alone."""
+    """The tasks of a set; for a single task, only itself."""
     if name.startswith(METAWORLD):
         return metaworld_table.members(name)
     return libero_table.members(name) if name.startswith(LIBERO) else (name,)
 
 
 def suites(name: str) -> tuple[str, ...]:
-    """The suites that a set of several is of, as LIBERO's four are; empty for any other."""
+    """The suites in a set of several, such as LIBERO's four; empty for anything else."""
     return libero_table.suites(name) if name.startswith(LIBERO) else ()
 
 
 def member(name: str, number: int) -> str:
-    """The task of the episode of that number: a set's tasks take turns."""
+    """The task of the episode with that number: the tasks of a set take turns."""
     tasks = members(name)
     return tasks[number % len(tasks)]
 
 
 def cameras(name: str) -> tuple[str, ...]:
-    """The cameras that a task can be seen by; the first takes the pictures if none is asked for."""
+    """The cameras of a task; the first is the default."""
     if name.startswith(METAWORLD):
         return metaworld_table.CAMERAS
     return tuple(libero_table.CAMERAS) if name.startswith(LIBERO) else (TOP,)
 
 
 def camera(task: str | None, before: str, now: str) -> str:
-    """What a task calls a policy's camera: the name before a renaming, where the task has it."""
+    """A task's name for a policy's camera: the name before renaming, if the task has it."""
     return before if task is not None and before in cameras(task) else now
 
 
 def playable(task: str | None, seen_by: Collection[str]) -> str | None:
-    """The task, if a policy of these cameras can act in it; None if none of ours shows as much."""
-    # A single picture needs no name: the task's own camera takes its place.
+    """The task, if it has the cameras that the policy needs; otherwise None."""
+    # A single picture needs no name: the task's own camera stands in for it.
     if task is None or len(seen_by) == 1 or {*seen_by} <= {*cameras(task)}:
         return task
     return None
 
 
 def check(name: str) -> None:
-    """Raise AegisError unless `name` is a task that can be made; needs no MuJoCo for our own."""
+    """Raise AegisError unless `name` is a task that can be created; our own need no MuJoCo here."""
     if name in TASKS:
         return
     if name in metaworld_table.names():
-        import_module("aegis_cli.sim.metaworld")  # raises where MetaWorld is not installed
+        import_module("aegis_cli.sim.metaworld")  # raises if MetaWorld is not installed
         return
     if name in libero_table.names():
-        import_module("aegis_cli.sim.libero")  # raises where LIBERO is not installed
+        import_module("aegis_cli.sim.libero")  # raises if LIBERO is not installed
         return
     suite = import_module("aegis_cli.sim.suite").names()
     if name in suite:
@@ -116,7 +116,7 @@ def check(name: str) -> None:
 
 
 def check_recordable(name: str) -> None:
-    """Raise AegisError unless `name` is a task that can be made, with an expert to record."""
+    """Raise AegisError unless `name` is a task that can be created, with an expert to record."""
     if of_datasets(name) is not None:
         raise AegisError(
             f"task '{name}' to be recorded",
@@ -128,7 +128,7 @@ def check_recordable(name: str) -> None:
 
 
 def _unknown(name: str, known: tuple[str, ...]) -> AegisError:
-    # The name of a whole collection is no typing error for one of its tasks.
+    # The name of a whole collection is not a misspelling of one of its tasks.
     examples = {
         SUITE: "suite/cartpole-swingup",
         METAWORLD: "metaworld/button-press",
@@ -145,8 +145,8 @@ def _unknown(name: str, known: tuple[str, ...]) -> AegisError:
 
 
 def _close(name: str, known: tuple[str, ...]) -> str:
-    """Names that are meant, perhaps: `'reach'`, or several with commas."""
-    # A prefix may have been forgotten, and LIBERO calls a suite libero_spatial.
+    """Names that may be meant: `'reach'`, or several separated by commas."""
+    # A prefix may be missing, and LIBERO calls a suite libero_spatial.
     for guess in (name, SUITE + name, METAWORLD + name, LIBERO + name, name.replace("_", "/")):
         close = difflib.get_close_matches(guess, known, n=3)
         if close:
@@ -155,7 +155,7 @@ def _close(name: str, known: tuple[str, ...]) -> str:
 
 
 def check_cameras(name: str, seen_by: Sequence[str]) -> None:
-    """Raise AegisError for a camera that a task does not have, or one twice."""
+    """Raise AegisError for a camera that a task does not have, or one listed twice."""
     known = cameras(name)
     unknown = [camera for camera in seen_by if camera not in known]
     if unknown or len(set(seen_by)) < len(seen_by):
@@ -173,17 +173,17 @@ def make(
     seen_by: tuple[str, ...] = (),
     published: bool = False,
 ) -> TaskEnv:
-    """A new environment; those of a task share one rendering context, but for LIBERO's.
+    """A new environment; except for LIBERO, those of a task share one rendering context.
 
     Args:
-        threads: how many a suite task's planner simulates with.
-        number: the episode's that it is for. The environments of a set differ by it.
-        seen_by: cameras that take pictures, in their order; empty for the task's own.
-        published: whether episodes are those that a benchmark has published, if it has; else, and
-            in all other tasks, each is drawn anew.
+        threads: number of threads with which the planner of a suite task simulates.
+        number: number of the episode that it is for; the environments of a set depend on it.
+        seen_by: cameras that take pictures, in this order; empty for the task's own.
+        published: whether to use the initial states that a benchmark has published, if there are
+            any; otherwise each episode is drawn anew.
 
     Raises:
-        AegisError: an unknown name, a task whose package is missing, or a camera it does not have.
+        AegisError: the name is unknown, the task's package is missing, or it lacks a camera.
     """
     check(name)
     check_cameras(name, seen_by)

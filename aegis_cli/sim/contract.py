@@ -10,18 +10,18 @@ import numpy as np
 
 from aegis_cli.common.errors import AegisError
 
-SUITE = "suite/"  # what the names of dm_control's suite tasks begin with
-METAWORLD = "metaworld/"  # and those of MetaWorld's
-LIBERO = "libero/"  # and those of LIBERO's
-TOP = "top"  # the camera of our own tasks, and what we call the suite's
-# Streams keep the episodes of one seed apart: no evaluation scene is ever a demonstration's.
+SUITE = "suite/"  # prefix of the names of dm_control suite tasks
+METAWORLD = "metaworld/"  # prefix of MetaWorld's tasks
+LIBERO = "libero/"  # prefix of LIBERO's tasks
+TOP = "top"  # the camera of our own tasks, and our name for the suite's
+# Streams keep the episodes of one seed apart: no evaluation scene ever appears in a demonstration.
 DEMOS, EVALUATION, VALIDATION = 0, 1, 2
 
 
 def episode_rng(seed: int, stream: int, i: int) -> np.random.Generator:
     """The random generator of episode `i`.
 
-    It depends on these three numbers alone, so workers may share the episodes out.
+    It depends only on these three numbers, so episodes may be distributed over workers.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, stream, i]))
 
@@ -32,11 +32,11 @@ class TaskSpec:
 
     Attributes:
         templates: instruction texts, each with one "{color}" if the task has coloured targets.
-        measure: what an episode is judged by. `success` is whether the coloured target was reached,
-            or the benchmark's own verdict. `return` is the sum of its rewards, each at most 1; such
-            a task has no colours, and its episodes neither succeed nor fail.
-        camera: name of the camera that takes the pictures, where no other is asked for.
-        said_hz: a rate that data sets of the task's steps have instead of its own; None for none.
+        measure: how an episode is judged. `success` is whether the coloured target was reached, or
+            the benchmark's own verdict. `return` is the sum of its rewards, each at most 1; such a
+            task has no colours, and its episodes neither succeed nor fail.
+        camera: name of the default camera.
+        said_hz: a rate that data sets of the task state instead of its own; None if there is none.
     """
 
     name: str
@@ -52,16 +52,16 @@ class TaskSpec:
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy may see; nothing but images and words tells where to go.
+    """What a policy may see; only images and words tell where to go.
 
     Pictures are 64 pixels wide and high, those of LIBERO 256.
 
     Attributes:
-        more: pictures of further cameras that were asked for, in their order.
+        more: pictures of further requested cameras, in order.
     """
 
     image: np.ndarray  # [H, W, 3] uint8; in our own tasks, x points to the right and y up
-    proprio: np.ndarray  # [P] float32; in our own tasks, positions alone
+    proprio: np.ndarray  # [P] float32; in our own tasks, only positions
     instruction: str
     more: tuple[np.ndarray, ...] = ()  # each [H, W, 3] uint8
 
@@ -72,7 +72,7 @@ class Step:
 
     `observation` is None for a step without a look.
 
-    A task measured by its return has None for `success`, one measured by success for `reward`.
+    `success` is None for a task measured by its return, `reward` for one measured by success.
     Without coloured targets `wrong_target` is None.
     """
 
@@ -96,11 +96,11 @@ class TaskEnv(Protocol):
         """Apply `action` [A], clipped to [-1, 1], for one control step.
 
         Args:
-            look: whether to observe what came of it. To draw a picture takes longer than to step.
+            look: whether to return an observation. Rendering a picture takes longer than a step.
         """
 
     def expert_action(self) -> np.ndarray:
-        """The expert's action [A] float32 in this state; the same if asked twice before a step."""
+        """The expert's action [A] float32 in this state; repeated calls return the same."""
 
     def distance(self) -> float | None:
         """Metres from the effector to the true target's centre; None without coloured targets."""
@@ -108,7 +108,7 @@ class TaskEnv(Protocol):
     def target_circle(self) -> tuple[float, float, float] | None:
         """Where the picture shows the true target: its centre (right, down) and radius.
 
-        Both are in sides of the picture. It is None without coloured targets.
+        Both are fractions of the picture's side. None without coloured targets.
         """
 
 
@@ -116,7 +116,7 @@ def checked(action: np.ndarray, size: int) -> np.ndarray:
     """The action [size] clipped to [-1, 1].
 
     Raises:
-        AegisError: another shape, or numbers that are not finite.
+        AegisError: it has another shape, or values that are not finite.
     """
     action = np.asarray(action, dtype=np.float64)
     if action.shape != (size,) or not np.isfinite(action).all():

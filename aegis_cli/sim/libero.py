@@ -1,6 +1,6 @@
-"""`libero/<suite>`: LIBERO's tasks as they come, for policies of its recorded demonstrations.
+"""`libero/<suite>`: LIBERO's original tasks, for policies trained on its demonstrations.
 
-LIBERO has no expert to record: its demonstrations are people's, and come as data sets.
+LIBERO has no expert to record: its demonstrations were made by people, and come as data sets.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from aegis_cli.sim import libero_table as table
 from aegis_cli.sim.contract import Observation, Step, checked
 
 SIZE = 256  # pixels per side of a picture, as in the data sets
-_SETTLING = 10  # steps of rest before an episode begins, in which objects fall onto the table
+_SETTLING = 10  # idle steps before an episode begins, in which objects settle on the table
 _REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # no movement, and an open gripper
-_TRIES = 20  # to place a scene's objects
+_TRIES = 20  # attempts to place a scene's objects
 _NOTHING = np.zeros((SIZE, SIZE, 3), np.uint8)
 
 
 @contextlib.contextmanager
 def _quietly() -> Generator[None]:
-    """Hush what LIBERO and its simulator say, and take the folders that LIBERO proposes.
+    """Silence LIBERO and its simulator, and accept the folders that LIBERO proposes.
 
-    At its first import it asks on the terminal where its own data sets are to lie, of which none is
-    needed here, and keeps the answer in `~/.libero`.
+    At its first import LIBERO asks on the terminal where to keep its own data sets, which are not
+    needed here, and stores the answer in `~/.libero`.
     """
     stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
-    # What other code has disabled stays so.
+    # Logging that other code has disabled stays disabled.
     disabled = logging.root.manager.disable
     logging.disable(max(disabled, logging.WARNING))
     try:
@@ -58,7 +58,7 @@ def _quietly() -> Generator[None]:
 
 @contextlib.contextmanager
 def _all_devices_seen() -> Generator[None]:
-    """Leave CUDA_VISIBLE_DEVICES out: the simulator compares MUJOCO_EGL_DEVICE_ID with it."""
+    """Hide CUDA_VISIBLE_DEVICES, because the simulator checks MUJOCO_EGL_DEVICE_ID against it."""
     visible = os.environ.pop("CUDA_VISIBLE_DEVICES", None)
     try:
         yield
@@ -67,7 +67,7 @@ def _all_devices_seen() -> Generator[None]:
             os.environ["CUDA_VISIBLE_DEVICES"] = visible
 
 
-choose_backend()  # before the simulator's import, which takes what it finds
+choose_backend()  # before importing the simulator, which uses the current setting
 import mujoco  # noqa: E402
 
 try:
@@ -94,15 +94,15 @@ except OSError as error:
 class LiberoTask:
     """A `contract.TaskEnv` without target colours or expert: one of LIBERO's tasks.
 
-    An episode ends with LIBERO's own success. Proprioception is the hand's position, its rotation
-    as axis times angle, and the fingers' places. Pictures are turned by 180 degrees, as those of
-    the data sets are.
+    An episode ends with success as LIBERO defines it. Proprioception is the position of the hand,
+    its rotation as axis times angle, and the positions of the fingers. Pictures are turned by 180
+    degrees, as in the data sets.
 
     Args:
-        number: the episode's. The tasks of a suite take turns by it.
-        seen_by: names of `table.CAMERAS` that take pictures; empty for the usual one.
+        number: number of the episode, by which the tasks of a suite take turns.
+        seen_by: names in `table.CAMERAS` that take pictures; empty for the usual one.
         published: whether the episode begins in one of the 50 states that LIBERO has published for
-            each task, by its number; else objects are placed anew.
+            each task, chosen by its number; otherwise objects are placed anew.
     """
 
     target_color = None
@@ -119,15 +119,15 @@ class LiberoTask:
         self._seen_by = tuple(seen_by) or (self.spec.camera,)
         self._cameras = tuple(dict.fromkeys(table.CAMERAS[name] for name in self._seen_by))
         self._published = published
-        # Whether somebody looks at a step; the simulator knows it, and must not hold `self`.
+        # Whether a step is observed; shared with the simulator, which must not hold `self`.
         self._looks = SimpleNamespace(wanted=True)
-        # It is made when an episode begins and closed with its last step: it holds half a gigabyte.
+        # Created when an episode begins and closed at its last step: it takes half a gigabyte.
         self._env: Any = None
         self._state: Any = None
         self._closing: weakref.finalize | None = None
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
-        """See `contract.TaskEnv`; there is nothing to colour."""
+        """See `contract.TaskEnv`; there are no colours."""
         self._close()
         seed = int(rng.integers(2**31))
         with _global_numbers_kept(), _quietly():
@@ -136,9 +136,9 @@ class LiberoTask:
             self._env = made
             self._closing = weakref.finalize(self, _close, made)
             self._closing.atexit = False  # OpenGL may be gone by then
-            # Even a published state says nothing of what the table stands on.
+            # Even a published state does not determine what the table stands on.
             np.random.seed(seed)
-            # LIBERO's own `reset` would go on for ever, whatever error or signal ends it.
+            # LIBERO's own `reset` would retry forever, after any error or signal.
             _placed(made.env.reset)
             if self._published:
                 states = _states(self._suite, self._number)  # [50, numbers of a state]
@@ -160,17 +160,18 @@ class LiberoTask:
         return step
 
     def _step(self, control: np.ndarray, look: bool) -> bool:
-        """Whether the task is done after one more step."""
+        """Take a step, and return whether the task is done."""
         self._looks.wanted = look
         _make_current(self._env)
         self._state, _, success, _ = self._env.step(control)
         return bool(success)
 
     def _draw_when_looked_at(self) -> None:
-        """Let the simulator draw those pictures alone that a policy sees.
+        """Let the simulator render only the pictures that a policy sees.
 
-        It would draw one of each camera at every step, at a moment of its own within the step. A
-        picture at the step's end would be another one than those that a policy has learned from.
+        By itself it would render one per camera at every step, at its own point in time within the
+        step. Rendering at the end of the step instead would give pictures unlike those that a
+        policy has learned from.
         """
         simulator, looks = self._env.env, self._looks
         for camera in self._cameras:
@@ -184,7 +185,7 @@ class LiberoTask:
             simulator.modify_observable(name, "sensor", seen)
 
     def expert_action(self) -> np.ndarray:
-        """LIBERO has none.
+        """Not available: LIBERO has no expert.
 
         Raises:
             AegisError: always.
@@ -196,10 +197,10 @@ class LiberoTask:
         )
 
     def distance(self) -> None:
-        """None, because tasks are about objects, and not about where the hand is."""
+        """None, because tasks are about objects, not about the position of the hand."""
 
     def target_circle(self) -> None:
-        """A picture rings no target."""
+        """None: there is no target to mark in a picture."""
 
     def _observe(self) -> Observation:
         state = self._state
@@ -216,18 +217,18 @@ class LiberoTask:
 
 
 def _make_current(env: Any) -> None:
-    """Let OpenGL speak of this simulator's pictures, and not of those that another has drawn."""
+    """Make this simulator's OpenGL context current, instead of another simulator's."""
     env.sim._render_context_offscreen.gl_ctx.make_current()
 
 
 def _close(env: Any) -> None:
-    _make_current(env)  # or another's textures would be freed, and its pictures turn black
+    _make_current(env)  # otherwise another one's textures would be freed and its pictures be black
     env.close()
 
 
 @contextlib.contextmanager
 def _global_numbers_kept() -> Generator[None]:
-    """Put NumPy's global generator, which LIBERO draws from, back to where it was."""
+    """Restore NumPy's global random state, which LIBERO uses, after the block."""
     before = np.random.get_state()
     try:
         yield
@@ -247,23 +248,23 @@ def _environment(suite: str, number: int, cameras: Sequence[str]) -> Any:
 
 
 def _share_display() -> None:
-    """Let LIBERO's simulator draw on the display of MuJoCo's own pictures.
+    """Let LIBERO's simulator render on the EGL display that MuJoCo itself uses.
 
-    Its own choice follows CUDA_VISIBLE_DEVICES, which may be empty or hold names, and it would end
-    the display before other renderers are closed.
+    Its own choice depends on CUDA_VISIBLE_DEVICES, which may be empty or contain names, and it
+    would terminate the display before other renderers are closed.
     """
     theirs: Any = sys.modules.get("robosuite.renderers.context.egl_context")
     if theirs is not None and theirs.EGL_DISPLAY is None:
-        context = mujoco.GLContext(8, 8)  # which opens the display, if nobody has yet
+        context = mujoco.GLContext(8, 8)  # opens the display if it is not open yet
         context.free()
         theirs.EGL_DISPLAY = sys.modules["mujoco.egl"].EGL_DISPLAY
 
 
 def _placed(draw: Callable[[], Any]) -> Any:
-    """What LIBERO makes when it has found places for all objects, which it draws.
+    """The result of `draw`, repeated until LIBERO finds random places for all objects.
 
     Raises:
-        AegisError: it has found none several times.
+        AegisError: it has failed too often.
     """
     for _ in range(_TRIES):
         with contextlib.suppress(RandomizationError):
@@ -288,17 +289,17 @@ def _instruction(suite: str, number: int) -> str:
 
 @cache
 def _states(suite: str, number: int) -> np.ndarray:
-    """The published states [50, S] of a task's simulator at an episode's begin."""
+    """The published initial simulator states [50, S] of a task."""
     path = _file(suite, number, "init_states", "init_states_file")
-    # The files are part of LIBERO's own package, and hold NumPy's arrays, which need pickle.
+    # The files are part of LIBERO's own package and contain NumPy arrays, which need pickle.
     return np.asarray(torch.load(path, weights_only=False))
 
 
 def _file(suite: str, number: int, kind: str, name: str) -> Path:
-    """A file of a task's in LIBERO's folders of a kind, which its configuration names.
+    """A task's file in LIBERO's folder for a kind of file, which its configuration names.
 
     Raises:
-        AegisError: a configuration that another installation has written, which is there no more.
+        AegisError: the configuration was written by another installation, which no longer exists.
     """
     task = _benchmark(suite).get_task(number)
     path = Path(get_libero_path(kind)) / task.problem_folder / getattr(task, name)
@@ -313,7 +314,7 @@ def _file(suite: str, number: int, kind: str, name: str) -> Path:
 
 
 def _check_assets() -> None:
-    """Raise AegisError unless LIBERO's meshes are there, or can be had from the hub."""
+    """Raise AegisError unless LIBERO's meshes exist or can be downloaded from the hub."""
     with contextlib.redirect_stdout(io.StringIO()):  # the hub's own progress is on stderr
         folder = get_assets_path()
     if not os.path.isdir(folder):

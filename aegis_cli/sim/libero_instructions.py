@@ -1,6 +1,6 @@
-"""The instructions of LIBERO's tasks, as its data sets have them: a line per task, by its number.
+"""The instructions of LIBERO's tasks as in its data sets: one line per task, in order of number.
 
-They tell which of a data set's episodes are a task's, also where LIBERO is not installed.
+They tell which episodes of a data set belong to a task, even if LIBERO is not installed.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ pick up the book on the right and place it on the cabinet shelf
 pick up the book on the right and place it under the cabinet shelf
 """
 
-# of each suite, in LIBERO's order
+# For each suite, in LIBERO's order.
 INSTRUCTIONS: dict[str, tuple[str, ...]] = {
     "spatial": tuple(_SPATIAL.strip().splitlines()),
     "object": tuple(_OBJECT.strip().splitlines()),

@@ -8,8 +8,8 @@ from functools import cache
 from aegis_cli.sim.contract import LIBERO, TaskSpec
 from aegis_cli.sim.libero_instructions import INSTRUCTIONS
 
-# How many tasks each suite has, and how many steps one has for an episode: LeRobot's limits, which
-# the longest demonstration keeps. openpi ends those of `spatial` at 220.
+# The number of tasks in each suite, and the most steps in an episode: LeRobot's limits, within
+# which the longest demonstration stays. openpi ends episodes of `spatial` at 220.
 SUITES: dict[str, tuple[int, int]] = {
     "spatial": (10, 280),
     "object": (10, 280),
@@ -20,8 +20,7 @@ SUITES: dict[str, tuple[int, int]] = {
 ALL = "all"  # the four suites of ten, which are what papers report
 _REPORTED = ("spatial", "object", "goal", "10")
 
-# The simulator's cameras by the names that data sets give to their pictures: LeRobot's, openpi's
-# and LIBERO's own.
+# The simulator's cameras by the picture names of data sets: LeRobot's, openpi's and LIBERO's own.
 CAMERAS = {
     "image": "agentview",
     "image2": "robot0_eye_in_hand",
@@ -40,18 +39,18 @@ _TASK = TaskSpec(
     control_hz=20.0,
     templates=(),
     camera="image",
-    said_hz=10.0,  # what LeRobot's and openpi's copies of the demonstrations say
+    said_hz=10.0,  # stated in LeRobot's and openpi's copies of the demonstrations
 )
 
 
 def names() -> tuple[str, ...]:
-    """Every set, suite and task, as `aegis` calls it."""
+    """The names of all sets, suites and tasks in `aegis`."""
     tasks = (task for suite in SUITES for task in members(LIBERO + suite))
     return (*(LIBERO + name for name in (ALL, *SUITES)), *tasks)
 
 
 def members(name: str) -> tuple[str, ...]:
-    """The tasks of a suite, or of all four, in LIBERO's order; of a task itself alone."""
+    """The tasks of a suite, or of all four, in LIBERO's order; for a task, only itself."""
     short = name.removeprefix(LIBERO)
     if short == ALL:
         return tuple(task for suite in _REPORTED for task in members(LIBERO + suite))
@@ -62,7 +61,7 @@ def members(name: str) -> tuple[str, ...]:
 
 
 def suites(name: str) -> tuple[str, ...]:
-    """The suites of the set of all four; empty for one of them, or a task."""
+    """The suites in the set of all four; empty for a single suite or a task."""
     return tuple(LIBERO + suite for suite in _REPORTED) if name == LIBERO + ALL else ()
 
 
@@ -73,13 +72,13 @@ def place(task: str) -> tuple[str, int]:
 
 
 def instructions(name: str) -> tuple[str, ...]:
-    """What a task tells its policy, or each task of a suite or a set."""
+    """The instruction of a task, or of each task of a suite or a set."""
     places = map(place, members(name))
     return tuple(INSTRUCTIONS[suite][number] for suite, number in places)
 
 
 def told(instruction: str) -> tuple[str, ...]:
-    """The tasks that have this instruction, capitals aside; a few share one in other scenes."""
+    """The tasks with this instruction, ignoring case; a few in different scenes share one."""
     return _told().get(instruction.strip().lower(), ())
 
 
@@ -93,12 +92,12 @@ def _told() -> dict[str, tuple[str, ...]]:
 
 
 def steps(task: str) -> int:
-    """How many steps an episode of a single task has."""
+    """The most steps in an episode of a single task."""
     suite, _ = place(task)
     return SUITES[suite][1]
 
 
 def spec(name: str, instructions: tuple[str, ...] = ()) -> TaskSpec:
-    """The facts of a task, a suite or a set, whose longest episodes count."""
+    """The facts of a task, a suite or a set, with the limit of its longest episodes."""
     longest = max(steps(task) for task in members(name))
     return replace(_TASK, name=name, max_steps=longest, templates=instructions)

@@ -1,4 +1,4 @@
-"""`metaworld/<task>`: the benchmark's tasks as they come; its scripted policies are the experts."""
+"""`metaworld/<task>`: the benchmark's original tasks; its scripted policies are the experts."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ except ImportError as error:
         "pip install 'aegis-vla[metaworld]'",
     ) from error
 
-# The camera's place in metres, as visual policies on MetaWorld usually have it (Seo et al. 2022,
+# The camera position in metres that is usual for visual policies on MetaWorld (Seo et al. 2022,
 # arXiv 2206.14244; LeRobot): nearer to the table than the benchmark's own.
 _CAMERA_M = (0.75, 0.075, 0.7)
-# The benchmark's own numbers of the weld between the hand and the body that actions move: anchor,
-# position, quaternion, and scale of the torque. From MuJoCo 3.17 on there is a twelfth, which is 0
-# for a weld whose numbers are given.
+# The benchmark's own values for the weld between the hand and the body that actions move: anchor,
+# position, quaternion and torque scale. From MuJoCo 3.17 on there is a twelfth value, which is 0
+# for a weld with explicit values.
 _WELD = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
-# The robot's meshes have 70,000 faces, at which drawing takes nearly all of a step's time. A pixel
-# is as wide as 15 mm of the table. Objects have fewer faces and are drawn as they are.
+# The robot's meshes have 70,000 faces, so rendering takes nearly all the time of a step. A pixel
+# covers 15 mm of the table. Objects have fewer faces and are drawn as they are.
 _CELL_M, _LEAST_FACES = 0.01, 2000
-_VERSION = "-v3"  # what the benchmark's names end with
+_VERSION = "-v3"  # suffix of the benchmark's names
 
-# All that the benchmark writes to a model: positions [bodies, 3] and [sites, 3], in metres.
+# All that the benchmark modifies in a model: positions [bodies, 3] and [sites, 3], in metres.
 Places = tuple[np.ndarray, np.ndarray]
 
 
 class MetaWorldTask:
     """A `contract.TaskEnv` without target colours: one of the benchmark's tasks.
 
-    Objects and goals are placed anew in each episode. An episode ends with the benchmark's own
-    success. Proprioception is the hand's position and the gripper's opening, the first four of the
-    benchmark's observations; where the objects are, only the expert is told.
+    Objects and goals are placed anew in each episode. An episode ends with success as the benchmark
+    defines it. Proprioception is the position of the hand and the opening of the gripper, the first
+    four of the benchmark's observations; only the expert is told where the objects are.
 
     Args:
-        number: the episode's. The tasks of a set take turns by it.
+        number: number of the episode, by which the tasks of a set take turns.
         seen_by: the benchmark's cameras that take pictures; empty for the usual one.
     """
 
@@ -70,14 +70,14 @@ class MetaWorldTask:
         self._policy = ENV_POLICY_MAP[_published(task)]()
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
-        """See `contract.TaskEnv`; there is nothing to colour."""
+        """See `contract.TaskEnv`; there are no colours."""
         self._env.seed(int(rng.integers(2**31)))
         # The benchmark lets the hand come to rest before it places the objects anew. It must not
-        # meet those of the episode before.
+        # touch those of the previous episode.
         _put(self._env.model, self._stage.initial)
         self._env.reset()
         self._places = _places(self._env.model)
-        # Nor has the benchmark computed yet where they are now, but would report where they were.
+        # Without this, the benchmark would report the objects' previous positions.
         mujoco.mj_forward(self._env.model, self._env.data)
         self._state = self._env._get_obs()
         self._steps = 0
@@ -94,7 +94,7 @@ class MetaWorldTask:
         model = self._env.model
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         picture = self._stage.screen.render(model, self._env.data, number)
-        # This camera hangs upside down.
+        # This camera is upside down.
         return np.ascontiguousarray(picture[::-1, ::-1]) if camera == table.CAMERA else picture
 
     def step(self, action: np.ndarray, look: bool = True) -> Step:
@@ -110,15 +110,15 @@ class MetaWorldTask:
     def expert_action(self) -> np.ndarray:
         """The scripted policy's action [4] float32, clipped as the benchmark clips it."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that actions will be clipped
+            warnings.simplefilter("ignore")  # about clipped actions
             action = self._policy.get_action(self._state)
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
     def distance(self) -> None:
-        """None, because most tasks are about an object, and not about where the hand is."""
+        """None, because most tasks are about an object, not about the position of the hand."""
 
     def target_circle(self) -> None:
-        """A picture rings no target."""
+        """None: there is no target to mark in a picture."""
 
 
 def _published(task: str) -> str:
@@ -126,15 +126,15 @@ def _published(task: str) -> str:
 
 
 def _environment(task: str) -> Any:
-    """A new environment of the benchmark, whose goals follow from its seed.
+    """A new environment of the benchmark, whose goals depend on its seed.
 
-    All environments of a task share one model, which is large with its textures. Where one has its
-    objects, it writes before each use.
+    All environments of a task share one model, because its textures make it large. Each writes the
+    positions of its objects to it before each use.
     """
     cls = ENV_CLS_MAP[_published(task)]
     ours = {"_initialize_simulation": _shared_simulation, "reset_mocap_welds": _nothing}
     env = type(cls.__name__, (cls,), ours)()
-    # The benchmark's own ways to these settings fix the goals, or draw them from NumPy's global
+    # The benchmark's own ways to set these fix the goals, or draw them from NumPy's global
     # generator. The expert has to be told the goal, as in the benchmark's multi-task sets.
     env._set_task_called = True
     env._partially_observable = False
@@ -144,13 +144,13 @@ def _environment(task: str) -> Any:
 
 
 def _shared_simulation(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """What takes the place of a method of gymnasium's that compiles the model each time."""
+    """Replaces a method of gymnasium that compiles the model each time."""
     model = _stage(env.model_name).model
     return model, mujoco.MjData(model)
 
 
 def _nothing(env: Any) -> None:
-    """What takes the place of a method that sets welds, but fails from MuJoCo 3.17 on."""
+    """Replaces a method that sets welds, but fails from MuJoCo 3.17 on."""
 
 
 @dataclass(frozen=True)

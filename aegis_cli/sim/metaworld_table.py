@@ -7,11 +7,11 @@ from dataclasses import replace
 from aegis_cli.sim.contract import METAWORLD, TaskSpec
 
 CAMERA = "corner2"
-# All cameras of the benchmark, that of the usual pictures first.
+# All cameras of the benchmark, the usual one first.
 CAMERAS = (CAMERA, "corner", "corner3", "topview", "behindGripper", "gripperPOV")
 
-# The instructions of each task, in our own words; an episode has one of them. `embedded-easy` knows
-# all of their words, so that it can be trained on every task.
+# The instructions of each task, in our own words; each episode has one of them. `embedded-easy`
+# knows all their words, so that it can be trained on every task.
 SENTENCES: dict[str, tuple[str, ...]] = {
     "assembly": ("put the nut on the peg", "pick up the nut and place it on the peg"),
     "basketball": ("put the ball into the basket", "dunk the basketball"),
@@ -122,12 +122,12 @@ _TASK = TaskSpec(
 
 
 def names() -> tuple[str, ...]:
-    """Every task and set, as `aegis` calls it."""
+    """The names of all tasks and sets in `aegis`."""
     return tuple(METAWORLD + name for name in (*SETS, *SENTENCES))
 
 
 def members(name: str) -> tuple[str, ...]:
-    """The tasks of a set, in the benchmark's order; of a task itself alone."""
+    """The tasks of a set, in the benchmark's order; for a task, only itself."""
     short = name.removeprefix(METAWORLD)
     return tuple(METAWORLD + task for task in SETS.get(short, (short,)))
 
@@ -138,6 +138,6 @@ def sentences(task: str) -> tuple[str, ...]:
 
 
 def spec(name: str) -> TaskSpec:
-    """The facts of a task, or of a set, which knows all of its tasks' instructions."""
+    """The facts of a task, or of a set, with the instructions of all its tasks."""
     said = (text for task in members(name) for text in sentences(task))
     return replace(_TASK, name=name, templates=tuple(dict.fromkeys(said)))

@@ -1,6 +1,6 @@
 """One episode of a planar task: scene layout, control steps, and when it ends.
 
-A subclass brings the effector.
+A subclass provides the effector.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from aegis_cli.sim.scene import RADIUS_M, SLOTS, Look, Stage, lay_out
 
 SUBSTEPS = 5  # physics steps of 20 ms in a control step
 CONTROL_HZ = 10.0
-HOLD_STEPS = 3  # control steps of rest on a disc that count as having chosen it
-_APART_M = 2 * RADIUS_M + 0.015  # least distance between disc centres
-_CLEAR_M = 0.09  # least distance from the effector's start to any disc's centre
+HOLD_STEPS = 3  # control steps of rest on a disc that count as choosing it
+_APART_M = 2 * RADIUS_M + 0.015  # minimum distance between disc centres
+_CLEAR_M = 0.09  # minimum distance from the effector's start to any disc's centre
 
 Sampler = Callable[[np.random.Generator], np.ndarray]
 
@@ -28,8 +28,8 @@ Sampler = Callable[[np.random.Generator], np.ndarray]
 def place_discs(
     rng: np.random.Generator, count: int, start: np.ndarray, sample: Sampler
 ) -> np.ndarray:
-    """Centres [count, 2] drawn by `sample`, apart from each other and from `start` [2]; metres."""
-    while True:  # a layout that leaves no room for the rest is thrown away whole, so that this ends
+    """Centres [count, 2] from `sample`, apart from each other and from `start` [2]; metres."""
+    while True:  # a layout that leaves no room for the rest is discarded completely, so this ends
         centers: list[np.ndarray] = []
         for _ in range(50):
             center = sample(rng)
@@ -45,7 +45,7 @@ class PlanarTask(ABC):
 
     spec: ClassVar[TaskSpec]
     step_m: ClassVar[float]  # displacement of a full action in one control step
-    slow_m: ClassVar[float] = 0.05  # the expert slows within this distance
+    slow_m: ClassVar[float] = 0.05  # the expert slows down within this distance
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -58,7 +58,7 @@ class PlanarTask(ABC):
 
     @abstractmethod
     def sample_center(self, rng: np.random.Generator) -> np.ndarray:
-        """A disc centre [2] that the effector can get to, metres."""
+        """A random disc centre [2] that the effector can reach, metres."""
 
     @abstractmethod
     def tip(self) -> np.ndarray:
@@ -98,7 +98,7 @@ class PlanarTask(ABC):
         return self.observe()
 
     def _name(self, rng: np.random.Generator, target_colors: Sequence[str]) -> None:
-        """Draw the discs' colours, each once, and the instruction that names the target's."""
+        """Draw distinct colours for the discs, and the instruction that names the target's."""
         self.target_color = str(rng.choice(list(target_colors)))
         others = [c for c in COLORS if c != self.target_color]
         distractors = rng.choice(others, size=len(self.centers) - 1, replace=False)
@@ -107,7 +107,7 @@ class PlanarTask(ABC):
         self._instruction = template.format(color=self.target_color)
 
     def observe(self) -> Observation:
-        """The observation of the present state."""
+        """The observation of the current state."""
         image = self._stage.render(self.physics, self._look, self.colors)
         return Observation(image, self.proprio().astype(np.float32), self._instruction)
 
@@ -126,9 +126,9 @@ class PlanarTask(ABC):
         return Step(self.observe() if look else None, success, wrong, done)
 
     def _count_rest(self, moved_m: float) -> None:
-        """Count the steps in a row that rest on one disc.
+        """Count the consecutive steps that rest on one disc.
 
-        Only steps slower than half of full speed count: to pass over a disc is not to choose it.
+        Only steps slower than half of full speed count: passing over a disc is not choosing it.
         """
         gaps = np.linalg.norm(self.centers - self.tip(), axis=1)
         slow = moved_m < self.step_m / 2
@@ -158,6 +158,6 @@ class PlanarTask(ABC):
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
-    """The vector at length 1; zero stays zero, for the effector may stand on its goal."""
+    """The vector scaled to length 1; zero stays zero, as the effector may be at its goal."""
     length = np.linalg.norm(vector)
     return vector / length if length > 0 else np.zeros_like(vector)

@@ -1,8 +1,8 @@
-"""Sampling-based predictive control: draw plans about the last one, simulate, and take the best.
+"""Sampling-based predictive control: sample plans around the last one, simulate, take the best.
 
-This is predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several sizes at once
-and a weighted mean of the best few. A plan is [K, A]: K knots of A actions in [-1, 1], with
-straight lines between them. The module knows no task.
+This is predictive sampling as in MuJoCo MPC (arXiv 2212.00541), with noise of several scales at
+once and a weighted mean of the best few. A plan is [K, A]: K knots of A actions in [-1, 1],
+linearly interpolated. The module knows no task.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ gl.choose_backend()
 import mujoco  # noqa: E402  (the backend is chosen when MuJoCo is imported)
 from mujoco.rollout import Rollout  # noqa: E402
 
-# Bounds of the noise's standard deviation, where 1 is half of an action's range. Each plan draws
-# its own, log-uniformly.
+# Bounds of the noise's standard deviation, where 1 is half the range of an action. It is drawn
+# log-uniformly for each plan.
 _LEAST_NOISE, _MOST_NOISE = 0.05, 1.0
 _ELITES = 4  # plans in the weighted mean
 
@@ -35,7 +35,7 @@ class Search:
         horizon_s: seconds that a plan covers.
         knots: K.
         samples: plans per search.
-        score_s: seconds between two rewards that count for a plan.
+        score_s: seconds between two rewards that count towards a plan's score.
         replan_s: seconds after which a new plan is made.
     """
 
@@ -52,23 +52,23 @@ def follow(plan: np.ndarray, steps: int) -> np.ndarray:
 
 
 def shift(plan: np.ndarray, share: float) -> np.ndarray:
-    """The plan that is left after `share` of its horizon; at its end it holds the last knot."""
+    """The rest of a plan after a fraction `share` of its horizon; its end holds the last knot."""
     last = len(plan) - 1
     return _read(plan, np.minimum(np.arange(len(plan)) + share * last, last))
 
 
 def _read(plan: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The plan's actions [len(at), A] at knot numbers, whole or between."""
+    """The plan's actions [len(at), A] at knot indices, which may be fractional."""
     low = np.minimum(at.astype(int), len(plan) - 2)
     part = (at - low)[:, None]
     return (1 - part) * plan[low] + part * plan[low + 1]
 
 
 def improve(plan: np.ndarray, score: Score, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """The best plan [K, A] among this one, `samples` - 1 draws about it, and a mean of the best.
+    """The best plan [K, A] among this one, `samples` - 1 samples around it, and a mean of the best.
 
-    The mean smooths plans that differ in noise alone. Where the best few take different ways, their
-    mean scores low, and the best single one is taken.
+    The mean smooths plans that differ only in noise. If the best few take different ways, their
+    mean scores low, and the best single plan is taken.
     """
     noise = np.exp(rng.uniform(np.log(_LEAST_NOISE), np.log(_MOST_NOISE), size=(samples, 1, 1)))
     drawn = np.clip(plan + noise * rng.standard_normal((samples, *plan.shape)), -1, 1)
@@ -80,7 +80,7 @@ def improve(plan: np.ndarray, score: Score, samples: int, rng: np.random.Generat
         return plan
     weights = np.exp((scores[best] - scores[first]) / spread)
     mean = np.tensordot(weights / weights.sum(), drawn[best], axes=1)
-    mean = np.clip(mean, -1, 1)  # rounding may leave the bounds
+    mean = np.clip(mean, -1, 1)  # rounding may exceed the bounds
     return mean if score(mean[None])[0] > scores[first] else drawn[first]
 
 
@@ -89,8 +89,8 @@ class Simulator:
 
     Args:
         substeps: physics steps in a control step, all with the same control.
-        threads: how many share the futures out, which does not change the result; 1 is the
-            caller's own.
+        threads: number of threads that share the work, which does not change the result; 1 is the
+            calling thread.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, threads: int = 1) -> None:
@@ -102,7 +102,7 @@ class Simulator:
         """Full physics states [N, T, S] after each of T control steps.
 
         Args:
-            start: the state [S] that all futures begin in.
+            start: the initial state [S] of all futures.
             controls: [N, T, U].
         """
         fine = np.repeat(controls, self._substeps, axis=1)

@@ -13,7 +13,7 @@ from aegis_cli.sim.scene import Stage, plain_xml
 # After `scene`, which chooses the OpenGL backend.
 from dm_control.suite import point_mass  # isort: skip
 
-# Half sides of the squares that starts and pads are drawn from; the walls are at 0.29.
+# Half the sides of the squares that starts and pads are drawn from; the walls are at 0.29.
 _START_M = 0.25
 _PAD_M = 0.22
 _HALF_WIDTH_M = 0.275
@@ -21,7 +21,7 @@ _HALF_WIDTH_M = 0.275
 
 @cache
 def stage() -> Stage:
-    """The one stage of all point environments in this process."""
+    """The stage shared by all point environments in this process."""
     xml, assets = point_mass.get_model_and_assets()
     plain = plain_xml(xml, tip="pointmass", tip_radius_m=0.016, servo_gain=20.0)
     return Stage(point_mass.Physics.from_xml_string(plain, assets), "pointmass", _HALF_WIDTH_M)

@@ -1,4 +1,4 @@
-"""Record an episode of the expert: noisy execution, clean labels; without torch or files."""
+"""Record an episode of the expert, with noisy execution and clean labels; no torch, no files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from aegis_cli.sim import make, member, members
 from aegis_cli.sim.contract import DEMOS, TaskEnv, episode_rng
 
-# Probability per step that a burst of noise begins or ends; so bursts, and the pauses between them,
+# Probability per step that a burst of noise begins or ends, so bursts and the pauses between them
 # last 4 steps on average.
 _SWITCH = 0.25
 
@@ -22,24 +22,24 @@ class RecordedEpisode:
 
     frames: np.ndarray  # [T, 64, 64, 3] uint8
     proprio: np.ndarray  # [T, P] float32
-    actions: np.ndarray  # [T, A] float32, what the expert would do at that very frame
+    actions: np.ndarray  # [T, A] float32, the expert's action at each frame
     instruction: str
     target_color: str | None
-    # A task has one of the two, as `contract.Step` does.
+    # A task has one of these two, as in `contract.Step`.
     success: bool | None
     total_reward: float | None = None
-    task: str | None = None  # of a set's, the one whose turn it was
+    task: str | None = None  # for a set, the task whose turn it was
     more_frames: tuple[np.ndarray, ...] = ()  # [T, 64, 64, 3] uint8 of each further camera
 
 
 def bursts(rng: np.random.Generator, size: float, actions: int) -> Iterator[np.ndarray]:
-    """Endless pushes [A] in bursts: each burst is one constant draw, and zero follows it.
+    """Endless pushes [A] in bursts: each burst is one constant random push, followed by zeros.
 
-    A constant push carries the effector off its way, so that the labels show how to come back.
-    White noise would average out and leave the expert's own states.
+    A constant push moves the effector off its path, so that the labels show how to recover. White
+    noise would average out and only visit the expert's own states.
 
     Args:
-        size: standard deviation of a draw.
+        size: standard deviation of a push.
     """
     push = np.zeros(actions)
     while True:
@@ -93,14 +93,15 @@ def record_numbered(
     """Episode `i` of `seed`, the same in whichever process it is recorded.
 
     Args:
-        threads: how many a planner simulates with; the episode does not depend on it.
-        seen_by: cameras, in their order; empty for the task's own.
+        threads: number of threads with which a planner simulates; the episode does not depend on
+            it.
+        seen_by: cameras, in this order; empty for the task's own.
     """
     env = _env(task, threads, i % len(members(task)), seen_by)
     episode = record(env, episode_rng(seed, DEMOS, i), noise, colors)
     return replace(episode, task=member(task, i))
 
 
-@cache  # one environment per task and process: to make one takes longer than an episode
+@cache  # one environment per task and process: creating one takes longer than an episode
 def _env(task: str, threads: int, turn: int, seen_by: tuple[str, ...]) -> TaskEnv:
     return make(task, threads, turn, seen_by)

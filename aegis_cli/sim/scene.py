@@ -1,4 +1,4 @@
-"""What a task looks like: a plain dm-control domain with coloured discs, seen from above."""
+"""The appearance of a task: a plain dm-control domain with coloured discs, seen from above."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ from dm_control.mujoco import Physics  # noqa: E402
 SIZE = 64  # pixels per side of a picture
 SLOTS = 4  # discs in a model; an episode shows two or more of them
 RADIUS_M = 0.035  # a disc's radius
-_FOVY_DEG = 20.0  # the camera looks from afar, through a narrow lens: nearly no parallax
+_FOVY_DEG = 20.0  # a distant camera with a narrow field of view has almost no parallax
 # The arm lies below the discs, the effector above them, and unused discs under the floor.
 _DISC_Z, _TIP_Z, _STORED_Z = 0.03, 0.05, -1.0
 SLOW_FLAGS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -> str:
-    """Strip a dm_control.suite domain of decoration, and give it discs and velocity servos.
+    """Strip a dm_control.suite domain of decoration, and add discs and velocity servos.
 
-    There are `SLOTS` discs, which are mocap bodies; servos take the place of the motors.
+    There are `SLOTS` discs, which are mocap bodies; servos replace the motors.
 
     A servo's force is servo_gain * (control - velocity): the control is a joint velocity. The
-    integrator is implicit in velocity, so a stiff servo stays stable at the domain's 20 ms time
-    step.
+    integrator is implicit in velocity, so a stiff servo is stable at the domain's 20 ms time step.
     """
     root = ElementTree.fromstring(xml)
     world = _child(root, "worldbody")
@@ -63,7 +62,7 @@ def plain_xml(xml: bytes, *, tip: str, tip_radius_m: float, servo_gain: float) -
 
 
 def _child(parent: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """The first of its children of that tag, which every domain has."""
+    """The first child with that tag, which every domain has."""
     found = parent.find(tag)
     assert found is not None
     return found
@@ -71,7 +70,7 @@ def _child(parent: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 @dataclass(frozen=True)
 class Look:
-    """What varies from episode to episode and means nothing: greys, light, and the camera.
+    """Irrelevant variation between episodes: greys, light, and the camera.
 
     The camera moves by about a pixel.
     """
@@ -79,7 +78,7 @@ class Look:
     floor: np.ndarray  # [3], red, green and blue in [0, 1]
     body: np.ndarray  # [3], neutral and lighter than the floor
     light: float
-    ambient: float  # share of the light
+    ambient: float  # fraction of the light
     shift_m: np.ndarray  # [2]
     zoom: float
 
@@ -116,7 +115,7 @@ class Stage:
         """Picture [64, 64, 3] uint8 of one environment's state.
 
         Args:
-            colors: names of its discs' colours, in the order of the slots.
+            colors: names of the discs' colours, in the order of the slots.
         """
         self._dress(look, colors)
         if self._renderer is None:
@@ -127,23 +126,23 @@ class Stage:
     def circle(self, look: Look, center: np.ndarray) -> tuple[float, float, float]:
         """Where a picture shows the disc at `center` [2] metres: centre (right, down) and radius.
 
-        Both are in sides of the picture.
+        Both are fractions of the picture's side.
         """
         side_m = 2 * self._half_width_m * look.zoom
         right, up = (center - look.shift_m) / side_m
         return 0.5 + float(right), 0.5 - float(up), RADIUS_M / side_m
 
     def _open(self) -> mujoco.Renderer:
-        with interrupts.deferred():  # half of a context cannot be closed
+        with interrupts.deferred():  # a half-created context cannot be closed
             renderer = mujoco.Renderer(self._model, SIZE, SIZE)
-            # Later, when the interpreter shuts down, EGL is gone and closing raises.
+            # Later, during interpreter shutdown, EGL is gone and closing raises.
             atexit.register(renderer.close)
         for flag in SLOW_FLAGS:
             renderer.scene.flags[flag] = False
         return renderer
 
     def _dress(self, look: Look, colors: Sequence[str]) -> None:
-        """Write one environment's colours, light and camera to what all of them share."""
+        """Write one environment's colours, light and camera to the shared model."""
         rgba = self._model.geom_rgba
         rgba[:, :3] = look.body
         rgba[self._floor, :3] = look.floor

@@ -1,4 +1,4 @@
-"""Pictures of a task as it comes, from one of its own cameras."""
+"""Pictures of an unmodified task, from one of its own cameras."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from aegis_cli.sim.scene import SIZE, SLOW_FLAGS
 
 import mujoco  # isort: skip  (after scene, which chooses the OpenGL backend)
 
-_MOST_GEOMS = 2000  # room in a scene; the suite's largest has fewer
+_MOST_GEOMS = 2000  # capacity of a scene; the suite's largest has fewer
 
 
 class Screen:
     """One rendering context for all environments of a task.
 
-    It renders any environment whose model is compiled from the same source as `model`; the models'
-    numbers may differ.
+    It renders any environment whose model is compiled from the same source as `model`; the values
+    in the models may differ.
 
     Args:
-        camera: number of the model's camera that takes the pictures.
+        camera: index of the model's camera that takes the pictures.
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int = 0) -> None:
-        # The context takes these from the model when it is made. More samples would be slow.
+        # The context reads these from the model when it is created. Multisampling would be slow.
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
         self._gl = mujoco.GLContext(SIZE, SIZE)
@@ -37,7 +37,7 @@ class Screen:
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         self._camera.type, self._own_camera = mujoco.mjtCamera.mjCAMERA_FIXED, camera
         self._area = mujoco.MjrRect(0, 0, SIZE, SIZE)
-        # Later, when the interpreter shuts down, EGL is gone and closing raises.
+        # Later, during interpreter shutdown, EGL is gone and closing raises.
         atexit.register(self._close)
 
     def render(
@@ -46,11 +46,11 @@ class Screen:
         """Picture [64, 64, 3] uint8 of one environment's state.
 
         Args:
-            camera: number of another of the model's cameras than the screen's own.
+            camera: index of a camera of the model; None for the screen's own.
         """
         self._gl.make_current()
         self._camera.fixedcamid = self._own_camera if camera is None else camera
-        # Terrain is made anew in each episode, but drawn from the context's copy.
+        # Terrain is regenerated in each episode, but drawn from the context's copy.
         for field in range(model.nhfield):
             mujoco.mjr_uploadHField(model, self._context, field)
         mujoco.mjv_updateScene(

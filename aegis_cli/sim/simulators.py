@@ -1,4 +1,4 @@
-"""A task's environments in this process, or shared out among processes that simulate at once."""
+"""A task's environments, in this process or distributed over several that run in parallel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Wanted:
-    """An environment that is wanted: the arguments of `sim.make`."""
+    """A requested environment: the arguments of `sim.make`."""
 
     task: str
     number: int
@@ -28,20 +28,20 @@ class Wanted:
     published: bool = False
 
     def made(self) -> TaskEnv:
-        """A new one, in this process."""
+        """A new environment in this process."""
         return sim.make(
             self.task, number=self.number, seen_by=self.seen_by, published=self.published
         )
 
 
 class Simulators:
-    """What makes a task's environments; `opened` has it.
+    """Creates a task's environments; returned by `opened`.
 
-    An environment is the same in whichever process it is.
+    An environment behaves the same in any process.
 
     Args:
-        pools: processes that simulate, one each; none: this process alone.
-        threads: of which each environment that acts has one.
+        pools: pools of one simulating process each; empty to use only this process.
+        threads: a pool with one thread for each environment that acts.
     """
 
     def __init__(self, pools: Sequence[WorkerPool], threads: ThreadPoolExecutor) -> None:
@@ -61,10 +61,10 @@ class Simulators:
         items: Iterable[Item],
         told: Callable[[int], object] = lambda _: None,
     ) -> None:
-        """Call `act` with each item: at once, where there are several processes.
+        """Call `act` with each item, in parallel if there are several processes.
 
         Args:
-            told: called in this thread with the number of items that are done, in their order.
+            told: called in this thread with the number of items that are done, in order.
         """
         results = self._threads.map(act, items) if self._pools else map(act, items)
         for done, _ in enumerate(results, 1):
@@ -76,18 +76,18 @@ def opened(workers: int, at_once: int) -> Generator[Simulators]:
     """Simulators for the length of a `with` block.
 
     Args:
-        workers: processes that simulate; 1: this process alone.
-        at_once: environments that act at the same time.
+        workers: number of simulating processes; 1: only this process.
+        at_once: number of environments that act at the same time.
 
     Raises:
         AegisError: at the end of the block, if a process died in it.
     """
     fix = "there may be too little memory for it: see free -h, and ulimit -v"
-    # An environment stays in one process, so that each is a pool of its own.
+    # An environment stays in one process, so each process is a pool of its own.
     several = range(workers) if workers > 1 else ()
     pools = [WorkerPool(1, "a simulating process", fix) for _ in several]
-    # A thread for each environment, which mostly waits for its process: no process stands idle as
-    # long as one of its environments has something to do.
+    # A thread for each environment, which mostly waits for its process: no process is idle while
+    # one of its environments has something to do.
     with ThreadPoolExecutor(at_once) as threads, ExitStack() as processes:
         for pool in pools:
             processes.enter_context(pool)
@@ -95,7 +95,7 @@ def opened(workers: int, at_once: int) -> Generator[Simulators]:
 
 
 class _Elsewhere:
-    """A `contract.TaskEnv` in another process, which knows it by a key."""
+    """A `contract.TaskEnv` in another process, where it is stored under a key."""
 
     def __init__(self, pool: WorkerPool, key: int, wanted: Wanted) -> None:
         self._pool, self._key = pool, key

@@ -1,4 +1,4 @@
-"""`suite/<domain>-<task>`: any task of dm_control's suite as it comes; its expert is a planner."""
+"""`suite/<domain>-<task>`: any original task of dm_control's suite; the expert is a planner."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from dm_control.rl.control import PhysicsError  # isort: skip
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 STEPS = 1000  # an episode's limit: the suite's own, and ours for lqr, which has none
-_UNBOUNDED = 1e9  # bounds above are none, as for lqr's forces; 1 is then one newton
+_UNBOUNDED = 1e9  # larger bounds count as none, as for lqr's forces; 1 then means one newton
 
 
 def names() -> tuple[str, ...]:
-    """Every task of the suite, as `aegis` calls it."""
+    """The names of all tasks of the suite in `aegis`."""
     return tuple(f"{SUITE}{domain}-{task}" for domain, task in suite.ALL_TASKS)
 
 
 class SuiteTask:
     """A `contract.TaskEnv` without target colours.
 
-    The action is the suite's own, its range mapped to [-1, 1]. Proprioception is the suite's whole
-    observation, velocities included. Our own tasks leave velocities out, because a policy that sees
-    that it rests concludes that it should. Here no servo lies under the action, which is a force,
-    and to balance a pole one has to know how it falls.
+    The action is the suite's own, with its range mapped to [-1, 1]. Proprioception is the suite's
+    full observation, including velocities. Our own tasks leave velocities out, because a policy
+    that sees that it is at rest learns to stay at rest. Here the action is a force without a servo,
+    and balancing a pole requires knowing how it falls.
 
-    The expert is a planner. It makes a plan every `Search.replan_s`, and follows it until the next.
+    The expert is a planner. It makes a plan every `Search.replan_s` and follows it until the next.
     """
 
     target_color = None
 
     def __init__(self, name: str, threads: int = 1) -> None:
         domain, _, task = name.removeprefix(SUITE).partition("-")
-        # A fixed seed, because lqr draws its springs when it is made.
+        # A fixed seed, because lqr draws its springs when it is created.
         self._env = suite.load(domain, task, task_kwargs={"random": 0})
         self.physics = _without_contexts(self._env.physics)
         self.spec = self._describe(name)
@@ -63,7 +63,7 @@ class SuiteTask:
         )
 
     def reset(self, rng: np.random.Generator, target_colors: Sequence[str]) -> Observation:
-        """See `contract.TaskEnv`; there is nothing to colour."""
+        """See `contract.TaskEnv`; there are no colours."""
         self._env.task.random.seed(int(rng.integers(2**32)))
         self._expert.begin(np.random.default_rng(int(rng.integers(2**63))))
         self._steps = 0
@@ -78,8 +78,7 @@ class SuiteTask:
         """See `contract.TaskEnv`.
 
         Raises:
-            AegisError: an action of another shape, or forces under which the simulation breaks
-                down.
+            AegisError: the action has another shape, or the simulation breaks down under it.
         """
         control = self._expert.scale(checked(action, len(self.spec.action_names)))
         try:
@@ -100,14 +99,14 @@ class SuiteTask:
         return self._expert.action(self._steps).astype(np.float32)
 
     def distance(self) -> None:
-        """None, because a suite task has no one target."""
+        """None, because a suite task has no single target."""
 
     def target_circle(self) -> None:
-        """A suite task has no one target."""
+        """None, because a suite task has no single target."""
 
 
 class _Expert:
-    """The planner at work on one environment, with its present plan."""
+    """The planner for one environment, with its current plan."""
 
     def __init__(self, env: Any, known: Known, threads: int) -> None:
         self._env, self._search, self._guide = env, known.search, known.guide
@@ -115,7 +114,7 @@ class _Expert:
         bounds, step_s = env.action_spec(), env.control_timestep()
         self._low = np.where(np.abs(bounds.minimum) < _UNBOUNDED, bounds.minimum, -1.0)
         self._high = np.where(np.abs(bounds.maximum) < _UNBOUNDED, bounds.maximum, 1.0)
-        # Control steps of a plan, between two plans, and between two rewards that are looked at.
+        # Control steps in a plan, between two plans, and between two rewards that count.
         self._horizon = max(2, round(known.search.horizon_s / step_s))
         self._replan = max(1, round(known.search.replan_s / step_s))
         self._every = max(1, round(known.search.score_s / step_s))
@@ -123,7 +122,7 @@ class _Expert:
         self._imagined = env.physics.copy(share_model=True)
 
     def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode; the first plan is to do nothing, and the search starts from it."""
+        """Begin an episode; the search starts from a plan that does nothing."""
         self._rng, self._made = rng, None
         self._plan = np.zeros((self._search.knots, len(self._low)))
 
@@ -132,7 +131,7 @@ class _Expert:
         return self._low + (actions + 1) / 2 * (self._high - self._low)
 
     def action(self, step: int) -> np.ndarray:
-        """The plan's action [A] at a step of the episode; the same if asked twice."""
+        """The plan's action [A] at a step of the episode; repeated calls return the same."""
         passed = 0 if self._made is None else step - self._made
         if self._made is None or passed >= self._replan:
             plan = shift(self._plan, passed / (self._horizon - 1))
@@ -141,7 +140,7 @@ class _Expert:
         return follow(self._plan, self._horizon)[passed]
 
     def _score(self, plans: np.ndarray) -> np.ndarray:
-        """Sum of rewards, and of the guide, over each plan's horizon [N]."""
+        """Sum of rewards and guide values over each plan's horizon [N]."""
         controls = self.scale(np.stack([follow(plan, self._horizon) for plan in plans]))
         start = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_getState(self._model, self._physics.data.ptr, start, _STATE)
@@ -153,9 +152,9 @@ class _Expert:
         return np.array(totals)
 
     def _reward(self, state: np.ndarray, control: np.ndarray) -> float:
-        """What the planner is told of one state: the task's reward, and the guide's.
+        """The planner's reward in one state: that of the task, plus the guide.
 
-        A copy of the physics is looked at, since the real one must stay where the episode is.
+        It is computed on a copy of the physics, because the real one must not move.
         """
         physics = self._imagined
         mujoco.mj_setState(self._model, physics.data.ptr, state, _STATE)
@@ -168,23 +167,23 @@ class _Expert:
 
 
 def _labels(observation: Mapping[str, Any]) -> Iterator[str]:
-    """One name per number: `height`, `velocity[2]`, `arm_pos[1,0]`."""
+    """One name per value: `height`, `velocity[2]`, `arm_pos[1,0]`."""
     for key, value in observation.items():
         for place in np.ndindex(np.shape(value)):
             yield f"{key}[{','.join(map(str, place))}]" if place else key
 
 
 def _without_contexts(physics: Any) -> Any:
-    """The same physics, which never starts dm_control's own renderer.
+    """The same physics, prevented from starting dm_control's own renderer.
 
-    Beside ours, that renderer fails when the interpreter ends. quadruped-escape would start it, to
-    show it new terrain.
+    Together with ours, that renderer fails when the interpreter exits. quadruped-escape would start
+    it to upload new terrain.
     """
     physics.__class__ = type("Physics", (type(physics),), {"contexts": None})
     return physics
 
 
-_screens: dict[str, Screen] = {}  # by task: each has an OpenGL context, of which there are few
+_screens: dict[str, Screen] = {}  # by task: each has an OpenGL context, and their number is limited
 
 
 def _screen(name: str, model: mujoco.MjModel) -> Screen:

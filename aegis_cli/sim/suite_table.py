@@ -1,6 +1,6 @@
-"""Settings of single suite tasks: their instructions, and how the planner solves them.
+"""Settings of individual suite tasks: their instructions, and how the planner solves them.
 
-All other suite tasks get defaults.
+All other suite tasks use defaults.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class Known:
     """The settings of one task.
 
     Args:
-        text: the instruction; None: made from the names.
+        text: the instruction; None: derived from the names.
         search: how the planner searches.
-        guide: what the planner adds to the reward, where that says nothing until the task is done.
-            Returns that are reported never contain it.
+        guide: a term that the planner adds to a reward that is uninformative until the task is
+            done. Reported returns never include it.
     """
 
     text: str | None = None
@@ -46,7 +46,7 @@ def _poles_up(physics: Any) -> float:
 def _ball_over_cup(physics: Any) -> float:
     """The ball's height over the target, up to 10 cm, minus its distance, in metres.
 
-    The height keeps the ball from being pulled against the cup's bottom, from below.
+    The height term keeps the ball from being pulled against the bottom of the cup from below.
     """
     gap = physics.ball_to_target()
     return float(min(-gap[1], 0.1) - np.linalg.norm(gap))
@@ -68,7 +68,7 @@ def _mass_near_target(physics: Any) -> float:
 
 
 def _spinning(physics: Any) -> float:
-    """Share of the rewarded speed, which is 15 rad/s, in [-1, 1]."""
+    """Fraction of the rewarded speed, which is 15 rad/s, in [-1, 1]."""
     return float(np.clip(-physics.hinge_velocity() / 15, -1, 1))
 
 

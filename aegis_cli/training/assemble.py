@@ -63,20 +63,21 @@ class TrainingRun:
 
     Attributes:
         ranks: the processes that take its steps together.
-        plain: in the first process, a policy of the same shape whose weights are whole, by which a
-            sharded one is written, and asked; None where it is not sharded.
+        plain: in the first process, an unsharded policy of the same shape, through which a sharded
+            policy is written and asked questions; None if the policy is not sharded.
         watched: the anchor's file, which stays memory-mapped.
-        temporary: the checkpoint of an interruption, if the run has resumed from one; the next
+        temporary: the checkpoint of an interruption, if the run was resumed from one; the next
             checkpoint replaces it.
-        unread: figures of steps that nobody has read yet.
+        unread: figures of past steps that have not been read yet.
         reused: the anchor gradient that the next steps share, by the backbone's parameter names;
-            None where each step takes its own.
+            None if each step computes its own.
         masters: the float32 weights that passes see rounded.
-        began_as: as of `loading.Loaded`.
-        questions: what the backbone is asked with every validation loss; None for nothing.
-        episodes: which the policy acts in with every validation loss; None for none.
-        actions: held-out frames at which it predicts with every validation loss; None for none.
-        told_of_drop: whether it has been said that more is lost than the recipe allows.
+        began_as: as in `loading.Loaded`.
+        questions: what the backbone is asked at every validation; None for no questions.
+        episodes: episodes that the policy acts in at every validation; None for none.
+        actions: held-out frames for which it predicts actions at every validation; None for none.
+        told_of_drop: whether the user was told that accuracy dropped further than the recipe
+            allows.
     """
 
     recipe: Recipe
@@ -105,21 +106,21 @@ class TrainingRun:
 
     @property
     def shown(self) -> Policy:
-        """The policy that answers, acts and predicts while it trains, one with whole weights.
+        """The policy, with whole weights, that answers, acts and predicts during training.
 
-        Where weights are sharded only the first process has it, and inside `by_whole` alone its
-        weights are those of the moment.
+        If weights are sharded, only the first process has it, and its weights are current only
+        inside `by_whole`.
         """
         return self.policy if self.plain is None else self.plain
 
     def by_whole(self, find: Callable[[Ranks], T]) -> T:
-        """What is found by `shown` as it is now, by all processes that have whole weights.
+        """The result of `find`, called by all processes whose `shown` has whole weights.
 
-        Where weights are sharded, the first process gathers them, finds it alone, and tells the
-        others, which wait.
+        If weights are sharded, they are gathered to the first process, which calls `find` alone and
+        sends the result to the others, which wait.
 
         Args:
-            find: what to do, with the processes that do it together.
+            find: the function to call with the processes that run it together.
         """
         if not parallel.is_sharded(self.policy):
             return find(self.ranks)
@@ -133,12 +134,12 @@ class TrainingRun:
 
     @property
     def learning(self) -> list[nn.Parameter]:
-        """Every parameter that learns."""
+        """Every trainable parameter."""
         return [p for group in self.rates for p in group["params"]]
 
     @property
     def meta(self) -> PolicyMeta:
-        """What a policy's user has to know."""
+        """The metadata that a user of the policy needs."""
         found: dict[str, Any] = {
             "method": self.method.name,
             "task": self.demos.task,
@@ -168,13 +169,13 @@ class TrainingRun:
 
     @property
     def order(self) -> BatchOrder:
-        """Which of the training frames each step has, as places among them."""
+        """Which training frames each step uses, as indices into them."""
         count, batch = len(self.demos.train), self.recipe.train.batch_size
         return BatchOrder(count, batch, self.recipe.seed, self.shares)
 
     @property
     def shares(self) -> list[tuple[int, int]]:
-        """Frames of each set, and how many of an epoch's are of it; empty where each comes once."""
+        """Each set's frame count, and how many an epoch draws; empty if each frame comes once."""
         weights = self.recipe.demos.weights
         if weights is None:
             return []
@@ -182,17 +183,17 @@ class TrainingRun:
         return list(zip(sizes, mixture.drawn(self.demos, weights), strict=True))
 
     def save_checkpoint(self, steps: int, going_on: Mapping[str, Any] | None = None) -> None:
-        """Write a checkpoint, and the ledger so far; of several processes, the first does it.
+        """Write a checkpoint and the ledger so far; with several processes, the first one writes.
 
         Args:
-            going_on: what else a resumed run has to know, for its training state's header.
+            going_on: what else a resumed run needs to know, written to the training state's header.
 
         Raises:
-            AegisError: it cannot be written, or what was trained on has changed meanwhile.
+            AegisError: it cannot be written, or the files trained on have changed meanwhile.
         """
         self.demos.check_files()
         self.watched.check()
-        # The first step of an interval takes a gradient of its own.
+        # The first step of an interval computes its own gradient.
         reused = (self.reused or {}) if self.parts.reuses(steps) else {}
         self.average.follow(steps)
         state = checkpoint.state_of(self.policy, self.optimizers, reused, self.average.weights)
@@ -200,7 +201,7 @@ class TrainingRun:
             state = state._replace(tensors=parallel.gathered(state.tensors, self.ranks))
         if self.ranks.first:
             self._write(steps, state, going_on)
-        # A GPU's own connections would give up on a process that writes for ten minutes.
+        # GPU collectives would time out if the first process writes for ten minutes.
         self.ranks.wait()
 
     def _write(
@@ -215,7 +216,8 @@ class TrainingRun:
             policy = parallel.filled(self.plain, checkpoint.policy_of(state))
             averaged = nullcontext
         # The ledger first. If the process ends between the two, the ledger is ahead of the last
-        # checkpoint, and a resumed run cuts it; one that lacked rows it would have to refuse.
+        # checkpoint, and a resumed run truncates it; a ledger that lacks rows would have to be
+        # refused.
         with checkpoint.writing(self.out):
             ledger_file.save(
                 self.out / "ledger.safetensors",
@@ -249,7 +251,8 @@ class TrainingRun:
                 shutil.rmtree(self.temporary, ignore_errors=True)
             self.temporary = None
         kept = self.recipe.train.keep_checkpoints
-        # That of an interruption goes with the next one, and takes the place of none until then.
+        # The checkpoint of an interruption goes when the next one is written, and replaces none
+        # until then.
         if kept is not None and not going_on:
             retention.prune(self.out, steps, kept, self.recipe)
 
@@ -267,7 +270,7 @@ def build(
 
     Args:
         demos: one set, or several to learn from together.
-        ranks: the processes that take its steps together, each of which builds the same.
+        ranks: the processes that take its steps together, each of which builds the same run.
 
     Raises:
         AegisError: inputs that do not fit together.
@@ -281,14 +284,15 @@ def build(
     backbone, measured = loaded.backbone, loaded.measured
     policy = _begun_policy(recipe, loaded, on_event)
     source = loading.questions(method, recipes.options(recipe), on_event)
-    # Before the method adapts the backbone: an anchor's sites have the names of the plain one.
+    # Before the method adapts the backbone: an anchor's sites are named as in the plain backbone.
     sites = backbone.sites() if measured and (measured.inputs or measured.curvature) else {}
     masters = _adapted(recipe, method, backbone, on_event)
-    # The first process writes checkpoints from an unsharded copy, which has what the method added.
+    # The first process writes checkpoints from an unsharded copy, which includes what the method
+    # added.
     plain = copy.deepcopy(policy) if shards and ranks.first else None
     owners = ranks if shards else ALONE
-    # Sharding puts other parameters in the place of these, so that whatever holds on to them comes
-    # after it: the method's groups, the optimizers and the average.
+    # Sharding replaces the parameters, so whatever holds references to them is made afterwards: the
+    # method's groups, the optimizers and the average.
     if shards:
         parallel.shard(policy, recipe.train.precision, device)
     parts = _start(recipe, method, policy, loaded.demos, measured, sites, source, owners, on_event)
@@ -319,23 +323,23 @@ def build(
 
 
 def _begun_policy(recipe: Recipe, loaded: loading.Loaded, on_event: OnEvent) -> Policy:
-    """The policy as it begins, its backbone in the type that the recipe asks for."""
-    # After the fingerprint: the anchor is of the weights before they are rounded.
+    """The policy before the first step, with its backbone in the dtype that the recipe asks for."""
+    # After the fingerprint: the anchor was measured on the weights before rounding.
     _fit(loaded.backbone, recipe)
-    torch.manual_seed(recipe.seed)  # the expert begins alike under every method
+    torch.manual_seed(recipe.seed)  # the expert has the same initial weights under every method
     return _policy(recipe, loaded.backbone, loaded.demos, on_event)
 
 
 def _adapted(recipe: Recipe, method: Method, backbone: Backbone, on_event: OnEvent) -> Masters:
-    """Make trainable what the method trains and `train.freeze` leaves; return the masters."""
+    """Make trainable what the method trains, unless `train.freeze` names it; return the masters."""
     own = list(backbone.parameters())
     freezing.adapt(method, backbone, recipes.options(recipe), recipe.train.freeze, on_event)
-    # After it, for adapters are wide anyway, and what does not learn needs no master.
+    # Afterwards, since adapters are float32 anyway, and frozen weights need no master.
     return Masters.of(own) if recipe.train.weights == BF16_MASTER else NONE
 
 
 def _average(settings: Train, policy: Policy) -> Average:
-    """The average of what learns, which begins here; of nothing, if none is asked for."""
+    """The average of the trainable weights as they are now; an empty one if none is asked for."""
     if settings.ema_decay is None:
         return Average()
     learning = {name: p for name, p in policy.named_parameters() if p.requires_grad}
@@ -343,17 +347,17 @@ def _average(settings: Train, policy: Policy) -> Average:
 
 
 def _ledger(parts: Parts, backbone: Backbone) -> Ledger:
-    """A ledger of what learns and of all layers, or without columns for one backward pass."""
+    """A ledger of the trainable groups and all layers; without columns for one backward pass."""
     if not parts.dual:
         return Ledger([], [])
     return Ledger(list(backbone.learning_groups()), [f"layers.{i}" for i in range(backbone.depth)])
 
 
 def _fit(backbone: Backbone, recipe: Recipe) -> None:
-    """Do to the backbone what the recipe asks of it.
+    """Apply the recipe's weight dtype and gradient checkpointing to the backbone.
 
     Raises:
-        AegisError: it cannot, or two of these wishes exclude each other.
+        AegisError: the backbone cannot do so, or two settings exclude each other.
     """
     if recipe.train.compile and recipe.train.gradient_checkpointing:
         raise AegisError(
@@ -374,7 +378,7 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
 
 
 def _check_weights(recipe: Recipe, parts: Parts) -> None:
-    """Refuse weights in half precision where the applied update is constrained.
+    """Refuse half-precision weights for a method that constrains the applied update.
 
     The rounding would be as large as the update.
     """
@@ -419,10 +423,11 @@ def _start(
 def _learning_sites(
     backbone: Backbone, sites: Mapping[str, str], options: Mapping[str, Any]
 ) -> dict[str, str]:
-    """The sites that learn.
+    """The trainable sites.
 
     Raises:
-        AegisError: a site of which only a half learns, or none of the kinds that are protected.
+        AegisError: a site of which only a part is trainable, or no trainable site of the protected
+            kinds.
     """
     found = {site: kind for site, kind in sites.items() if not structure.frozen(backbone, site)}
     kinds = options.get("protect", ())  # only nullspace has such an option
@@ -446,9 +451,9 @@ def _vqa_loss(
     waits = devices.reading_stalls(backbone.device)
 
     def make(place: tuple[int, Share]) -> tuple[Any, list[str], list[str], Any]:
-        """The images, questions and answers of a share of a step, as the backbone takes them."""
+        """The images, questions and answers of one share of a step, prepared for the backbone."""
         number, share = place
-        # With the questions of one image side by side, it is passed once.
+        # Questions about the same image are put side by side, so that it is encoded once.
         rows = sorted(order.rows(number)[share.rows(options["batch_size"])].tolist())
         questions = [asked.questions[i] for i in rows]
         images = tensors(asked.images[asked.image_of[rows]])
@@ -460,7 +465,7 @@ def _vqa_loss(
         number, share = place
         return number + 1, share
 
-    # A step would wait for images to be decoded and scaled.
+    # Otherwise a step would wait for images to be decoded and scaled.
     fetch = prefetch.one_ahead(make, same_of_next_step) if waits else make
 
     def loss(seen: Pass) -> Tensor:
@@ -468,7 +473,8 @@ def _vqa_loss(
         said = -backbone.answer_log_likelihood(images, texts, answers, prepared)  # [N]
         if seen.total is None:
             return said.mean()
-        # Divided by the questions of all processes: their gradients are added, not averaged.
+        # Divided by the questions of all processes: gradients are summed over processes, not
+        # averaged.
         return said.sum() / seen.total(said.new_tensor(len(texts)))
 
     return loss
@@ -493,14 +499,14 @@ def _policy(
 
 
 def is_spread(scale: Normalizer, normalization: str, demos: Demonstrations) -> bool:
-    """Whether a scale of absolute actions is how far these vary over the training frames."""
-    # An action that hardly varies beside its mean has a scale of 1, or 0.
+    """Whether a scale of absolute actions is their standard deviation over the training frames."""
+    # An action that hardly varies compared with its mean has a scale of 1, or 0.
     found, spread = scale.std.cpu().double(), torch.tensor(demos.action_std).double()
     return normalization == "mean_std" and torch.allclose(found, spread, rtol=1e-4)
 
 
 def view(demos: Demonstrations, backbone: Backbone) -> PolicyMeta:
-    """How the policy looked at its demonstrations: of its meta, `cameras` and `pictures`."""
+    """How the policy saw its demonstrations: the entries `cameras` and `pictures` of its meta."""
     found: dict[str, Any] = {}
     if demos.cameras:
         found["cameras"] = list(demos.cameras)
@@ -527,6 +533,6 @@ def expert_shape(
         chunk=recipe.train.chunk,
         width=recipe.expert.width,
         mlp_ratio=recipe.expert.mlp_ratio,
-        # None where they are equal, which is how a shape without grouped queries is written.
+        # None if they are equal: a shape without grouped-query attention is written so.
         kv_heads=backbone.kv_heads if backbone.kv_heads != backbone.heads else None,
     )

@@ -1,9 +1,9 @@
-"""An exponential moving average of the weights; where it is asked for, checkpoints hold it.
+"""An exponential moving average of the weights, which checkpoints hold if the recipe asks for it.
 
-The weights of a flow-matching policy jitter with the noise of their batches, and their average
-acts more steadily: diffusion policies and openpi's pi0 are used by it. Training itself goes on from
-the weights as they are. A checkpoint's backbone and expert are the average, and so is what the
-validation loss is taken of; the training state has both.
+The weights of a flow-matching policy jitter with the noise of their batches, and their average acts
+more steadily: diffusion policies and openpi's pi0 are evaluated with it. Training itself continues
+from the raw weights. A checkpoint's backbone and expert are the average, and the validation loss is
+computed with it; the training state holds both.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ class Average:
     """The average of the weights after every step; without parameters it does nothing.
 
     After step n the average moves by 1 - d towards the weights, where d is the smaller of the decay
-    and (1 + n) / (10 + n). So it forgets where it began sooner than its decay alone would let it:
-    the action expert begins as noise.
+    and (1 + n) / (10 + n). So it forgets its initial value sooner than with the decay alone: the
+    action expert starts from random weights.
 
     Attributes:
-        weights: the average by the parameters' names, sharded as they are.
+        weights: the averages by parameter name, sharded like the parameters.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter] | None = None, decay: float = 0.0):
-        """Begin with the weights as they are.
+        """Start the average at the current weights.
 
         Raises:
-            AegisError: weights that are narrower than float32, in which small steps are lost.
+            AegisError: weights are narrower than float32, in which small steps would be lost.
         """
         self._parameters = dict(parameters or {})
         self._decay = decay
@@ -53,18 +53,19 @@ class Average:
 
     @torch.no_grad()
     def follow(self, step: int | Tensor) -> None:
-        """Move towards the weights after `step` steps; nothing changes where that was done.
+        """Move towards the weights after `step` steps; does nothing if that was already done.
 
-        Steps that a method constrains together count one by one, each with the constrained weights.
+        Steps that a method constrains together count individually, each with the constrained
+        weights.
 
         Args:
-            step: a tensor [] float64 where to read it would be to wait.
+            step: a float64 tensor [] if reading it would wait for the GPU.
         """
         waited = step - self._step
         if not self._parameters or (not isinstance(waited, Tensor) and waited <= 0):
             return
         decay = self._decay_after(step) ** waited
-        # In place through the local rows: the average stays sharded as the weights are.
+        # In place through the local rows: the average stays sharded like the weights.
         means = [rows_here(mean) for mean in self.weights.values()]
         now = [rows_here(p) for p in self._parameters.values()]
         if isinstance(decay, Tensor):
@@ -75,26 +76,26 @@ class Average:
         self._step = step
 
     def _decay_after(self, step: int | Tensor) -> float | Tensor:
-        """What one step leaves of the average, the last of `step` steps."""
+        """The decay factor of the last of `step` steps."""
         early = (1 + step) / (10 + step)
         if isinstance(early, Tensor):
             return early.clamp(max=self._decay)
         return min(self._decay, early)
 
     def check(self, tensors: Mapping[str, Tensor], source: str) -> None:
-        """Raise AegisError for what cannot be put back, being no average of these weights."""
+        """Raise AegisError if `tensors` are not an average of these weights."""
         check_state(source, tensors, self._parameters)
 
     @torch.no_grad()
     def put_back(self, step: int, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from the average after `step` steps."""
+        """Restore the average after `step` steps."""
         for name, mean in self.weights.items():
             mean.copy_(sharded_as(tensors[name].to(mean.device), mean))
         self._step = step
 
     @contextlib.contextmanager
     def in_place(self) -> Generator[None]:
-        """Let the parameters have the average's values inside the block, and their own after it."""
+        """Give the parameters the average's values inside the block, and their own after it."""
         self._exchange()
         try:
             yield
@@ -103,9 +104,10 @@ class Average:
 
     @torch.no_grad()
     def _exchange(self) -> None:
-        """Give the parameters the average's values and the average theirs, one by one.
+        """Swap the values of parameters and averages, one parameter at a time.
 
-        Values are swapped in place: the optimizer, compiled passes and FSDP hold on to the memory.
+        Values are swapped in place: the optimizer, compiled passes and FSDP hold references to the
+        memory.
         """
         for name, parameter in self._parameters.items():
             own, mean = rows_here(parameter), rows_here(self.weights[name])

@@ -1,4 +1,4 @@
-"""The model card of an exported backbone: what was done to it, on what, and how to go on."""
+"""The model card of an exported backbone: how it was trained, on what, and what to do next."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ processor = AutoProcessor.from_pretrained(folder)
 
 @dataclass(frozen=True)
 class Data:
-    """The demonstrations: their task and cameras, as far as they name any, and frames per use."""
+    """The demonstrations: their task and cameras, if they name any, and frames per split."""
 
     task: str | None
     cameras: Sequence[str]
@@ -87,13 +87,13 @@ def text(
     """The card after `steps` steps; equal runs give equal cards.
 
     Args:
-        inputs: sha256 of what the run was made from, by a name for it.
-        ledger: with one row per step, where the method reads the anchor.
-        began_as: of a policy's meta.
+        inputs: sha256 of each of the run's inputs, by a name for it.
+        ledger: with one row per step if the method reads the anchor.
+        began_as: as in a policy's meta.
     """
     settings, options = recipe.train, recipes.options(recipe)
     asks = method.trains_on_questions(options)
-    # A method that reads no anchor may have been given one all the same.
+    # A method that reads no anchor may still have been given one.
     read = {name: digest for name, digest in inputs.items() if name != "anchor" or method.needs}
     cameras = ", then ".join(f"`{camera}`" for camera in data.cameras)
     return _CARD.format(
@@ -123,10 +123,10 @@ def text(
 
 
 def model(recipe: Recipe | RobotStreamRecipe, began_as: str | None) -> str:
-    """What a card calls the model that a run began with, which another run may have trained.
+    """How a card names the model that a run began with, which another run may have trained.
 
     Args:
-        began_as: of a policy's meta.
+        began_as: as in a policy's meta.
     """
     if began_as is None:
         return f"`{without_folders(recipe.backbone)}`"
@@ -134,15 +134,15 @@ def model(recipe: Recipe | RobotStreamRecipe, began_as: str | None) -> str:
 
 
 def without_folders(name: str) -> str:
-    """What a card calls a model or a file of questions: it tells nobody where these lie."""
+    """How a card names a model or a file of questions: without the folder that it lies in."""
     return Path(name).name if Path(name).is_absolute() else name
 
 
 def without_places(value: Any, key: str = "") -> Any:
-    """A recipe or a part of it, in which no model, data or questions say in what folder they lie.
+    """A recipe or a part of it, without the folders in which models, data and questions lie.
 
     Args:
-        key: whose value it is.
+        key: the key whose value it is.
     """
     if isinstance(value, Mapping):
         return {name: without_places(inner, name) for name, inner in value.items()}

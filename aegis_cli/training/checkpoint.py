@@ -1,7 +1,7 @@
 """The run folder: checkpoints written aside and renamed, and what is read back from them.
 
 recipe.yaml  ledger.safetensors  metrics.jsonl
-checkpoints/000500/backbone/model.safetensors        a plain VLM; of the hub's layout with
+checkpoints/000500/backbone/model.safetensors        a plain VLM; in the hub's layout with
                                                      config.json, the processor's files and a
                                                      README.md
                    expert.safetensors                the action expert and its scales
@@ -52,11 +52,11 @@ _AVERAGE = "average."
 _OTHER_CAMERAS = (
     "roll it out on its own robot, or train on one of them with --set demos.camera=NAME"
 )
-_BUFFER = "buffer."  # of a running average that training passes write, as BatchNorm's
+_BUFFER = "buffer."  # of a running average that training passes update, such as BatchNorm's
 
 
 class State(NamedTuple):
-    """What a resumed run puts back: named tensors, and what has no optimizer's state."""
+    """What a resumed run restores: named tensors, and the parameters without optimizer state."""
 
     tensors: dict[str, Tensor]
     stateless: list[str]
@@ -71,7 +71,7 @@ def state_of(
     """The state of a run.
 
     Args:
-        reused: the anchor gradient that the next step shares with those before, by the backbone's
+        reused: the anchor gradient that the next step shares with earlier steps, by the backbone's
             parameter names.
         average: of the weights, by the policy's parameter names.
     """
@@ -84,13 +84,13 @@ def state_of(
 
 
 def policy_of(state: State) -> dict[str, Tensor]:
-    """What others are to use, by the policy's names: weights, or their averages, and buffers."""
+    """What users of a policy load, by its names: weights or their averages, and buffers."""
     weights = _named(optimizer_state.WEIGHT, state.tensors) | _named(_AVERAGE, state.tensors)
     return weights | _named(_BUFFER, state.tensors)
 
 
 def _running(policy: Policy) -> dict[str, Tensor]:
-    """The buffers that training passes write, by the policy's names."""
+    """The buffers that training passes update, by the policy's names."""
     found = {}
     for name, module in structure.averaging(policy.backbone).items():
         for leaf, buffer in module.named_buffers(recurse=False):
@@ -114,15 +114,16 @@ def save(
 ) -> Path:
     """Write checkpoint `step` of the run in `folder` and point `checkpoints/last` at it.
 
-    If `last` already points at a complete checkpoint of this step, that stays: there has to be one
-    at every moment. From the header of its training state goes what an interruption has left there.
+    If `last` already points at a complete checkpoint of this step, that one stays, since there has
+    to be one at every moment; only what an interruption left in the header of its training state is
+    removed.
 
     Args:
         policy: its weights are those of `state`, or of its average.
-        card: written beside a model of the Hugging Face Hub.
+        card: written beside the model if it has the Hugging Face layout.
         going_on: written into the header of the training state.
-        wide: as of `plain_backbone`.
-        averaged: inside its block the policy has the weights that others are to use.
+        wide: as in `plain_backbone`.
+        averaged: a context in which the policy has the weights that its users load.
     """
     described = {**meta, "step": step, optimizer_state.STATELESS: state.stateless}
     target = folder / "checkpoints" / f"{step:06d}"
@@ -147,7 +148,8 @@ def save(
     aside = target.with_name(f".{target.name}.tmp")
     try:
         with writing(folder):
-            # Another step's is of a process that was killed, for this one has the folder alone.
+            # One of another step was left by a killed process: this process has the folder to
+            # itself.
             for left in (aside, *aside.parent.glob(".*.tmp")):
                 shutil.rmtree(left, ignore_errors=True)
             (aside / STATE.parent).mkdir(parents=True)
@@ -157,8 +159,9 @@ def save(
             files.begin_to_write(aside)
             write_state(aside / STATE)
             files.reach_disk(aside)
-            # `last` moves only when the new checkpoint is complete under its own name. What may lie
-            # under that name, as in a run that was taken back to an earlier step, is not `last`.
+            # `last` moves only once the new checkpoint is complete under its own name. An old
+            # checkpoint of that name, as in a run that was set back to an earlier step, is not
+            # `last`.
             shutil.rmtree(target, ignore_errors=True)
             os.rename(aside, target)
             point_last_at(target)
@@ -176,7 +179,7 @@ def write_policy(
     seed: int | None,
     card: str = "",
 ) -> None:
-    """Write into an existing folder what a policy's user needs: its plain backbone, its expert."""
+    """Write a policy's plain backbone and its expert into an existing folder."""
     plain.save(folder / BACKBONE)
     if card and model_folder.is_model(folder / BACKBONE):
         files.write_text(folder / BACKBONE / "README.md", card)
@@ -184,10 +187,10 @@ def write_policy(
 
 
 def plain_backbone(backbone: Backbone, method: Method, wide: bool = False) -> Backbone:
-    """A copy of the backbone without what the method has added; itself where that is nothing.
+    """A copy of the backbone without the method's additions; the backbone itself if there are none.
 
     Args:
-        wide: whether weights become float32 before what was added is merged into them.
+        wide: whether weights are cast to float32 before the additions are merged into them.
     """
     if method.export is None:
         return backbone
@@ -222,10 +225,10 @@ def _save_expert(
 
 
 def point_last_at(target: Path) -> None:
-    """Let `checkpoints/last` lead to this checkpoint."""
+    """Point `checkpoints/last` at this checkpoint."""
     link = target.with_name(LAST)
-    # A link cannot be changed in one step, but another one can be renamed over it. It is relative,
-    # so that a run folder may be moved.
+    # A link cannot be changed atomically, but a new one can be renamed over it. It is relative, so
+    # that a run folder can be moved.
     fresh = target.with_name(f".{LAST}.tmp")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target.name)
@@ -237,7 +240,7 @@ def point_last_at(target: Path) -> None:
 
 @contextlib.contextmanager
 def writing(folder: Path) -> Generator[None]:
-    """Turn a failing disk, also as safetensors reports it, into the one error that a user sees."""
+    """Turn a disk failure, including one reported by safetensors, into an AegisError."""
     try:
         yield
     except (OSError, SafetensorError) as error:
@@ -256,20 +259,20 @@ def whole(folder: Path) -> list[Path]:
 
 
 def numbered(folder: Path) -> list[Path]:
-    """What lies in a run's checkpoints under the number of a step, in the steps' order.
+    """The entries of a run's checkpoints folder that are named by a step, in order of the steps.
 
-    The names of a millionth step and of those after it have more digits than those before.
+    They are sorted as numbers: from step 1,000,000 on the names have more digits.
     """
     named = (Path(folder) / "checkpoints").glob("[0-9]*")
     return sorted((path for path in named if path.name.isdecimal()), key=lambda p: int(p.name))
 
 
 def begun(folder: Path) -> bool:
-    """Whether a run has a checkpoint to go on from.
+    """Whether a run has a checkpoint to resume from.
 
     Raises:
-        AegisError: it has some, and `checkpoints/last`, a link that some copying leaves out, leads
-            to none of them.
+        AegisError: it has checkpoints, but `checkpoints/last` leads to none of them; some ways of
+            copying leave out links.
     """
     link = Path(folder) / "checkpoints" / LAST
     if (link / EXPERT).is_file():
@@ -287,7 +290,7 @@ def kept_state(run: Path) -> Path:
     """The file of the training state in a run's last checkpoint.
 
     Raises:
-        AegisError: none, as in a merged run.
+        AegisError: there is none, as in a merged run.
     """
     state = last(run) / STATE
     if not state.is_file():
@@ -304,10 +307,11 @@ def last(folder: Path) -> Path:
     """The newest complete checkpoint of a run.
 
     Raises:
-        AegisError: no run, or a run without a checkpoint.
+        AegisError: this is no run, or a run without a checkpoint.
     """
     path = Path(folder) / "checkpoints" / LAST
     if not (path / EXPERT).is_file():
+        model_folder.refuse_foreign_policy(Path(folder))
         raise AegisError(
             f"no checkpoint in '{folder}'",
             "a run folder with checkpoints/last, the folder of one of its checkpoints, or a "
@@ -318,19 +322,19 @@ def last(folder: Path) -> Path:
 
 
 def _not_asked(folder: Path) -> str:
-    """What to add to the advice for a folder that may have been meant as an id on the hub."""
+    """What to add to the advice if the folder may have been meant as an id on the hub."""
     return "" if Path(folder).exists() else hub.not_asked(str(folder))
 
 
 def chosen(folder: Path) -> Path:
-    """A checkpoint's own folder as it is, and of a run the newest one, as `last` finds it."""
+    """The folder itself if it is a checkpoint, else the run's newest one, as `last` finds it."""
     return Path(folder) if is_one(folder) else last(folder)
 
 
 def is_one(folder: Path) -> bool:
     """Whether a folder is a checkpoint.
 
-    The run of a stream of robot tasks has files of the same names, and a recipe.
+    The run of a stream of robot tasks has files of the same names, but also a recipe.
     """
     folder = Path(folder)
     return (
@@ -341,19 +345,19 @@ def is_one(folder: Path) -> bool:
 
 
 def run_of(path: Path) -> Path | None:
-    """The run that a checkpoint's folder lies in; None where it has been taken out of one."""
-    # `RUN/checkpoints/last` says by its own name where it lies; of another link only its target
-    # does.
+    """The run that a checkpoint's folder lies in; None if it does not lie in one."""
+    # `RUN/checkpoints/last` shows by its own path which run it lies in; for another link only the
+    # target does.
     inside = path if path.parent.name == "checkpoints" else path.resolve()
     run = inside.parent.parent
     return run if (run / "recipe.yaml").is_file() else None
 
 
 def step_of(path: Path) -> int:
-    """After how many steps a checkpoint was written.
+    """The number of steps after which a checkpoint was written.
 
-    Where `last` was copied as a folder, its files say so: its state does, and where it has none, as
-    after a merge, the checkpoint beside it that has the same expert.
+    If `last` was copied as a folder, the step is read from its training state or, if it has none,
+    as after a merge, from the name of the checkpoint beside it that has the same expert.
     """
     name = path.resolve().name
     if name.isdecimal():
@@ -367,16 +371,16 @@ def step_of(path: Path) -> int:
 
 
 def load_policy(folder: str | Path) -> tuple[Policy, PolicyMeta]:
-    """The policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
+    """Load the policy of a checkpoint, of a run's last one, or of a folder in LeRobot's layout.
 
-    How its chunks are executed is read from the recipe of its run, where it lies in one: a job's
-    `rollout` may be another than when it was trained.
+    How its chunks are executed is read from the recipe of its run, if it lies in one: a job's
+    `rollout` may have changed since training.
 
     Args:
         folder: such a folder, or the id on the hub of a policy that was pushed.
 
     Raises:
-        AegisError: files that are missing, broken, or not of one checkpoint.
+        AegisError: files are missing, broken, or from different checkpoints.
     """
     folder = download.locate(folder)
     if lerobot_folder.is_policy(folder):
@@ -393,14 +397,14 @@ def load_policy(folder: str | Path) -> tuple[Policy, PolicyMeta]:
 
 
 def check_task(meta: PolicyMeta, task: str | None) -> None:
-    """Raise AegisError for a task that is asked of a policy and is not the one that it has."""
+    """Raise AegisError if the requested task is not the policy's own."""
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
         raise AegisError(said, "its own", "leave out the task")
 
 
 def _executed_now(path: Path, meta: PolicyMeta) -> PolicyMeta:
-    """A checkpoint's meta with `replan` and `ensemble` as its run's recipe says them by now."""
+    """A checkpoint's meta with `replan` and `ensemble` as they are now in its run's recipe."""
     run = run_of(path)
     now = meta.copy()
     if run is None:
@@ -414,7 +418,7 @@ def _executed_now(path: Path, meta: PolicyMeta) -> PolicyMeta:
 
 
 def load_expert(folder: str | Path) -> tuple[ActionExpert, PolicyMeta]:
-    """The expert alone of what `load_policy` takes, and the meta."""
+    """Load only the expert and the meta of what `load_policy` accepts."""
     folder = download.locate(folder)
     if lerobot_folder.is_policy(folder):
         policy, meta = lerobot_folder.load(folder)
@@ -423,7 +427,7 @@ def load_expert(folder: str | Path) -> tuple[ActionExpert, PolicyMeta]:
 
 
 def expert_sha256(folder: str | Path) -> str:
-    """sha256 of the file with the expert of what `load_policy` takes."""
+    """sha256 of the file that holds the expert, for what `load_policy` accepts."""
     return files.sha256_file(_expert_file(folder))
 
 
@@ -438,7 +442,7 @@ def _load_expert(
     """The expert in a checkpoint's file, the meta, and the scales of proprioception and actions.
 
     Args:
-        backbone: the one that it has to be of; None: any.
+        backbone: the backbone that it has to belong to; None: any.
     """
     artifact = artifacts.load(
         file, "expert", fingerprint=None if backbone is None else backbone.fingerprint()
@@ -450,8 +454,8 @@ def _load_expert(
             check_fit(shape, backbone.depth, backbone.heads, backbone.head_dim)
         policy_meta.check(meta, shape.actions, shape.proprio)
         relative_of(meta, shape.actions, shape.proprio)
-    # The expert that the header describes, without memory: the file's tensors are compared with it
-    # before one of that size is made.
+    # The expert that the header describes, without allocating memory: the file's tensors are
+    # compared with it before an expert of that size is made.
     with outline(file):
         wanted = {f"expert.{name}": t for name, t in ActionExpert(shape).state_dict().items()}
         for kind, size in (("proprio", shape.proprio), ("action", shape.actions)):
@@ -468,22 +472,22 @@ def _load_expert(
 
 
 def sizes_of(meta: PolicyMeta) -> tuple[tuple[int, int], ...]:
-    """(height, width) of the pictures that each camera showed in training; () where none is known.
+    """(height, width) of the pictures that each camera showed in training; () if unknown.
 
-    Only a backbone that reads pictures of any size has to know.
+    Only a backbone that accepts pictures of any size needs them.
     """
     return tuple((height, width) for height, width in meta.get("pictures", ()))
 
 
 def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
-    """The cameras of a simulated task that a policy looks by; empty for the task's own.
+    """The cameras of a simulated task that a policy sees through; empty for the task's default.
 
     Raises:
-        AegisError: it was trained on others.
+        AegisError: it was trained on other cameras.
     """
     named = meta.get("cameras", ())
     found = seen_by(meta, task)
-    known = () if task is None else sim.cameras(task)  # the first is the task's own
+    known = () if task is None else sim.cameras(task)  # the first is the task's default
     if len(found) == 1 and found[0] not in known[1:]:
         return ()  # whatever the only camera is called
     if not set(found) <= {*known}:
@@ -506,10 +510,10 @@ def cameras_of(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
 
 
 def seen_by(meta: PolicyMeta, task: str | None) -> tuple[str, ...]:
-    """The names of a policy's cameras, in short, as a simulated task has them where it does.
+    """The short names of a policy's cameras, as the simulated task names them if it has them.
 
-    One that was renamed for the policy is known by the name that it had before, or by the new one
-    where the task has none of the old.
+    A camera that was renamed for the policy is looked up by its old name, or by the new one if the
+    task has no camera of the old name.
     """
     before = {layout.short(new): layout.short(old) for old, new in meta.get("rename", {}).items()}
     now = [layout.short(name) for name in meta.get("cameras", ())]
@@ -522,14 +526,14 @@ def restore(
     optimizers: Sequence[torch.optim.Optimizer],
     average: Average,
 ) -> tuple[int, Mapping[str, Any], dict[str, Tensor]]:
-    """Put the last checkpoint's training state back, and the average that a run may keep.
+    """Restore the last checkpoint's training state, and the average if the run keeps one.
 
     Returns:
-        How many steps it has behind it, the meta of its header, and the anchor gradient that the
-        next step reuses, by the backbone's parameter names: empty where that takes its own.
+        The number of steps taken, the meta of the state's header, and the anchor gradient that the
+        next step reuses, by the backbone's parameter names: empty if it computes its own.
 
     Raises:
-        AegisError: a state that is damaged, or not of this policy; nothing was put back.
+        AegisError: the state is damaged, or not of this policy; nothing was restored.
     """
     path = last(folder) / STATE
     saved = artifacts.load(path, "training-state")
@@ -539,7 +543,7 @@ def restore(
             raise ValueError(f"a state after {step} steps")
         bare = optimizer_state.said_stateless(saved.header.meta)
     # Every kind of tensor is checked before the first value is changed. `from_tensors` comes last
-    # among the checks, since it puts its own back at once.
+    # among the checks, since it restores its own tensors at once.
     reused = _reused(path, saved.tensors, policy.backbone)
     average.check(_named(_AVERAGE, saved.tensors), f"the average in '{path}'")
     running, buffers = _running(policy), _named(_BUFFER, saved.tensors)
@@ -555,7 +559,7 @@ def restore(
 
 
 def _named(kind: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of a kind, without the prefix that says so."""
+    """The tensors of one kind, without the prefix that marks it."""
     return {name.removeprefix(kind): t for name, t in tensors.items() if name.startswith(kind)}
 
 

@@ -1,4 +1,4 @@
-"""`aegis train --dry-run`: check everything that a training needs, and estimate what it costs."""
+"""`aegis train --dry-run`: check everything that a training run needs, and estimate its cost."""
 
 from __future__ import annotations
 
@@ -50,41 +50,41 @@ T = TypeVar("T")
 
 MB = 1e6
 WRITTEN_COPIES = 3  # copies of a tensor while it is checked, hashed and written, as measured
-TIMED_STEPS = 3  # steps, after a first one that pays for what is done once
+TIMED_STEPS = 3  # steps, after a first one that includes one-time work
 
 
 @dataclass(frozen=True)
 class DryRunReport:
-    """What a training would do.
+    """What a training run would do.
 
-    Megabytes are estimates, but for those measured, and of the process that needs most. Activations
-    are those of one frame, times the frames of a pass.
+    Megabytes are estimates unless they are said to be measured, and are those of the process that
+    needs the most. Activations are those of one frame times the frames of a pass.
 
     Attributes:
-        precision: of the matrix products, bf16 or float32, also where the recipe says `auto`.
+        precision: of the matrix products, bf16 or float32, even if the recipe says `auto`.
         processes: how many share the training.
         parameters, trainable: of backbone and expert; groups: of the backbone, by the groups that
             are projected.
         cameras: of a LeRobot folder, in the order in which the prompt shows their frames.
-        training_frames: those that are not held out; epochs: how often each is seen, or with
-            `demos.weights` is seen in the mean.
-        sets: of several sets of demonstrations, by their paths, what is said of all together and
-            the `share` of the frames that are seen; None where there is one.
-        tokens_per_frame: of one frame (of all cameras) with its instruction.
-        memory_mb: by what takes it; `method` is what the method keeps from beginning to end.
-        memory_measured_mb: the most that building and these steps took, and what a checkpoint takes
-            more; None where no step was taken.
-        memory_together_mb: measured, else estimated, of all processes on one machine, whose memory
-            they share; None on GPUs, of which each has its own, and of one process.
+        training_frames: those that are not held out; epochs: how often each is seen; with
+            `demos.weights`, on average.
+        sets: for each of several sets of demonstrations, by path, the same figures and its `share`
+            of the frames that are seen; None if there is one set.
+        tokens_per_frame: of one frame (all cameras) with its instruction.
+        memory_mb: by purpose; `method` is what the method keeps throughout the run.
+        memory_measured_mb: the peak while building and taking these steps, plus what a checkpoint
+            needs in addition; None if no step was taken.
+        memory_together_mb: measured, else estimated, for all processes on one machine, which share
+            its memory; None on GPUs, which each have their own, and for a single process.
         memory_fits: by what was measured, else by the estimate.
-        memory_free_mb: where training would run, None if that is not known.
-        step_s: of one step, the mean of three, or of as many as a method's constraint or anchor
-            gradient serves; None where memory does not suffice to take them.
-        validation_s: of one validation, by what takes them: its `loss`, `questions`, `episodes` if
-            none ends early, and predicted `actions`; None where memory does not suffice.
-        hours: of the steps still to be taken and the validations, without checkpoints.
-        checkpoints, disk_mb: those still to be written, as many as lie there at one time;
-            disk_free_mb: where they would be.
+        memory_free_mb: on the device that training would run on; None if not known.
+        step_s: of one step, the mean of three, or of as many steps as share a method's constraint
+            or anchor gradient; None if there is not enough memory to take them.
+        validation_s: of one validation, by part: its `loss`, `questions`, `episodes` if none ends
+            early, and predicted `actions`; None if there is not enough memory.
+        hours: for the remaining steps and validations, without checkpoints.
+        checkpoints, disk_mb: those still to be written, at most as many as exist at one time;
+            disk_free_mb: on the disk that they would be written to.
     """
 
     method: str
@@ -118,7 +118,7 @@ class DryRunReport:
 
     @property
     def memory_needed_mb(self) -> float:
-        """What was measured, else the estimate, of all that share what is free."""
+        """What was measured, else the estimate, for all processes that share the free memory."""
         if self.memory_together_mb is not None:
             return self.memory_together_mb
         measured = self.memory_measured_mb
@@ -126,7 +126,7 @@ class DryRunReport:
 
     def to_json(self) -> dict[str, Any]:
         values = dataclasses.asdict(self)
-        values["tokens_a_frame"] = self.tokens_per_frame  # its name before; it goes after 0.1
+        values["tokens_a_frame"] = self.tokens_per_frame  # its old name; it goes after 0.1
         return values
 
 
@@ -142,7 +142,7 @@ def run(
 ) -> DryRunReport:
     """Build the training, pass one frame through it, time some steps, and write nothing.
 
-    Where torchrun has started several processes, each calls this, and they share the steps.
+    If torchrun has started several processes, each calls this, and they share the steps.
 
     Raises:
         AegisError: what `train` would raise before its first step.
@@ -169,7 +169,7 @@ def _planned(
     ranks: Ranks,
 ) -> DryRunReport:
     device = devices.pick()
-    # Before this process itself takes some, or another one on its machine.
+    # Before this process, or another one on its machine, allocates any.
     there, free, base = _alive(device), memory.free(device), memory.restart_peak(device)
     ranks.wait()
     method = methods.get(recipe.train.method)
@@ -194,7 +194,7 @@ def _planned(
     written = [] if overwrite else checkpoint.whole(out)
     disk = _disk(training, written)
     buffers = WrittenBuffers(training.policy.backbone)
-    # Last of all: the steps fill what the optimizer keeps, and move the weights.
+    # Last of all: the steps fill the optimizer state and change the weights.
     needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
     return _report(training, tokens, needs, free, disk, _done(written))
@@ -203,12 +203,12 @@ def _planned(
 def _report(
     training: TrainingRun, tokens: int, needs: _Needs, free: int | None, disk: _Disk, done: int
 ) -> DryRunReport:
-    """What was found, in megabytes and hours.
+    """The report of what was found, in megabytes and hours.
 
     Args:
         tokens: of one frame.
         free: bytes of memory before anything was built.
-        done: steps that are behind it.
+        done: steps already taken.
     """
     recipe, policy, frames = training.recipe, training.policy, len(training.demos.train)
     groups = policy.backbone.parameter_groups()
@@ -245,7 +245,7 @@ def _report(
 
 
 def _hours(settings: Train, needs: _Needs, done: int) -> float | None:
-    """Hours of the steps after the first `done` ones, and of their validations."""
+    """Hours for the steps after the first `done` ones, and for their validations."""
     if needs.step_s is None or needs.validation_s is None:
         return None
     validations = _left(settings, settings.validate_every, done)
@@ -259,7 +259,7 @@ def _in_mb(size: int | None) -> float | None:
 
 
 def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
-    """What each of several sets of demonstrations has, and how much of it is seen."""
+    """The frames of each of several sets of demonstrations, and how often they are seen."""
     demos, settings = training.demos, training.recipe.train
     counts = mixture.drawn(demos, training.recipe.demos.weights)
     seen = settings.steps * settings.batch_size / len(demos.train)  # epochs of all together
@@ -278,12 +278,12 @@ class _Needs(NamedTuple):
     """What the processes need, in bytes.
 
     Attributes:
-        parts: the largest estimate, by what takes them.
-        measured: the most that a process took; None where no step was taken.
-        together: of the processes that share a machine's memory; None where none do.
-        fits: whether every process has what it needs; None where it is not known what is free.
-        step_s: seconds per step; None where none was taken.
-        validation_s: seconds of one validation, by what takes them; None where none was begun.
+        parts: the largest estimate, by purpose.
+        measured: the most that a process took; None if no step was taken.
+        together: for the processes that share a machine's memory; None if none do.
+        fits: whether every process has what it needs; None if the free memory is not known.
+        step_s: seconds per step; None if none was taken.
+        validation_s: seconds of one validation, by part; None if none was started.
     """
 
     parts: dict[str, int]
@@ -302,11 +302,11 @@ def _needs(
     ranks: Ranks,
     on_event: OnEvent,
 ) -> _Needs:
-    """What the processes need, by steps that they take if the estimate fits.
+    """What the processes need, measured on some steps if the estimate fits.
 
     Args:
-        parts: this process's estimate, in bytes by what takes them.
-        free: bytes before anything was built; `base` are those that the process had then.
+        parts: this process's estimate, in bytes by purpose.
+        free: free bytes before anything was built; `base` is what the process used then.
     """
     device, needed = training.policy.backbone.device, sum(parts.values())
     fits = fits_in(needed, free, device, ranks)
@@ -314,13 +314,13 @@ def _needs(
     if fits is not False:
         step_s = where_it_fits(partial(_timed, training, on_event), ranks)
         if step_s is not None:
-            # After the steps, for gradients and what the optimizer keeps are there while it
-            # validates: together they are part of the training's peak.
+            # After the steps, since gradients and optimizer state exist during a validation:
+            # together they are part of the training's peak.
             measure = partial(validation_time.measured, training, on_event)
             validation_s = where_it_fits(measure, ranks)
-        fits = False  # unless both show that it does
+        fits = False  # unless both measurements succeed
     if validation_s is not None:
-        # No checkpoint was written: its share is still the estimate's.
+        # No checkpoint was written: its share is still estimated.
         needed = memory.peak(device) - base + parts["checkpoint"]
         measured = max(ranks.gathered(needed))
         fits = fits_in(needed, free, device, ranks)
@@ -330,16 +330,16 @@ def _needs(
 
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
-    """The most frames that one process passes at once."""
+    """The most frames that one process puts through the model at once."""
     # -(-a // b) rounds up: shares differ by one frame at most, and the largest decides.
     return -(-settings.batch_size // (ranks.count * settings.accumulate))
 
 
 def _together(needed: int, device: torch.device, ranks: Ranks) -> int | None:
-    """Bytes that the processes on this one's machine need, where they share its memory."""
+    """Bytes that the processes on this machine need together; None if they do not share memory."""
     if device.type == "cuda" or not ranks.several:
         return None
-    # The launcher numbers the processes of one machine one after the other, and starts as many on
+    # The launcher numbers the processes of one machine consecutively, and starts equally many on
     # each.
     here = launch.local_world_size()
     first = ranks.rank // here * here
@@ -347,7 +347,7 @@ def _together(needed: int, device: torch.device, ranks: Ranks) -> int | None:
 
 
 def fits_in(needed: int, free: int | None, device: torch.device, ranks: Ranks) -> bool | None:
-    """Whether every process has what it needs; None where it is not known what is free."""
+    """Whether every process has what it needs; None if the free memory is not known."""
     together = _together(needed, device, ranks)
     short = free is not None and (needed if together is None else together) > free
     unknown, lacking = ranks.any(free is None, short)
@@ -355,11 +355,11 @@ def fits_in(needed: int, free: int | None, device: torch.device, ranks: Ranks) -
 
 
 def shortage(report: DryRunReport) -> str | None:
-    """What does not fit, on one line, and what to do about it; None where everything does."""
+    """What does not fit, on one line, and what to do about it; None if everything fits."""
     missing = []
     if report.memory_fits is False:
-        assert report.memory_free_mb is not None  # else nobody knows whether it fits
-        # Activations alone shrink with the batch.
+        assert report.memory_free_mb is not None  # otherwise memory_fits is None
+        # Only activations shrink with the batch.
         shared = 1 if report.memory_together_mb is None else report.processes
         rest = report.memory_needed_mb - shared * report.memory_mb["activations"]
         smaller = "use a smaller backbone, or a method that trains less"
@@ -378,9 +378,9 @@ def shortage(report: DryRunReport) -> str | None:
 
 
 def too_little(needed_mb: float, free_mb: float, smaller: str) -> str:
-    """What is said of memory that does not suffice."""
+    """The message if there is not enough memory."""
     needs = f"about {needed_mb:,.0f} MB of memory, and"
-    if needed_mb <= free_mb:  # a step has shown that it is more
+    if needed_mb <= free_mb:  # a step ran out of memory all the same
         needs = f"more memory than the estimate of {needed_mb:,.0f} MB, and"
     return f"training needs {needs} {free_mb:,.0f} MB are free: {smaller}"
 
@@ -390,7 +390,7 @@ def _count(parameters: Iterable[Tensor]) -> int:
 
 
 def _bytes(tensors: Iterable[Tensor]) -> int:
-    """Bytes of whole tensors, wherever their rows are."""
+    """Bytes of whole tensors, including other processes' rows."""
     return sum(t.nbytes for t in tensors)
 
 
@@ -403,11 +403,11 @@ def _bytes_here(tensors: Iterable[Tensor]) -> int:
 
 
 class Passing(NamedTuple):
-    """What passes through which policy.
+    """Which frames are passed through which policy, and how.
 
     Attributes:
         detach: whether the gradient stops at the keys and values.
-        seen: a context in which the weights are those that a pass sees.
+        seen: a context in which the weights are as a training pass sees them.
     """
 
     policy: Policy
@@ -418,10 +418,10 @@ class Passing(NamedTuple):
 
 
 def pass_kept(passing: Passing, frames: int, on_event: OnEvent) -> tuple[int, int]:
-    """Tokens of one frame, and bytes that the forward pass of some keeps for the backward.
+    """Tokens per frame, and bytes that the forward pass of `frames` keeps for the backward pass.
 
-    Passes of two and of three frames tell what grows with the frames from what does not (weights
-    that autocast has rounded). A pass of a single frame would keep less, being no batch.
+    Passes of two and of three frames separate what grows with the frames from what does not
+    (weights that autocast has rounded). A single frame would keep less, since it is no real batch.
     """
     on_event(Progress("dry run (memory)", 0, 2, "passes"))
     tokens, of_two = _pass_some(passing, 2)
@@ -433,24 +433,25 @@ def pass_kept(passing: Passing, frames: int, on_event: OnEvent) -> tuple[int, in
 
 
 def _pass_some(passing: Passing, frames: int) -> tuple[int, int]:
-    """Tokens of a frame, and bytes that a pass keeps of the first frame, so many times over."""
+    """Tokens per frame, and bytes kept by a pass of the first frame repeated `frames` times."""
     settings, policy = passing.settings, passing.policy.train()
-    # One frame over and over, so that passes differ in nothing but how many they are.
+    # The same frame repeated, so that passes differ only in the number of frames.
     batch = passing.demos.batch(passing.demos.train[:1].repeat(frames), settings.chunk)
     own: set[int] = set()
-    # The storages are held, so that no address is given to another one meanwhile.
+    # References keep the storages alive, so that no address is reused meanwhile.
     kept: dict[int, torch.UntypedStorage] = {}
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in own:
             kept[storage.data_ptr()] = storage
-        # Not the tensor itself: an operation that saves its own result would hold on to itself.
+        # Not the tensor itself: an operation that saves its own result would then keep itself
+        # alive.
         return tensor.detach()
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda t: t)
     with passing.seen(), hooks, devices.autocast(policy.backbone.device, settings.precision):
-        # A weight that the graph saves takes no memory of its own.
+        # A weight that the graph saves takes no additional memory.
         own.update(rows_here(p).untyped_storage().data_ptr() for p in policy.parameters())
         encoding = policy.encode(batch.images, batch.instructions)
         generator = torch.Generator().manual_seed(0)
@@ -462,9 +463,9 @@ def _pass_some(passing: Passing, frames: int) -> tuple[int, int]:
 
 
 def _alive(device: torch.device) -> dict[int, torch.UntypedStorage]:
-    """The memory of every tensor on a device, by its address, garbage that is not collected too.
+    """The storages of all tensors on a device by address, including uncollected garbage.
 
-    It is held, so that no address is given to another one meanwhile.
+    References keep them alive, so that no address is reused meanwhile.
     """
     tensors = [thing for thing in gc.get_objects() if type(thing) in (Tensor, nn.Parameter)]
     storages = [t.untyped_storage() for t in map(rows_here, tensors)]
@@ -472,23 +473,23 @@ def _alive(device: torch.device) -> dict[int, torch.UntypedStorage]:
 
 
 def _held(training: TrainingRun, there: Mapping[int, torch.UntypedStorage]) -> int:
-    """Bytes that the method keeps for as long as it works."""
+    """Bytes that the method keeps throughout the run."""
     weights = [*training.policy.parameters(), *training.policy.buffers()]
     known = [*weights, *training.average.weights.values()]
     known += [*training.demos.held, *_plain(training)]
-    # What was there before anything was built, and what is counted under another name.
+    # Tensors from before anything was built, and those counted under another name.
     others = there.keys() | {rows_here(t).untyped_storage().data_ptr() for t in known}
-    gc.collect()  # what only waits to be collected is not kept
+    gc.collect()  # garbage does not count as kept
     alive = _alive(training.policy.backbone.device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in others)
 
 
 def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int]:
-    """Bytes by what takes them at the peak: of a step, or if it takes more, of a checkpoint."""
+    """Bytes by purpose at the peak: of a step or, if that takes more, of a checkpoint."""
     learning = [p for p in training.policy.parameters() if p.requires_grad]
     backbone = [p for p in training.policy.backbone.parameters() if p.requires_grad]
-    # A pass sees weights that are rounded beside their masters, and leaves gradients as narrow. The
-    # step has wide gradients instead of both, or, of several passes, wide sums beside both.
+    # A pass sees rounded weights beside their masters, and leaves gradients in bfloat16 too. The
+    # step has float32 gradients instead of both or, with several passes, float32 sums beside both.
     rounded = training.masters.rounded_bytes
     several = training.recipe.train.accumulate > 1
     on_cpu = training.policy.backbone.device.type == "cpu"
@@ -505,19 +506,19 @@ def _memory(training: TrainingRun, held: int, activations: int) -> dict[str, int
         "weights before the step": _remembered(training),
         "activations": activations,
     }
-    # A checkpoint is written between two steps, when what a step takes is free again: only what it
+    # A checkpoint is written between two steps, when a step's memory is free again: only what it
     # takes beyond that raises the peak.
     more = _while_saving(training) - sum(in_a_step.values())
     return throughout | in_a_step | {"checkpoint": max(0, more)}
 
 
 def _plain(training: TrainingRun) -> list[Tensor]:
-    """The whole weights, on the CPU, by which the first process writes sharded ones."""
+    """The whole weights on the CPU, through which the first process writes sharded ones."""
     return [] if training.plain is None else list(training.plain.parameters())
 
 
 def _remembered(training: TrainingRun) -> int:
-    """Bytes of what is kept of the weights while steps wait for the method to constrain them."""
+    """Bytes of the copies of weights kept while steps wait for the method to constrain them."""
     parts = training.parts
     if parts.copies:
         return _bytes_here(p for p in training.policy.backbone.parameters() if p.requires_grad)
@@ -525,20 +526,20 @@ def _remembered(training: TrainingRun) -> int:
         return 0
     device = training.policy.backbone.device
     there = _alive(device)
-    parts.begin()  # anew before the first step
+    parts.begin()  # called again before the first step
     gc.collect()
     alive = _alive(device)
     return sum(storage.nbytes() for place, storage in alive.items() if place not in there)
 
 
 def _while_saving(training: TrainingRun) -> int:
-    """Bytes that a checkpoint takes beside what is there throughout."""
+    """Bytes that a checkpoint takes beside what is allocated throughout."""
     largest = max(p.nbytes for p in training.policy.parameters())
     if parallel.is_sharded(training.policy):
-        # One weight after the other is gathered, by all; the first process keeps them on its CPU.
+        # All processes gather one weight after the other; the first one keeps them on its CPU.
         on_cpu = training.policy.backbone.device.type == "cpu" and training.ranks.first
         return _state_bytes(training) + WRITTEN_COPIES * largest if on_cpu else largest
-    # A method that has added something takes it out of a copy.
+    # A method that has added modules removes them from a copy.
     copied = 0 if training.method.export is None else _plain_bytes(training)
     return copied + WRITTEN_COPIES * largest
 
@@ -547,9 +548,9 @@ def _while_saving(training: TrainingRun) -> int:
 
 
 def where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
-    """What was found; None where a GPU has no memory left for what takes it.
+    """The result of `found`; None if a GPU runs out of memory.
 
-    With several processes that is an error, for the others wait in the same step.
+    With several processes that is an error, since the others wait in the same step.
     """
     try:
         return found()
@@ -560,26 +561,26 @@ def where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
 
 
 def _timed(training: TrainingRun, on_event: OnEvent) -> float:
-    """Seconds per step, as the training takes its first ones; nothing is written.
+    """Seconds per step, measured on the training's first steps; nothing is written.
 
     Raises:
-        Diverged: a step that the training would end at, too.
+        Diverged: a step at which the training would end, too.
     """
     settings, parts = training.recipe.train, training.parts
-    # The first step pays for what is done once, and batches are fetched meanwhile: those that a
-    # GPU finds ready say nothing of how long they took, and as many may come together.
+    # The first step includes one-time work, and batches are fetched meanwhile: those that a GPU
+    # finds ready do not show how long they took, and the next ones may arrive in a burst as large.
     ready = train.fetched_ahead(training)
     timed = max(TIMED_STEPS, parts.every, parts.refresh, ready)
     ahead = 1 + ready
     steps = range(min(ahead + timed, settings.steps))
-    first = steps[ahead : ahead + 1] or steps  # the first that counts
+    first = steps[ahead : ahead + 1] or steps  # the first that is timed
     window, started_s = train.Window(), 0.0
     training.policy.train()
     on_event(Progress("dry run", 0, len(steps), "steps"))
     with train.batches_of(training, steps) as batches:
         for index in steps:
             if index == first[0]:
-                train.read_figures(training, window)  # a GPU has done by then what it was given
+                train.read_figures(training, window)  # waits until the GPU has finished
                 started_s = time.perf_counter()
             train.update(training, index, next(batches), window)
             on_event(Progress("dry run", index + 1, len(steps), "steps"))
@@ -594,7 +595,7 @@ class _Disk(NamedTuple):
     """What checkpoints take, in bytes.
 
     Attributes:
-        checkpoints: those still to be written that lie there at one time.
+        checkpoints: the most of those still to be written that exist at one time.
     """
 
     checkpoints: int
@@ -603,14 +604,14 @@ class _Disk(NamedTuple):
 
 
 def _disk(training: TrainingRun, written: Sequence[Path]) -> _Disk:
-    """What the checkpoints take that are still to be written, and what is free.
+    """The space that the remaining checkpoints take, and the free space.
 
     Args:
-        written: those that are there.
+        written: existing checkpoints.
     """
     to_come, kept = _to_come(training.recipe, written), training.recipe.train.keep_checkpoints
     checkpoints = retention.most_at_once(to_come, len(written), kept)
-    # What is free changes meanwhile: all report what the first, which writes, has seen.
+    # Free space changes meanwhile: all report what the first process, which writes, has seen.
     free = training.ranks.agree(free_disk(training.out))
     return _Disk(checkpoints, checkpoints * _checkpoint_bytes(training), free)
 
@@ -621,23 +622,23 @@ def _to_come(recipe: Recipe, written: Sequence[Path]) -> int:
 
 
 def _left(settings: Train, every: int, done: int) -> int:
-    """How often something still comes that does every so many steps, and after the last one."""
+    """How often something is still due that is done every `every` steps and after the last one."""
     if done >= settings.steps:
         return 0
-    # Rounded up: the last step has one too, whether or not its turn has come.
+    # Rounded up: it is done after the last step, even if that is no multiple of `every`.
     return -(-settings.steps // every) - done // every
 
 
 def _done(written: Sequence[Path]) -> int:
-    """Steps behind a run with these checkpoints."""
+    """Steps taken by a run with these checkpoints."""
     return int(written[-1].name) if written else 0
 
 
 def _checkpoint_bytes(training: TrainingRun) -> int:
     """Bytes of a plain backbone, the expert, and what --resume needs.
 
-    That is every weight, the optimizer's moments of each that learns, and an anchor gradient that
-    later steps share.
+    The latter is every weight, the optimizer's moments of the trainable ones, and an anchor
+    gradient that later steps share.
     """
     plain = _plain_bytes(training)
     expert = _bytes(_tensors(training.policy.expert))
@@ -647,16 +648,16 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
 
 def _state_bytes(training: TrainingRun) -> int:
-    """Bytes of all weights, their average and what the optimizers keep, wherever the rows are."""
+    """Bytes of all weights, their average and the optimizer state, over all processes."""
     weights = [*training.policy.parameters(), *training.average.weights.values()]
     return _bytes(weights) + optimizers.state_bytes(training.optimizers)
 
 
 def _plain_bytes(training: TrainingRun) -> int:
-    """Bytes of the backbone, which is written in one type: the widest of its weights."""
+    """Bytes of the backbone, which is written in one dtype: the widest of its weights."""
     backbone = training.policy.backbone
     if training.recipe.train.weights == "bf16":
-        return _bytes(_tensors(backbone))  # into which wider terms of a method are merged
+        return _bytes(_tensors(backbone))  # a method's wider terms are merged into these
     wide = structure.widest(backbone.parameters()).itemsize
     widened = 0
     for parameter in backbone.parameters():
@@ -665,16 +666,16 @@ def _plain_bytes(training: TrainingRun) -> int:
 
 
 def _tensors(module: nn.Module) -> Iterable[Tensor]:
-    """Each once, however many names it has."""
+    """Each tensor once, however many names it has."""
     found: dict[int | str, Tensor] = {}
     for name, tensor in module.state_dict().items():
-        # A process may have no row of a sharded tensor: then it has no address.
+        # A process may have no rows of a sharded tensor: then there is no address.
         found.setdefault(rows_here(tensor).data_ptr() or name, tensor)
     return found.values()
 
 
 def free_disk(out: Path) -> int:
-    """Bytes, where the first folder on the way to `out` is that is there; it has to be writable."""
+    """Free bytes on the disk of the nearest existing folder above `out`, which must be writable."""
     whole = out.absolute()
     there = next(path for path in (whole, *whole.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):

@@ -1,8 +1,8 @@
-"""AdamW whose moments take a byte each: bitsandbytes' (Dettmers et al. 2022, arXiv 2110.02861).
+"""bitsandbytes' AdamW, whose moments take one byte each (Dettmers et al. 2022, arXiv 2110.02861).
 
-Moments are kept as 8-bit codes, with a scale for each block of them, and computed in float32. A
-small parameter's stay float32. What the library makes anew by itself, the tables of what a code
-stands for, goes into no checkpoint.
+Moments are kept as 8-bit codes, with a scale for each block of them, and computed in float32. Those
+of small parameters stay float32. The tables that map codes to values are not saved in checkpoints,
+since the library makes them anew.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from aegis_cli.recipes import Train
 
 STATES = "8bit"  # the value of `train.states`, and a mark in each group of parameters
 _COUNT = "step"
-_SMALLEST = 4096  # entries from which on a parameter's moments are codes
+_SMALLEST = 4096  # the fewest entries of a parameter whose moments are codes
 _BLOCK = 256  # entries that share a scale
-_TABLES = {"qmap1": "dynamic", "qmap2": "udynamic"}  # in a state -> of the optimizer
+_TABLES = {"qmap1": "dynamic", "qmap2": "udynamic"}  # of a state -> of the optimizer
 
 
 def check(settings: Train, ranks: Ranks) -> None:
-    """Refuse 8-bit states where they cannot be.
+    """Refuse 8-bit states if they are not possible.
 
     Raises:
         AegisError: another optimizer, sharded weights, or no bitsandbytes.
@@ -53,8 +53,8 @@ def check(settings: Train, ranks: Ranks) -> None:
 
 
 def adamw(groups: list[dict[str, Any]], settings: Train) -> Optimizer:
-    """AdamW of groups of parameters, each of which it marks."""
-    # It warns of a kernel that has nothing to do with optimizers.
+    """The 8-bit AdamW of these parameter groups, each of which is marked."""
+    # The library warns of a kernel that has nothing to do with optimizers.
     logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
     from bitsandbytes.optim import AdamW8bit
 
@@ -79,7 +79,7 @@ def owns(optimizer: Optimizer) -> bool:
 
 
 def kept(parameter: Tensor) -> dict[str, Tensor]:
-    """What a checkpoint has of a parameter's state, as far as shapes and types go."""
+    """A parameter's state as a checkpoint holds it: shapes and dtypes only."""
     coded = parameter.numel() >= _SMALLEST
     kind = torch.uint8 if coded else torch.float32
     moment = torch.empty_like(parameter, dtype=kind, device="meta")
@@ -92,18 +92,18 @@ def kept(parameter: Tensor) -> dict[str, Tensor]:
 
 
 def state_bytes(parameter: Tensor) -> int:
-    """Bytes of a parameter's state, its count aside."""
+    """Bytes of a parameter's state, without the step count."""
     return sum(tensor.nbytes for name, tensor in kept(parameter).items() if name != _COUNT)
 
 
 def to_tensors(state: dict[str, Any]) -> dict[str, Tensor]:
-    """A parameter's state as a checkpoint has it; the library counts steps by a plain number."""
+    """A parameter's state as a checkpoint holds it; the library's step count is a plain number."""
     found = {name: value for name, value in state.items() if name not in _TABLES}
     return {**found, _COUNT: torch.tensor(float(state[_COUNT]))}
 
 
 def put_back(optimizer: Any, parameter: nn.Parameter, saved: dict[str, Tensor]) -> None:
-    """Give the optimizer a parameter's state, as `to_tensors` took it."""
+    """Give the optimizer a parameter's state, as saved by `to_tensors`."""
     device = parameter.device
     state: dict[str, Any] = {n: t.to(device, copy=True) for n, t in saved.items()}
     state[_COUNT] = int(saved[_COUNT])

@@ -1,4 +1,4 @@
-"""A run folder's `recipe.yaml` and `metrics.jsonl`, and whether a run may go on in it."""
+"""A run folder's `recipe.yaml` and `metrics.jsonl`, and whether a run may be resumed in it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
 from aegis_cli.training import checkpoint, inputs
 
 METRICS = "metrics.jsonl"
-JOBS_REPORT = "train.json"  # in a run that `aegis run` has trained
-MERGED = "merged"  # in such a run: the run that `aegis run` has made of it by a merge
-MERGE_REPORT = "merge.json"  # in the merged run; an earlier Aegis wrote it into the one around it
+JOBS_REPORT = "train.json"  # in a run that `aegis run` trained
+MERGED = "merged"  # in such a run: the run that `aegis run` made from it by a merge
+MERGE_REPORT = "merge.json"  # in the merged run; an earlier Aegis wrote it into the enclosing run
 # What Aegis writes into a run's folder, beside its checkpoints.
 _FILES = (
     "recipe.yaml",
@@ -46,13 +46,13 @@ def check(
     overwrite: bool = False,
     read: Iterable[str | Path | None] = (),
 ) -> None:
-    """Refuse an existing run unless it is to be continued, and with the recipe it began with.
+    """Refuse an existing run unless it is to be resumed with the recipe it began with.
 
-    With `overwrite` any run may be there, if it holds nothing but what Aegis has written, and
-    nothing that the new one is made from.
+    With `overwrite` any run may be there, if it holds only files that Aegis has written, and none
+    that the new run reads.
 
     Args:
-        read: models and data that the new one is made from.
+        read: models and data that the new run reads.
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -85,30 +85,30 @@ def check(
 
 
 def learned(out: Path) -> str:
-    """The options of a run that begins with what another one of a policy has learned."""
+    """The options of a run that starts from what the policy run `out` has learned."""
     return f"--set {quote(f'backbone={out}')} --set {quote(f'expert.start={out}')}"
 
 
 def _or_go_on_from(out: Path, recipe: Trained) -> str:
-    """How a policy is trained on with other settings, such as another learning rate."""
+    """How to train a policy further with other settings, such as another learning rate."""
     is_policy = isinstance(recipe, Recipe) and checkpoint.begun(out)
     return f", there with what this run has learned by {learned(out)}" if is_policy else ""
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:
-    """Whether a run that has begun was begun with what shapes `recipe`'s training."""
+    """Whether an existing run was begun with the same training settings as `recipe`."""
     return recipes.training_part(_begun(out, recipe)) == recipes.training_part(recipe)
 
 
 def continues(out: Path, recipe: Trained) -> bool:
-    """Whether a run may go on by `recipe`, by which its backbone may lie elsewhere now.
+    """Whether a run may be resumed with `recipe`, in which its backbone may have another path.
 
-    The checkpoints of a policy's run know the backbone by its digest, which is compared later.
+    The checkpoints of a policy's run hold the backbone's digest, which is compared later.
     """
     begun = _begun(out, recipe)
     if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
         # A backbone is PATH#LAYERS. Only the path may differ: other layers of one model have the
-        # same weights and the same digest, and learn otherwise.
+        # same weights and the same digest, but train differently.
         _, layers_there = backbones.divided(begun.backbone)
         _, layers_here = backbones.divided(recipe.backbone)
         if layers_there == layers_here:
@@ -122,19 +122,19 @@ def _begun(out: Path, recipe: Trained) -> Trained:
 
 
 def _differences(there: Trained, here: Trained) -> str:
-    """What shapes training and differs.
+    """The training settings that differ.
 
-    It names none of two methods' options, since one run has no use for the other's.
+    Two methods' options are not listed, since neither run reads the other's.
     """
     shared = recipes.training_part(there).keys() & recipes.training_part(here).keys()
-    # A stream's split is part of its training only where it is not the default.
+    # A stream's split is part of its training only if it is not the default.
     shared |= {"split"}
     names = {name.replace("-", "_") for name in shared}  # a method's options are a section
     return differences(_shaping(there, names), _shaping(here, names))
 
 
 def _shaping(recipe: Trained, names: Collection[str]) -> dict[str, Any]:
-    """The sections of these names; of a policy's demonstrations, what is learned of them alone."""
+    """These sections, and of a policy's `demos` only the keys that affect training."""
     found = {k: v for k, v in dataclasses.asdict(recipe).items() if k in names}
     return found | ({"demos": recipes.drawn(recipe)} if isinstance(recipe, Recipe) else {})
 
@@ -142,7 +142,7 @@ def _shaping(recipe: Trained, names: Collection[str]) -> dict[str, Any]:
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The keys of nested mappings that differ, with both values.
 
-    For example `train.steps: 450 there, 460 here`.
+    For example: `train.steps: 450 there, 460 here`.
     """
     old, new = dict(_flat(there)), dict(_flat(here))
     found = []
@@ -161,32 +161,32 @@ def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _said(value: Any) -> str:
-    """A value on one line, as a recipe has it."""
+    """A value on one line, as a recipe writes it."""
     if value is None:
         return "nothing"
     if isinstance(value, bool | list | tuple):
-        return json.dumps(value).replace('"', "")  # true instead of True, and lists as YAML's
+        return json.dumps(value).replace('"', "")  # true instead of True, and lists as in YAML
     return str(value)
 
 
 def clear(out: Path, ours: bool) -> Path | None:
-    """Remove a run that can be made again, unless it holds more than what Aegis has written.
+    """Remove a run that can be made again, unless it holds files that Aegis has not written.
 
     Args:
-        ours: whether it is written down that `aegis run` began it.
+        ours: whether it is on record that `aegis run` began it.
 
     Returns:
-        Where the run was moved, because somebody has files of his own in it; None: it is removed.
+        Where the run was moved, because it holds other files; None if it was removed.
 
     Raises:
-        AegisError: somebody else's files, or a process that is at work there.
+        AegisError: there are somebody else's files, or a process is at work there.
     """
     with locks.alone(out):
         return _clear(out, ours)
 
 
 def check_ours(out: Path, ours: bool) -> None:
-    """Raise AegisError for what `clear` would not remove: files of somebody else's."""
+    """Raise AegisError if `clear` would not remove the folder: it holds somebody else's files."""
     if not ours and not files.is_vacant(out):
         fix = (
             f"move it: mv '{out}' ELSEWHERE; or choose another --out, or another name in the recipe"
@@ -201,7 +201,7 @@ def _clear(out: Path, ours: bool) -> Path | None:
     if not any(_is_foreign(path, out) for path in out.rglob("*")):
         shutil.rmtree(out, ignore_errors=True)
         return None
-    # Somebody's own files are never removed: the whole folder makes way under another name.
+    # A user's own files are never removed: the whole folder is renamed instead.
     aside = _free(out.with_name(f"{out.name}.{time.strftime('%Y-%m-%d_%H%M%S')}"))
     with checkpoint.writing(out):
         out.rename(aside)
@@ -209,7 +209,7 @@ def _clear(out: Path, ours: bool) -> Path | None:
 
 
 def _free(path: Path) -> Path:
-    """A path of this name that does not exist yet; a clock that was set back repeats a time."""
+    """This path, numbered if it already exists: a clock that was set back repeats a time."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(one for one in itertools.chain([path], numbered) if not one.exists())
 
@@ -226,7 +226,7 @@ def _check_own(out: Path) -> None:
 
 
 def _check_read(out: Path, read: Iterable[str | Path | None]) -> None:
-    """Raise AegisError where what is read lies in the run that is to be overwritten."""
+    """Raise AegisError if something that is read lies in the run that is to be overwritten."""
     for place in read:
         if place is not None and files.lies_in(Path(place), out):
             raise AegisError(
@@ -237,9 +237,9 @@ def _check_read(out: Path, read: Iterable[str | Path | None]) -> None:
 
 
 def remove(out: Path) -> None:
-    """Remove a run that `check` has let pass; its folder stays, for it is locked.
+    """Remove a run that `check` has accepted; its folder stays, since it is locked.
 
-    The recipe goes last. By it the rest is known as a run, if this is cut short.
+    The recipe goes last: if this is interrupted, the rest is still recognized as a run.
     """
     for path in sorted(out.iterdir(), key=lambda path: path.name == "recipe.yaml"):
         if path.is_dir() and not path.is_symlink():
@@ -249,7 +249,7 @@ def remove(out: Path) -> None:
 
 
 def _is_foreign(path: Path, out: Path) -> bool:
-    """Whether Aegis writes no file or folder of that name into a run."""
+    """Whether a file or folder in a run is foreign: not one that Aegis writes there."""
     parts = path.relative_to(out).parts
     if files.is_left(out / parts[0]):  # a temporary file of a process that was killed
         return False
@@ -258,7 +258,7 @@ def _is_foreign(path: Path, out: Path) -> bool:
     if parts[0] == MERGED and (len(parts) > 1 or (path / "recipe.yaml").is_file()):
         return len(parts) > 1 and _is_foreign(path, out / MERGED)  # a run within the run
     if parts[0] != "checkpoints":
-        # No other folder is Aegis's, so that anything inside one is somebody else's.
+        # No other folder is written by Aegis, so anything inside one is somebody else's.
         return len(parts) > 1 or not any(fnmatch(parts[0], name) for name in _FILES)
     step = parts[1] if len(parts) > 1 else checkpoint.LAST
     if not (step.isdecimal() or step == checkpoint.LAST or step.startswith(".")):
@@ -267,10 +267,10 @@ def _is_foreign(path: Path, out: Path) -> bool:
 
 
 def merged_in(run: Path) -> Path | None:
-    """The run that `aegis run` has made of a run by a merge and measured in its place.
+    """The merged run that `aegis run` made from a run and measured in its place.
 
     Returns:
-        None where it has made none, or where the recipe of its job no longer asks for a merge.
+        None if there is none, or if the recipe of its job no longer asks for a merge.
     """
     asks = _holds_merged(run) and recipes.load(run / "recipe.yaml").merge.method is not None
     return run / MERGED if asks else None
@@ -281,43 +281,43 @@ def _holds_merged(run: Path) -> bool:
 
 
 def trained_in(run: Path) -> Path:
-    """The run whose training a run is of: another one for what `aegis run` has merged."""
+    """The run that was trained: the enclosing run if `aegis run` made this one by a merge."""
     inside = run.name == MERGED and (run.parent / JOBS_REPORT).is_file()
     return run.parent if inside else run
 
 
 def measured_in(run: Path) -> Path | None:
-    """Where the figures lie that `aegis run` has measured of a run, with its report of the merge.
+    """Where the figures that `aegis run` measured of a run lie, with its report of the merge.
 
-    An earlier Aegis left those of a merged run in the run around it.
+    An earlier Aegis left those of a merged run in the enclosing run.
 
     Returns:
-        The folder; None for a run whose own figures `aegis run` has not measured, since it has
-        measured what it was merged into.
+        The folder; None for a run that `aegis run` did not measure itself, since it measured the
+        merged run made from it.
     """
     around = run.parent
     if run.name == MERGED and (around / MERGE_REPORT).is_file():
         return around
-    # The recipe in a run of an earlier Aegis need not say that it was merged.
+    # The recipe in a run of an earlier Aegis may not say that it was merged.
     return None if (run / MERGE_REPORT).is_file() and _holds_merged(run) else run
 
 
 def begin(out: Path, recipe: Trained) -> None:
-    """Start a run, its recipe first: by that the folder is known as a run that may begin again."""
+    """Start a run, its recipe first: it marks the folder as a run that may be begun again."""
     files.make_folder(out)
     write_recipe(out, recipe)
     files.write_text(out / METRICS, "")
 
 
 def write_recipe(out: Path, recipe: Trained) -> None:
-    """Keep by which recipe a run is trained."""
+    """Write the recipe that a run is trained with."""
     files.write_text(out / "recipe.yaml", recipes.to_yaml(recipe))
 
 
 def renew_recipe(out: Path, recipe: Trained) -> None:
-    """Keep a job's recipe of now in a run that it has not trained again.
+    """Write a job's present recipe into a run that was not trained again.
 
-    Its questions, its gate or its merge may be others than when the run was trained.
+    Its questions, gate or merge may have changed since the run was trained.
     """
     saved = out / "recipe.yaml"
     if not saved.is_file() or saved.read_bytes() != recipes.to_yaml(recipe).encode():
@@ -334,7 +334,7 @@ def read_metrics(out: Path, *needed: str) -> list[dict[str, Any]]:
     """The log's complete lines; one without its end was being written when the run stopped.
 
     Raises:
-        AegisError: no log, or a line that is no JSON object with numbers for the `needed` keys.
+        AegisError: no log, or a line is not a JSON object with numbers for the `needed` keys.
     """
     path = out / METRICS
     with files.reading(path, "give a run folder that `aegis train` wrote"):
@@ -365,7 +365,7 @@ def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dic
 def _is_figure(value: Any) -> bool:
     if value is None:
         return True
-    # Every comparison with NaN is false, so that it is no figure; neither is infinity.
+    # Every comparison with NaN is false, so NaN is no figure; neither is infinity.
     return isinstance(value, int | float) and abs(value) < sys.float_info.max
 
 

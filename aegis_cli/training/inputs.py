@@ -1,6 +1,6 @@
-"""Where a run's demonstrations and anchor lie, so that its folder alone says how it goes on.
+"""Where a run's demonstrations and anchor lie, so that its folder alone is enough to resume it.
 
-What they hold, a checkpoint knows by digests; these are only the places.
+Checkpoints hold digests of their contents; this file holds only the paths.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from aegis_cli.data import mixture
 from aegis_cli.data.selection import Paths
 
 NAME = "inputs.json"
-_RELATIVE = "relative"  # of its keys: the places as they are seen from the run
-_BEGAN_IN = "began_in"  # and the folder from which the recipe's own paths are seen
+_RELATIVE = "relative"  # a key: the places relative to the run
+_BEGAN_IN = "began_in"  # a key: the folder that the recipe's own paths are relative to
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """An absolute path each, or of demonstrations the id of a dataset on the hub.
+    """Absolute paths; for demonstrations possibly the id of a dataset on the hub.
 
     Attributes:
         demos: one for each set.
-        anchor: None where the run was given none.
+        anchor: None if the run was given none.
     """
 
     demos: tuple[str, ...]
@@ -35,31 +35,32 @@ class Inputs:
 
     @classmethod
     def given(cls, demos: Paths, anchor: Path | None) -> Inputs:
-        """Those that a command names, from the folder that it is called in."""
+        """The inputs that a command names, relative to the folder that it is called in."""
         places = []
         for path in mixture.each(demos):
-            # What is not here may be the id of a dataset on the hub, which is no path.
+            # A path that does not exist may be the id of a dataset on the hub.
             places.append(str(path.absolute() if path.exists() else path))
         return cls(tuple(places), None if anchor is None else str(anchor.absolute()))
 
     def each(self, change: Callable[[str], str]) -> Inputs:
-        """The same with every place changed."""
+        """The same inputs with `change` applied to every place."""
         anchor = None if self.anchor is None else change(self.anchor)
         return Inputs(tuple(map(change, self.demos)), anchor)
 
 
 def is_gone(place: str) -> bool:
-    """Whether nothing is there; the id of a dataset is the hub's to find."""
+    """Whether a path no longer exists; ids of datasets on the hub are not checked."""
     path = Path(place)
-    return path.is_absolute() and not path.exists()  # what is kept of a file is absolute
+    return path.is_absolute() and not path.exists()  # places of files are kept as absolute paths
 
 
 def keep(out: Path, inputs: Inputs, place: Path | None = None, began: Path | None = None) -> None:
-    """Write them into a run's folder, also as they are seen from there.
+    """Write the inputs into a run's folder, both as absolute paths and relative to it.
 
     Args:
-        place: where the folder is going to lie; None: where it is.
-        began: the folder that the run was begun in; None: what the run says, else the present one.
+        place: where the folder will lie later; None: where it is now.
+        began: the folder that the run was begun in; None: what the run says, else the current
+            folder.
     """
     here, first = (place or out).absolute(), str(began or began_in(out) or Path.cwd())
 
@@ -71,9 +72,9 @@ def keep(out: Path, inputs: Inputs, place: Path | None = None, began: Path | Non
 
 
 def began_in(out: Path) -> Path | None:
-    """The folder that a run was begun in, also where both have been moved together.
+    """The folder that a run was begun in, even if both have been moved together.
 
-    None of a run that does not say it, or where it is gone.
+    None if the run does not say, or the folder is gone.
     """
     said = files.load_json(out / NAME) if (out / NAME).is_file() else None
     if not isinstance(said, dict) or not isinstance(said.get(_RELATIVE), dict):
@@ -84,20 +85,20 @@ def began_in(out: Path) -> Path | None:
 
 
 def of(out: Path) -> Inputs | None:
-    """Those of a run; None of one that an earlier version has begun.
+    """The inputs of a run; None for a run that an earlier version has begun.
 
-    What is gone from its place, but lies as it did before when it is seen from the run, has been
-    moved together with the run.
+    An input that is gone from its absolute path but exists at the same path relative to the run has
+    been moved together with the run.
 
     Raises:
-        AegisError: a damaged file.
+        AegisError: the file is damaged.
     """
     path = out / NAME
     if not path.is_file():
         return None
     said = files.load_json(path)
     kept = _read(said)
-    # The first version kept no places as seen from the run. Then each stands for itself.
+    # The first version kept no relative places. Then the absolute ones are used.
     relative = _read(said[_RELATIVE]) if kept and _RELATIVE in said else kept
     if kept is None or relative is None or len(relative.demos) != len(kept.demos):
         raise AegisError(
@@ -115,7 +116,7 @@ def of(out: Path) -> Inputs | None:
 
 
 def _read(said: Any) -> Inputs | None:
-    """The places that a file's JSON holds; None where it does not hold them."""
+    """The places in a file's JSON; None if they are not there."""
     places = [said.get(name) for name in ("demos", "anchor")] if isinstance(said, dict) else []
     match places:
         case [[str(), *_] as demos, (str() | None) as anchor] if all(

@@ -1,4 +1,4 @@
-"""What a training reads, each loaded and checked against the others before anything is built."""
+"""The inputs of a training run, loaded and checked against each other before anything is built."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ Questions = sets.Scenes | sets.Listed
 
 @dataclass(frozen=True)
 class Loaded:
-    """What a training reads, each checked against the others.
+    """The inputs of a training run, checked against each other.
 
     Attributes:
-        backbone: with its weights as they were stored, on the device that it learns on; on the
+        backbone: with its weights as they were stored, on the device that it is trained on; on the
             CPU if it is to be sharded.
-        began_as: what the model is called that the backbone was before another run trained it;
-            None where none did, or nobody knows.
+        began_as: the name of the model that the backbone was before another run trained it; None if
+            no run did, or if that is not known.
         fingerprint: of its weights.
-        watched: the anchor's file, if there is one, and `anchor` its digest.
-        measured: what the anchor holds; None where there is none.
+        watched: the anchor's file, if there is one; `anchor` is its digest.
+        measured: the contents of the anchor; None if there is none.
     """
 
     backbone: Backbone
@@ -74,14 +74,14 @@ def load(
         AegisError: inputs that do not fit together.
     """
     device = devices.pick()
-    # Weights to be sharded stay on the CPU: a GPU may have room for its own shard only.
+    # Weights to be sharded stay on the CPU: a GPU may only have room for its own shard.
     shards = parallel.shards(recipe.train, ranks)
     backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
     measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
     _check_parts(method, measured, recipe)
-    # Last, since it may decode hours of video.
+    # Last, since this may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
     warn_of_outliers(demos, recorded, recipe.train, on_event)
@@ -94,9 +94,9 @@ def load(
 
 
 def began_as(name: str) -> str | None:
-    """What the model is called that the run began with whose backbone `name` is.
+    """The name of the model that a run began with, if `name` is the backbone of its checkpoint.
 
-    Where it lay is left out. None where `name` is no backbone of a checkpoint, or its run is gone.
+    Folders are left out. None if `name` is no backbone of a checkpoint, or its run is gone.
     """
     if shapes.of_backbone(name) is not None:
         return None
@@ -118,7 +118,8 @@ def _demonstrations(
     recipe: Recipe, backbone: Backbone, demos: Paths, on_event: OnEvent, ranks: Ranks
 ) -> demonstrations.Demonstrations:
     """The demonstrations; one process per machine decodes their frames, the others reuse them."""
-    # All call `wait` once, the decoding ones after their work: the others find the cache complete.
+    # All processes call `wait` once, the decoding ones after their work, so the others find a
+    # complete cache.
     decodes = launch.local_rank() == 0
     found = load_demonstrations(recipe, backbone, demos, on_event) if decodes else None
     ranks.wait()
@@ -130,15 +131,16 @@ def _demonstrations(
 def load_demonstrations(
     recipe: Recipe, backbone: Backbone, paths: Paths, on_event: OnEvent, decides: bool = True
 ) -> demonstrations.Demonstrations:
-    """Load what the backbone is to learn from.
+    """Load the demonstrations that the backbone learns from.
 
     Args:
-        decides: whether to look if the disk has room for decoded frames, where the recipe does not
-            say; else another process has, and kept frames are taken if there are any.
+        decides: whether this process checks if the disk has room for decoded frames, when the
+            recipe does not say; otherwise another process has decided, and cached frames are used
+            if there are any.
 
     Raises:
-        AegisError: demonstrations of another task, with words that the backbone does not know, or
-            of which the recipe's weights are not.
+        AegisError: the demonstrations are of another task, have words that the backbone does not
+            know, or do not match the recipe's weights.
     """
     check_cameras(backbone, recipe)
     mixture.check_weights(recipe.demos.weights, len(mixture.each(paths)))
@@ -163,7 +165,7 @@ def load_demonstrations(
             + (f", or record with: aegis demos {recipe.task}" if recorded else ""),
         )
     mixture.drawn(found, recipe.demos.weights)
-    # A word that the backbone does not know is found here, and ends no training half-way.
+    # A word that the backbone does not know is found here, and not in the middle of training.
     backbone.check_prompts(found.images(found.read[:1]), found.texts)
     return found
 
@@ -173,14 +175,14 @@ def of_named_task(
     named: str,
     rename: Mapping[str, str] = MappingProxyType({}),
 ) -> demonstrations.Demonstrations:
-    """Demonstrations of LIBERO's where a recipe names them so, for they do not say it themselves.
+    """LIBERO demonstrations with the recipe's task, which they do not name themselves.
 
     Args:
         named: the recipe's task.
-        rename: what cameras have been called anew, by their names in the data set.
+        rename: new names of cameras, by their names in the data set.
 
     Raises:
-        AegisError: demonstrations of another robot than the task's, or by other cameras.
+        AegisError: the demonstrations are of another robot than the task's, or of other cameras.
     """
     spec = sim.of_datasets(named)
     if spec is None:
@@ -201,10 +203,7 @@ def of_named_task(
 
 
 def check_named(recipe: Recipe, on_event: OnEvent) -> None:
-    """Raise AegisError for what `load` would find wrong with the files that the recipe names.
-
-    These are demonstrations, and another run's expert.
-    """
+    """Raise AegisError for what `load` would reject in a recipe's demonstrations and expert."""
     if recipe.expert.start is not None:
         checkpoint.load_expert(recipe.expert.start)
     if recipe.demos.path is None:
@@ -222,7 +221,7 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
 
 
 def _refuse_keys_of_a_path(settings: Demos) -> None:
-    """Refuse what chooses from demonstrations that are given, where they are to be recorded."""
+    """Refuse keys that choose from existing demonstrations if they are still to be recorded."""
     belonging = {
         "camera": ("a LeRobot folder, to choose of", "set demos.path to it"),
         "rename": ("demonstrations with names of their own", "set demos.path to them"),
@@ -235,7 +234,7 @@ def _refuse_keys_of_a_path(settings: Demos) -> None:
 
 
 def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> None:
-    """Refuse several cameras before their frames are decoded."""
+    """Refuse several cameras, before their frames are decoded, if the backbone reads one image."""
     named = recipe.demos.camera
     if isinstance(named, tuple) and len(named) > 1 and not backbone.reads_several:
         raise AegisError(
@@ -246,14 +245,14 @@ def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> Non
 
 
 def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """What the method reads of the anchor."""
+    """The parts of the anchor that the method reads."""
     found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
     return anchor_file.to_device(found, device)
 
 
 def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:
-    """Raise AegisError where the anchor lacks what the method needs."""
-    # What users call moments is two parts, `image` and `text`, which are measured together.
+    """Raise AegisError if the anchor lacks what the method needs."""
+    # For users, `moments` is one part; here it is `image` and `text`, which are measured together.
     held = {} if anchor is None else {"moments": anchor.image, **vars(anchor)}
     missing = [part for part in sorted(method.needs) if not held.get(part)]
     if not missing:
@@ -282,12 +281,12 @@ _MEASURED_AS = (
 
 
 def _measuring(recipe: Recipe, parts: Sequence[str]) -> str:
-    """The command that measures these parts as the recipe's section `anchor` has it."""
+    """The command that measures these parts with the settings of the recipe's section `anchor`."""
     asked, usual = recipe.anchor, type(recipe.anchor)()
     words = ["aegis", "anchor"]
     if recipe.backbone != backbones.EMBEDDED:
         words += ["--backbone", recipe.backbone]
-    if asked.source == "demos" and list(parts) == ["moments"]:  # frames tell nothing else
+    if asked.source == "demos" and list(parts) == ["moments"]:  # frames serve nothing else
         words += ["--demos", "DEMOS"]
     for name in _MEASURED_AS:
         value = getattr(asked, name)
@@ -301,7 +300,7 @@ def _measuring(recipe: Recipe, parts: Sequence[str]) -> str:
 def _warn_of_no_instruction(
     paths: Paths, found: demonstrations.Demonstrations, on_event: OnEvent
 ) -> None:
-    """Warn of episodes that are learned from and whose instruction is an empty text, or blanks."""
+    """Warn of training episodes whose instruction is empty or blank."""
     learned = found.episode_of[found.read].unique()
     if bare := len(found.without_instruction):
         text = (
@@ -319,14 +318,14 @@ def warn_of_outliers(
     settings: Train | RobotTrain,
     on_event: OnEvent,
 ) -> None:
-    """Warn of joints whose scale is that of a few values far off, as of a sensor's glitch.
+    """Warn of joints whose scale is set by a few outliers, such as a sensor's glitches.
 
-    On such a scale all that the joint does otherwise is nearly alike, and errors look small.
-    Quantiles hardly notice these values, and actions that are relative have a scale of their own.
+    On such a scale all other values of the joint nearly coincide, and errors look small. Quantiles
+    are hardly affected by outliers, and relative actions have their own scale.
     """
     if settings.normalization != "mean_std":
         return
-    relative = getattr(settings, "relative_actions", False)  # a stream has no such key
+    relative = getattr(settings, "relative_actions", False)  # streams do not have this key
     told = list[str]()
     for what, tensor, names in (
         ("action", "actions", found.action_names),
@@ -336,7 +335,7 @@ def warn_of_outliers(
             continue
         for one in outliers(found.tensors[tensor][found.train]):
             name = names[one.dimension] if names else str(one.dimension)
-            # Of several sets the episodes are numbered anew.
+            # With several sets the episodes are renumbered.
             episode = f" in episode {int(found.episode_of[found.train[one.row]])}"
             where = episode if len(mixture.each(paths)) == 1 else ""
             told.append(
@@ -355,10 +354,10 @@ def warn_of_outliers(
 
 
 def _warn_of_another_prompt(path: Path, recipe: Recipe, on_event: OnEvent) -> None:
-    """Warn of an anchor whose questions were asked in another way than the recipe asks.
+    """Warn of an anchor whose questions were asked with another prompt than the recipe's.
 
-    A chat model answers `{}` in sentences, and `{} Give a very brief answer.` in a word: what keeps
-    the one need not keep the other.
+    A chat model answers `{}` in sentences, and `{} Give a very brief answer.` in a word: preserving
+    the one need not preserve the other.
     """
     meta = artifacts.read_header(path).meta
     asked = meta.get("ask", sets.PLAIN)
@@ -379,10 +378,10 @@ def _warn_of_other_cameras(
     rename: Mapping[str, str] | None,
     on_event: OnEvent,
 ) -> None:
-    """Warn of an anchor of robot frames from other cameras than those that are learned from.
+    """Warn of an anchor measured on robot frames of other cameras than the training uses.
 
-    Each camera's frame is an image of the prompt. Of frames of one camera that nobody has named
-    nothing is said, and nothing of questions, which have one image each.
+    Each camera's frame is an image in the prompt. There is no warning for frames of a single
+    unnamed camera, nor for questions, which have one image each.
     """
     meta = artifacts.read_header(path).meta
     own = meta.get("cameras", [])
@@ -403,14 +402,14 @@ def _warn_of_other_cameras(
 
 
 def questions(method: Method, options: Mapping[str, Any], on_event: OnEvent) -> Questions | None:
-    """The questions that a method trains on, which most do not."""
+    """The questions that a method trains on; None for most methods."""
     if not method.trains_on_questions(options):
         return None
     return sets.read(options["vqa"], options["skip_bad"], on_event, options["ask"])
 
 
 def digests(recipe: Recipe, loaded: Loaded, source: Questions | None) -> dict[str, str]:
-    """Digests of what a training reads, by their names."""
+    """Digests of a training run's inputs, by name."""
     found = {**mixture.inputs(loaded.demos), "backbone": loaded.fingerprint}
     if loaded.anchor is not None:
         found["anchor"] = loaded.anchor
@@ -426,13 +425,14 @@ def begun_expert(
     recorded: Mapping[str, Any],
     on_event: OnEvent,
 ) -> ActionExpert:
-    """The expert of another run, which has to be of the shape that this one needs.
+    """The expert of another run, which has to have the shape that this run needs.
 
     Args:
-        recorded: what the demonstrations say of the robot, as in `Demonstrations.recorded`.
+        recorded: what the demonstrations say about the robot, as in `Demonstrations.recorded`.
 
     Raises:
-        AegisError: another shape, joints in another order, or actions relative to other positions.
+        AegisError: it has another shape, joints in another order, or actions relative to other
+            positions.
     """
     start = recipe.expert.start
     assert start is not None
@@ -477,9 +477,9 @@ def _warn_of_other_units(
     recorded: Mapping[str, Any],
     on_event: OnEvent,
 ) -> None:
-    """Warn of an expert whose numbers mean something else here: on another scale, or per step.
+    """Warn of an expert whose units differ here: another normalization, or steps of another length.
 
-    It learns the new units, but what it knew is no good beginning.
+    It learns the new units, but its weights are then a poor starting point.
     """
     known = meta.get("normalization", normalization)
     if known != normalization:

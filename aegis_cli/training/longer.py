@@ -1,7 +1,7 @@
-"""A finished run that is made longer: which recipe it goes on by, and when that is refused.
+"""Extending a finished run: which recipe it is resumed with, and when that is refused.
 
-`train.extended_from` keeps the numbers of steps that were planned before. The learning rate follows
-each plan up to its end, so that a run which begins with that key ends in the same bytes.
+`train.extended_from` keeps the earlier planned numbers of steps. The learning rate follows each
+plan up to its end, so a run that starts with that key ends in the same bytes.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from aegis_cli.training.schedule import rate_factor
 
 
 def plan(out: Path, recipe: Recipe) -> Recipe:
-    """The recipe by which a run goes on in `out`: the given one, with the plans before it.
+    """The recipe that the run in `out` is resumed with: the given one, with the earlier plans.
 
-    Nothing is changed where no run is there, or where more than the number of steps differs.
+    It is unchanged if there is no run, or if more than the number of steps differs.
     """
     saved = out / "recipe.yaml"
     if not saved.exists():
@@ -45,11 +45,11 @@ def check(
     places: inputs.Inputs,
     on_event: OnEvent,
 ) -> None:
-    """Refuse an existing run as `folder.check` does, but for one that has ended and goes on.
+    """Refuse an existing run as `folder.check` does, except for a finished one that is extended.
 
     Args:
-        recipe: by which it goes on, as `plan` says.
-        places: of what it learns from.
+        recipe: the recipe that it is resumed with, as `plan` returns it.
+        places: of the data that it reads.
     """
     if resume and lengthens(out, recipe):
         _check_ended(out, recipe, on_event)
@@ -60,14 +60,14 @@ def check(
 
 
 def lengthens(out: Path, recipe: Recipe) -> bool:
-    """Whether `recipe` is that of the run in `out` with more steps, as its last plan says."""
+    """Whether `recipe` is the recipe of the run in `out`, extended by a plan of more steps."""
     earlier = recipe.train.plans[:-1]
     there = (out / "recipe.yaml").exists()
     return bool(earlier) and there and folder.continues(out, _replanned(recipe, earlier))
 
 
 def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
-    """Refuse to make a run longer that has not ended, or that is another one's."""
+    """Refuse to extend a run that has not ended, belongs to a job, or froze its backbone."""
     settings, planned = recipe.train, recipe.train.plans[-2]
     done = checkpoint.step_of(checkpoint.last(out)) if checkpoint.begun(out) else 0
     if done != planned:

@@ -2,8 +2,8 @@
 
 Rounded to eight bits, a weight loses every step that is smaller than half the distance to its
 neighbour, and an update that was projected is no longer orthogonal to anything. So the parameters
-stay float32 wherever they are read or changed: by the optimizer, by the method, in a checkpoint.
-Only forward and backward passes find them rounded, in half the memory and at half the traffic. This
+stay float32 wherever they are read or changed: in the optimizer, in the method, in a checkpoint.
+Only forward and backward passes see them rounded, with half the memory and half the traffic. This
 is mixed-precision training with master weights (Micikevicius et al. 2018, arXiv 1710.03740).
 """
 
@@ -25,10 +25,10 @@ BF16_MASTER = "bf16-master"  # the value of `train.weights`
 
 
 def check_masters(settings: Train, ranks: Ranks) -> None:
-    """Refuse float32 masters of sharded weights.
+    """Refuse float32 master weights with sharding.
 
     Raises:
-        AegisError: that is asked for.
+        AegisError: both are asked for.
     """
     if settings.weights == BF16_MASTER and settings.parallel == "fsdp" and ranks.several:
         raise AegisError(
@@ -40,22 +40,22 @@ def check_masters(settings: Train, ranks: Ranks) -> None:
 
 
 class Masters:
-    """The float32 weights that passes see rounded.
+    """The float32 master weights, which passes see rounded to bfloat16.
 
-    Without parameters nothing is rounded, and nothing costs anything.
+    Without parameters nothing is rounded, at no cost.
     """
 
     def __init__(
         self, parameters: Iterable[nn.Parameter] = (), still: Iterable[nn.Parameter] = ()
     ) -> None:
-        """Hold on to what learns, and beside it to what is rounded for good."""
+        """Keep the trainable parameters, and beside them those that are rounded permanently."""
         self._parameters, self._still = list(parameters), list(still)
 
     @classmethod
     def of(cls, own: Iterable[nn.Parameter]) -> Masters:
-        """The masters among a backbone's own parameters, once it is known which of them learn.
+        """The masters among a backbone's own parameters, once it is known which are trainable.
 
-        What does not learn needs no master: it is rounded here, once and for good.
+        Frozen parameters need no master: they are rounded here, permanently.
         """
         learning, still = [], []
         for parameter in own:
@@ -68,24 +68,24 @@ class Masters:
 
     @property
     def rounded_bytes(self) -> int:
-        """Bytes of the rounded weights, and as many of their gradients."""
+        """Bytes of the rounded weights; their gradients take the same."""
         return sum(p.numel() * BF16.itemsize for p in self._parameters)
 
     @contextlib.contextmanager
     def rounded(self) -> Generator[None]:
         """Let passes inside the block see the weights rounded.
 
-        Afterwards the parameters are float32 again, with the values that they had, and so are their
-        gradients: what the block's backward passes leave is added to what was there.
+        Afterwards the parameters are float32 again, with their values from before, and so are their
+        gradients: those of the block's backward passes are added to the earlier ones.
         """
-        # A parameter that changes its type may have no gradient, which is of the same type.
+        # A parameter whose dtype changes must not have a gradient of the old dtype.
         before = _taken(self._parameters)
         with structure.of_type(self._parameters, BF16):
             try:
                 yield
             finally:
                 found = _taken(self._parameters)
-        # All of them are widened at once, in few kernels, and dealt out again in the same order.
+        # All gradients are cast together, in few kernels, and handed out again in the same order.
         present = [gradient for gradient in found if gradient is not None]
         wide = iter(structure.of_one_type(present, torch.float32))
         for parameter, known, new in zip(self._parameters, before, found, strict=True):
@@ -95,21 +95,21 @@ class Masters:
     def as_written(self) -> Generator[None]:
         """Let passes inside the block see all weights in float32, as a checkpoint has them.
 
-        Outside `rounded` a model has two types, which no pass of its own takes. Where nothing
-        learns, all are in bfloat16 and stay so.
+        Outside `rounded` a model has weights of two dtypes, which no pass can use. If nothing is
+        trainable, all weights are bfloat16 and stay so.
         """
         with structure.of_type(self._still if self._parameters else [], torch.float32):
             yield
 
     def wide(self, gradients: Mapping[int, Tensor | None]) -> Mapping[int, Tensor | None]:
-        """Gradients of the block that do not lie in `.grad`, in float32 too."""
+        """Gradients of a `rounded` block that are not in `.grad`, cast to float32 too."""
         if not self._parameters:
             return gradients
         return {i: None if g is None else g.float() for i, g in gradients.items()}
 
 
 def _taken(parameters: Iterable[nn.Parameter]) -> list[Tensor | None]:
-    """The gradients, which the parameters then have no more."""
+    """Take the gradients out of the parameters."""
     found = []
     for parameter in parameters:
         found.append(parameter.grad)
@@ -118,7 +118,7 @@ def _taken(parameters: Iterable[nn.Parameter]) -> list[Tensor | None]:
 
 
 def _sum(known: Tensor | None, found: Tensor | None) -> Tensor | None:
-    """The sum of two gradients, as far as there are any."""
+    """The sum of two gradients, either of which may be None."""
     if found is None or known is None:
         return found if known is None else known
     return known.add_(found)

@@ -14,10 +14,10 @@ from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import AS_WRITTEN, check_state
 from aegis_cli.training import eight_bit
 
-WEIGHT = "weight."  # a weight's name in a file begins so
+WEIGHT = "weight."  # prefix of a weight's name in a file
 _OPTIMIZER = "optimizer."
-STATELESS = "stateless"  # in a file's meta: parameters that learn and have no optimizer state
-# What each kind of optimizer keeps of a parameter: its step count, and tensors of its shape.
+STATELESS = "stateless"  # in a file's meta: trainable parameters without optimizer state
+# What each optimizer keeps per parameter: a step count, and tensors of the parameter's shape.
 _COUNT = "step"
 _KEPT: dict[type[torch.optim.Optimizer], tuple[str, ...]] = {
     torch.optim.AdamW: (_COUNT, "exp_avg", "exp_avg_sq"),
@@ -44,16 +44,16 @@ def to_tensors(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -
 
 
 def stateless(parameters: Mapping[str, nn.Parameter], optimizers: Optimizers) -> list[str]:
-    """Names of the parameters of which an optimizer keeps nothing, for they had no gradient yet."""
+    """Names of the parameters without optimizer state, because they have had no gradient yet."""
     name_of = {id(p): name for name, p in parameters.items()}
     return sorted(name_of[id(p)] for o in optimizers for p in _learned(o) if p not in o.state)
 
 
 def said_stateless(meta: Mapping[str, Any]) -> list[str] | None:
-    """What a file's meta says of `stateless`; None where it says nothing.
+    """The entry `stateless` of a file's meta; None if there is none.
 
     Raises:
-        TypeError: it says something else.
+        TypeError: it is no list of names.
     """
     said = meta.get(STATELESS)
     if said is not None and not (isinstance(said, list) and all(isinstance(n, str) for n in said)):
@@ -69,15 +69,15 @@ def from_tensors(
     source: str = "the saved state",
     without: Iterable[str] | None = None,
 ) -> None:
-    """Put back what `to_tensors` took; the optimizers go on as if nothing had happened.
+    """Restore what `to_tensors` saved; the optimizers continue as if nothing had happened.
 
     Args:
         source: what the tensors were read from, for errors.
-        without: what `stateless` said; None: nobody knows, as of an earlier version's file.
+        without: what `stateless` returned; None: not known, as in an earlier version's file.
 
     Raises:
-        AegisError: tensors that are not those of these parameters and optimizers; nothing was put
-            back.
+        AegisError: the tensors do not belong to these parameters and optimizers; nothing was
+            restored.
     """
     owner: dict[int, tuple[torch.optim.Optimizer, dict[str, Any]]] = {}
     for optimizer in optimizers:
@@ -86,8 +86,8 @@ def from_tensors(
                 owner[id(parameter)] = optimizer, group
     states = {label for label in tensors if label.startswith(_OPTIMIZER)}
     expected = {n: p for n, p in parameters.items() if id(p) in owner}
-    # Every parameter has all of its optimizer's state, or nothing of it. An earlier version's file
-    # does not say which have nothing, so that one whose state was lost passes for one of them.
+    # Every parameter has all of its optimizer state, or none. An earlier version's file does not
+    # say which have none, so a parameter whose state was lost is taken for one of those.
     has_some = {label.partition("/")[2] for label in states}
     bare = expected.keys() - has_some if without is None else set(without)
     wanted: dict[str, Tensor] = {WEIGHT + name: p for name, p in parameters.items()}
@@ -107,10 +107,10 @@ def from_tensors(
         if eight_bit.owns(optimizer):
             coded.setdefault(name, {})[key] = tensors[label]
             continue
-        # PyTorch counts steps on the CPU, but a fused kernel reads the count where the parameter
-        # is.
+        # PyTorch counts steps on the CPU, but a fused kernel reads the count on the parameter's
+        # device.
         device = "cpu" if key == _COUNT and not group.get("fused") else parameter.device
-        # A copy, for what was read is memory-mapped, and the optimizer writes into its state.
+        # A copy, since the file is memory-mapped and the optimizer writes into its state.
         value = tensors[label].to(device, copy=True)
         optimizer.state[parameter][key] = value if key == _COUNT else sharded_as(value, parameter)
     for name, saved in coded.items():
@@ -120,7 +120,7 @@ def from_tensors(
 def _state_of(
     name: str, parameter: nn.Parameter, optimizer: torch.optim.Optimizer
 ) -> dict[str, Tensor]:
-    """The tensors that an optimizer keeps of a parameter, as far as their shape and type go."""
+    """The tensors that an optimizer keeps for a parameter; only their shapes and dtypes count."""
     if eight_bit.owns(optimizer):
         kept = eight_bit.kept(parameter)
         return {f"{_OPTIMIZER}{key}/{name}": tensor for key, tensor in kept.items()}
@@ -132,11 +132,11 @@ def _state_of(
 
 
 def _check_values(source: str, tensors: Mapping[str, Tensor], known: bool, due: bool) -> None:
-    """Raise AegisError for values that no optimizer has.
+    """Raise AegisError for values that no optimizer state can have.
 
     Args:
         known: whether it is known which parameters have no state.
-        due: whether an optimizer is to get one.
+        due: whether an optimizer needs state.
     """
     squares = tuple(f"{_OPTIMIZER}{key}/" for key in _NOT_NEGATIVE)
     negative = [n for n, t in tensors.items() if n.startswith(squares) and (t < 0).any()]
@@ -149,5 +149,5 @@ def _check_values(source: str, tensors: Mapping[str, Tensor], known: bool, due: 
 
 
 def _learned(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
-    """The parameters that an optimizer moves."""
+    """The parameters that an optimizer updates."""
     return [p for group in optimizer.param_groups for p in group["params"]]

@@ -18,18 +18,18 @@ Groups = list[dict[str, Any]]
 
 
 def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Optimizer]:
-    """One for all that learns, or, with SGD, one for the backbone and one for the expert.
+    """One optimizer for all that is trained; with SGD, one each for backbone and expert.
 
-    The expert begins from nothing and learns far slower with SGD (recipes/results/LOG.md): under
-    SGD in both, methods would be compared on policies that fail.
+    The expert starts from random weights and learns far more slowly with SGD
+    (recipes/results/LOG.md): with SGD for both, methods would be compared on policies that fail.
 
     Args:
-        rate_per_parameter: give each of the backbone's parameters a group of its own.
+        rate_per_parameter: give each of the backbone's parameters its own group.
     """
     learning = [p for p in policy.backbone.parameters() if p.requires_grad]
     parts = [[p] for p in learning] if rate_per_parameter else [learning]
-    # No group is empty, also where nothing of the backbone learns: a step looks up a group's share
-    # of its rate by the first parameter.
+    # No group may be empty, even if nothing of the backbone is trainable: a step looks up a group's
+    # share of its learning rate by its first parameter.
     backbone = [_group("backbone", part, settings.backbone_lr) for part in parts if part]
     expert = [_group("expert", list(policy.expert.parameters()), settings.expert_lr)]
     if settings.optimizer == "adamw":
@@ -40,10 +40,10 @@ def make(policy: Policy, settings: Train, rate_per_parameter: bool) -> list[Opti
 
 
 def state_bytes(optimizers: Sequence[Optimizer], here: bool = False) -> int:
-    """Bytes that they keep beside the weights once they have taken a step, counters aside.
+    """Bytes of optimizer state after the first step, without counters.
 
     Args:
-        here: of sharded weights, only those of this process's rows.
+        here: for sharded weights, count only this process's rows.
     """
     total = 0
     for optimizer in optimizers:
@@ -60,21 +60,21 @@ def _state_bytes(group: dict[str, Any], parameter: Tensor) -> int:
 
 
 def _moments(group: dict[str, Any]) -> int:
-    """How many numbers are kept for each that learns: AdamW's two moments, or SGD's momentum."""
+    """Numbers kept per trainable weight: AdamW's two moments, or SGD's momentum."""
     if "betas" in group:
         return 2
     return 1 if group["momentum"] else 0
 
 
 def _group(name: str, parameters: list[nn.Parameter], rate: float) -> dict[str, Any]:
-    # `lr` is written anew in each step; the schedule scales `peak`.
+    # `lr` is set in each step; the schedule scales `peak`.
     return {"params": parameters, "lr": rate, "peak": rate, "name": name}
 
 
 def _adamw(groups: Groups, settings: Train) -> Optimizer:
     if settings.states == eight_bit.STATES:
         return eight_bit.adamw(groups, settings)
-    # Of PyTorch's AdamW only the fused one heeds `found_inf`, by which step_figures.py stops it.
+    # Only PyTorch's fused AdamW heeds `found_inf`, with which step_figures.py stops it.
     return torch.optim.AdamW(
         groups,
         betas=settings.betas,
@@ -85,6 +85,6 @@ def _adamw(groups: Groups, settings: Train) -> Optimizer:
 
 
 def _sgd(groups: Groups, settings: Train) -> Optimizer:
-    # Not fused: that kernel fails where a parameter's first gradient comes after the others', as
-    # it does where only a projection moves it.
+    # Not fused: that kernel fails if a parameter's first gradient comes later than the others',
+    # which happens if only a projection moves it.
     return torch.optim.SGD(groups, momentum=settings.momentum, weight_decay=settings.weight_decay)

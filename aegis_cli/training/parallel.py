@@ -1,9 +1,9 @@
-"""How several processes share a training's weights and gradients.
+"""How several processes share the weights and gradients of a training run.
 
 `ddp`: every process has all weights, and takes the same step from gradients that are summed here.
-PyTorch's own wrapper would sum them while they are made, and could not tell the two backward passes
-over one graph apart. `fsdp`: every process has some rows of each weight (PyTorch's `fully_shard`),
-and gradients arrive summed.
+PyTorch's own wrapper would sum them during the backward pass, and could not tell apart the two
+backward passes over one graph. `fsdp`: every process has some rows of each weight (PyTorch's
+`fully_shard`), and gradients arrive summed.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from aegis_cli.recipes import Recipe, Train
 if TYPE_CHECKING:
     from torch.distributed.fsdp import MixedPrecisionPolicy
 
-# Modules whose parameters enter matrix products alone, and those of autocast.
+# Modules whose parameters are used only in matrix products that autocast rounds.
 _PRODUCTS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d, LowRankLinear)
 
 
 def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
-    """Refuse what several processes, or several passes a step, cannot do.
+    """Refuse what several processes, or several passes per step, cannot do.
 
     Raises:
-        AegisError: too few frames for each to have one, or an option that needs one process.
+        AegisError: there are fewer frames than passes, or an option needs a single process.
     """
     settings, options = recipe.train, recipes.options(recipe)
     parts = ranks.count * settings.accumulate
@@ -69,7 +69,7 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
 
 
 def shards(settings: Train, ranks: Ranks) -> bool:
-    """Whether each process is to keep some rows of each weight alone."""
+    """Whether each process keeps only some rows of each weight."""
     return ranks.several and settings.parallel == "fsdp"
 
 
@@ -86,15 +86,14 @@ def _check_sharding(settings: Train, method: Method) -> None:
 
 
 def shard(policy: Policy, precision: str, device: torch.device) -> None:
-    """Let every process keep some rows of each weight; a block's are gathered where it is at work.
+    """Let every process keep some rows of each weight; a block's weights are gathered when it runs.
 
-    The policy may be on the CPU: its blocks go to the device one by one, and there each is cut
-    before the next one comes.
+    The policy may be on the CPU: its blocks are moved to the device and sharded one by one.
 
-    Gradients come summed, not averaged: the losses have the whole batch's divisor.
+    Gradients arrive summed, not averaged: the losses are divided by the size of the whole batch.
 
     Args:
-        precision: of the passes; where matrix products are in bfloat16, so are the weights that a
+        precision: of the passes; if matrix products are in bfloat16, so are the weights that a
             block gathers. The rows that each process keeps stay as they are.
     """
     from torch.distributed.device_mesh import init_device_mesh
@@ -111,19 +110,20 @@ def shard(policy: Policy, precision: str, device: torch.device) -> None:
     policies = dict.fromkeys(_blocks(policy.backbone), as_kept)
     if devices.takes_bf16(device, precision):
         policies = _halved(policies)
-    # These two are gathered as they are: their embeddings begin the residual stream, which autocast
-    # keeps in float32. PyTorch would else leave the outermost whole between forward and backward.
+    # These two are gathered as they are: their embeddings start the residual stream, which autocast
+    # keeps in float32. PyTorch would otherwise keep the outermost unsharded from forward to
+    # backward.
     policies |= {policy.backbone: as_kept, policy.expert: as_kept}
     for module, of_messages in policies.items():
         fully_shard(module, mesh=mesh, reshard_after_forward=True, mp_policy=of_messages)
-    for part in (policy.proprio_scale, policy.action_scale, policy.origins):  # nothing cuts them
+    for part in (policy.proprio_scale, policy.action_scale, policy.origins):  # not sharded
         part.to(device)
     for name in ("encode", "answer_log_likelihood"):
         register_fsdp_forward_method(policy.backbone, name)
     for module in policy.modules():
         if isinstance(module, FSDPModule):
             module.set_gradient_divide_factor(1.0)
-            module.set_force_sum_reduction_for_comms(True)  # gloo knows no scaled sums
+            module.set_force_sum_reduction_for_comms(True)  # gloo has no scaled sums
     # Keys and values are views of a layer's products. Nothing here writes into them.
     warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view tensor")
 
@@ -132,18 +132,18 @@ def shard(policy: Policy, precision: str, device: torch.device) -> None:
 def _tell_of_encodings() -> None:
     """Let PyTorch find the tensors of an `Encoding`, as it does by itself since 2.13.
 
-    By the gradients of a module's output it knows when to gather the module's weights again.
+    The gradients of a module's output tell it when to gather the module's weights again.
     """
     pytree.register_dataclass(Encoding)
 
 
 def _halved(blocks: Iterable[nn.Module]) -> dict[nn.Module, MixedPrecisionPolicy]:
-    """How the parts of blocks are gathered, the inner ones first, where products are in bfloat16.
+    """How parts of blocks are gathered, the inner ones first, if products are in bfloat16.
 
-    Autocast rounds what enters a matrix product, its weights too. So these are gathered rounded,
-    which halves the message and changes no product. What enters another operation, such as a norm's
-    weights, autocast leaves as it is: such modules are gathered by themselves, whole.
-    Gradients are summed in float32 either way.
+    Autocast rounds the inputs of a matrix product, weights included. So these weights are gathered
+    rounded, which halves the message and changes no product. Autocast leaves the inputs of other
+    operations, such as a norm's weights, as they are: such modules are gathered separately, without
+    rounding. Gradients are summed in float32 either way.
     """
     from torch.distributed.fsdp import MixedPrecisionPolicy
 
@@ -153,7 +153,7 @@ def _halved(blocks: Iterable[nn.Module]) -> dict[nn.Module, MixedPrecisionPolicy
     )
     found = {}
     for block in blocks:
-        # A module comes before what it holds; the reverse is the order in which to shard.
+        # A module comes before its submodules; they have to be sharded in the reverse order.
         for module in reversed(list(block.modules())):
             owns = any(True for _ in module.parameters(recurse=False))
             if owns and not isinstance(module, _PRODUCTS):
@@ -163,11 +163,12 @@ def _halved(blocks: Iterable[nn.Module]) -> dict[nn.Module, MixedPrecisionPolicy
 
 
 def _blocks(backbone: Backbone) -> list[nn.Module]:
-    """The modules that are gathered by themselves, such as a transformer's layers.
+    """The modules that are gathered separately, such as a transformer's layers.
 
-    The last language layer is not: what the expert reads of a Hugging Face one leaves it by a hook,
-    so that a gradient comes back past the output, by which PyTorch knows that it is time to gather.
-    With what lies outside the blocks it is gathered by what `encode` returns.
+    The last language layer is not among them: what the expert reads of a Hugging Face layer leaves
+    it through a hook, so its gradient bypasses the output, which tells PyTorch when to gather.
+    Together with what lies outside the blocks, that layer is gathered through the outputs of
+    `encode`.
     """
     last = {id(p) for p in backbone.parameter_groups()[f"layers.{backbone.depth - 1}"]}
     blocks = [block for blocks in structure.outermost_lists(backbone) for block in blocks]
@@ -187,7 +188,7 @@ def gathered(tensors: Mapping[str, Tensor], ranks: Ranks) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """A whole policy with these weights, which have its names, and with the buffers among them."""
+    """Copy these weights and buffers, by their names in the policy, into an unsharded policy."""
     for name, parameter in plain.named_parameters():
         parameter.copy_(weights[name])
     for name, buffer in plain.named_buffers():
@@ -198,11 +199,11 @@ def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
 
 @contextlib.contextmanager
 def made_whole(policy: Policy, plain: Policy | None, ranks: Ranks) -> Generator[None]:
-    """Let a whole policy have a sharded one's weights inside the block, on the same device.
+    """Give an unsharded policy a sharded one's weights inside the block, on the same device.
 
     Args:
-        plain: the whole one, in the first process; it is on the CPU otherwise, since a GPU may have
-            no room for it beside a step.
+        plain: the unsharded policy, in the first process; outside the block it is on the CPU, since
+            a GPU may have no room for it beside a step.
     """
     weights = gathered(dict([*policy.named_parameters(), *policy.named_buffers()]), ranks)
     if plain is not None:
@@ -217,21 +218,21 @@ def made_whole(policy: Policy, plain: Policy | None, ranks: Ranks) -> Generator[
 
 def is_sharded(policy: Policy) -> bool:
     """Whether a process has only some rows of each weight."""
-    # The class cannot occur where nobody has imported its module, which takes long.
+    # If its module was never imported, which is slow, no object can be of that class.
     fsdp = sys.modules.get("torch.distributed.fsdp")
     return fsdp is not None and isinstance(policy.backbone, fsdp.FSDPModule)
 
 
 @torch.no_grad()
 def share_averages(backbone: Backbone, ranks: Ranks) -> None:
-    """Make what modules such as BatchNorm average of frames the mean over the processes.
+    """Average the running statistics of modules such as BatchNorm over the processes.
 
-    Each process's modules read its own frames alone. Training passes do not read the averages, and
-    they are linear in what was read. So it is enough to do this before somebody does read them, and
-    to do it more often leads to the same.
+    Each process's modules see only its own frames. Training passes do not read the statistics,
+    which are linear in what was seen. So it is enough to do this before they are read, and doing it
+    more often gives the same result.
     """
     averaging = structure.averaging(backbone).values()
-    # What is frozen is the same everywhere, and stays so to the last bit.
+    # Frozen modules are the same everywhere, and stay equal bit for bit.
     following = [module for module in averaging if module.training]
     buffers = [b for module in following for b in module.buffers(recurse=False)]
     averages = [b for b in buffers if b.is_floating_point()]  # not the number of batches
@@ -242,7 +243,7 @@ def share_averages(backbone: Backbone, ranks: Ranks) -> None:
 
 @torch.no_grad()
 def add_up_gradients(policy: Policy, ranks: Ranks) -> None:
-    """Make every `.grad` its sum over the processes, where it is not yet."""
+    """Sum every `.grad` over the processes, unless FSDP has already done so."""
     if not ranks.several or is_sharded(policy):
         return
     learning = [p for p in policy.parameters() if p.requires_grad]
@@ -258,10 +259,10 @@ def added_up(
     """The sum of each gradient over the processes, by the parameters' ids."""
     parameters = [p for group in groups for p in group]
     given = [gradients[id(p)] for p in parameters]
-    # FSDP has summed those of sharded parameters on their way into `.grad`.
+    # FSDP has already summed the gradients of sharded parameters.
     if not ranks.several or any(map(is_cut, parameters)):
         return dict(gradients)
-    # Copies: autograd may give several parameters one and the same tensor.
+    # Copies: autograd may give several parameters the same tensor.
     copies = [None if g is None else g.clone() for g in given]
     ids = [id(p) for p in parameters]
     return dict(zip(ids, _summed(parameters, copies, ranks), strict=True))
@@ -270,9 +271,9 @@ def added_up(
 def _summed(
     parameters: Iterable[nn.Parameter], gradients: list[Tensor | None], ranks: Ranks
 ) -> list[Tensor | None]:
-    """Gradients summed in place; None only where no process has one."""
-    # A sum needs the same tensors from every process. One whose share of the frames has given a
-    # parameter no gradient adds zeros; where nobody has one, it stays None, and the weight is left.
+    """Gradients summed in place; None only if no process has one."""
+    # A sum needs the same tensors from every process. A process whose frames gave a parameter no
+    # gradient adds zeros; if no process has one, it stays None, and the weight is not updated.
     somewhere = ranks.any(*(g is not None for g in gradients))
     found: list[Tensor | None] = []
     for parameter, gradient, there in zip(parameters, gradients, somewhere, strict=True):

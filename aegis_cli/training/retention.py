@@ -1,4 +1,4 @@
-"""Which checkpoints of a run stay where `train.keep_checkpoints` bounds their number."""
+"""Which checkpoints of a run are kept if `train.keep_checkpoints` limits their number."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from aegis_cli.training import checkpoint, folder, validation_vqa
 
 
 def prune(out: Path, step: int, count: int, recipe: Recipe) -> None:
-    """Remove the checkpoints before `step` but for the last ones and the best one.
+    """Remove the checkpoints before `step`, except the last ones and the best one.
 
-    Later ones stay, for a user who went back to an earlier checkpoint. What is half removed
-    when the process is killed bears a name that the next checkpoint clears away.
+    Later ones stay, for a user who went back to an earlier checkpoint. If the process is killed
+    during removal, the rest has a temporary name, which the next checkpoint cleans up.
 
     Args:
-        step: of the checkpoint that has just been written, which is the newest.
-        count: how many of the last ones stay, that one included.
-        recipe: of the run, whose gate the best one is to pass.
+        step: step of the checkpoint that has just been written, which is the newest.
+        count: how many of the last ones stay, including that one.
+        recipe: recipe of the run, whose gate the best checkpoint should pass.
 
     Raises:
-        AegisError: the log is damaged, or the disk refuses.
+        AegisError: the log is damaged, or the disk cannot be written.
     """
     there = {int(path.name): path for path in checkpoint.whole(out)}
     behind = sorted(number for number in there if number <= step)
@@ -36,10 +36,10 @@ def prune(out: Path, step: int, count: int, recipe: Recipe) -> None:
 
 
 def best(out: Path, steps: Collection[int], recipe: Recipe) -> int | None:
-    """The one of these steps with the least validation loss; None where none has a loss.
+    """The step with the lowest validation loss; None if none has a loss.
 
-    Where the recipe limits the drop, it is the best of those of which answers have shown that they
-    keep to the limit, if there are any. Where losses are equal, it is the earliest step.
+    If the recipe limits the drop in accuracy, it is the best of the steps whose measured drop is
+    within the limit, if there are any. Among equal losses it is the earliest step.
     """
     losses: dict[int, float] = {}
     keeping: set[int] = set()
@@ -54,13 +54,13 @@ def best(out: Path, steps: Collection[int], recipe: Recipe) -> int | None:
 
 
 def most_at_once(planned: int, there: int, count: int | None) -> int:
-    """How many checkpoints a run adds to its disk at most at one time.
+    """The most checkpoints that a run adds to the disk at any one time.
 
-    That is the last ones and the best one, and the one that is written before another goes.
+    These are the last ones, the best one, and the one that is written before another is removed.
 
     Args:
         planned: checkpoints that are still to be written.
-        there: how many lie there already.
-        count: as `train.keep_checkpoints` says; None: all stay.
+        there: how many exist already.
+        count: as in `train.keep_checkpoints`; None: all are kept.
     """
     return planned if count is None else min(planned, max(1, count + 2 - there))

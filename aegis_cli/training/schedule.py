@@ -14,16 +14,16 @@ from aegis_cli.recipes.policy import CONSTANT, COSINE, LINEAR
 def warmup_then_decay(
     step: int, steps: int, warmup: int, final_share: float, schedule: str = COSINE
 ) -> float:
-    """The factor on the peak learning rate at `step`, from 0.
+    """The factor on the peak learning rate at `step`, counted from 0.
 
-    It rises linearly over `warmup` steps, then falls to `final_share`, which the step after the
-    last would have.
+    It rises linearly over `warmup` steps, then falls to `final_share`, which is reached at the step
+    after the last one.
 
     Args:
-        schedule: one of SCHEDULES: along a cosine, along a line, or not at all.
+        schedule: one of SCHEDULES: it falls along a cosine, linearly, or not at all.
     """
     if step < warmup:
-        return (step + 1) / warmup  # at a rate of 0 the first step would be lost
+        return (step + 1) / warmup  # a first step with rate 0 would do nothing
     if schedule == CONSTANT:
         return 1.0
     progress = min(1.0, (step - warmup) / max(1, steps - warmup))
@@ -32,37 +32,38 @@ def warmup_then_decay(
 
 
 def rate_factor(step: int, settings: Train) -> float:
-    """The factor on a training's peak learning rates at `step`, by the plan of that step."""
-    # The first plan that the step is still within: what was planned later changes nothing before.
+    """The factor on a run's peak learning rates at `step`, by the plan that covers the step."""
+    # The first plan that still includes the step: later plans do not change earlier steps.
     planned = next((steps for steps in settings.plans if step < steps), settings.steps)
     share, schedule = settings.final_lr_share, settings.schedule
     return warmup_then_decay(step, planned, settings.warmup, share, schedule)
 
 
 def rate_left(step: int, settings: Train) -> float:
-    """What is left of the peak learning rate at `step`: 1 until it is reached."""
+    """The share of the peak learning rate at `step`: 1 during the warmup."""
     return 1.0 if step < settings.warmup else rate_factor(step, settings)
 
 
 def moving_steps(steps: int, backbone_until: float) -> int:
-    """How many of the steps move the backbone, at least one; in those after it stands still."""
+    """How many of the steps, at least one, update the backbone; it is frozen in later steps."""
     return max(1, round(backbone_until * steps))
 
 
 class BatchOrder:
     """Shuffled epochs of `size` rows, dealt `batch` at a time.
 
-    Rows that an epoch leaves over begin the next batch.
+    Rows left over at the end of an epoch begin the next batch.
     """
 
     def __init__(
         self, size: int, batch: int, seed: int, shares: Sequence[tuple[int, int]] = ()
     ) -> None:
-        """Deal each row once an epoch, or let sets that the rows consist of have shares of it.
+        """Deal each row once per epoch, or give each set of rows a share of the epoch.
 
         Args:
-            shares: of each set, whose rows follow each other, how many it has and how many of an
-                epoch's rows are of it; both add up to `size`. Empty: each row comes once.
+            shares: for each set, whose rows are consecutive, its number of rows and how many of an
+                epoch's rows come from it; each of the two adds up to `size`. Empty: each row comes
+                once.
         """
         self._size, self._batch, self._seed = size, batch, seed
         self._shares = tuple(shares)
@@ -70,11 +71,11 @@ class BatchOrder:
 
     def rows(self, step: int) -> np.ndarray:
         """Row indices [batch] int64 of a step."""
-        # Epochs follow each other without a gap in one endless sequence, which is cut in batches.
+        # Epochs follow each other in one endless sequence, which is cut into batches.
         place = np.arange(step * self._batch, (step + 1) * self._batch)
         epochs, offsets = (place // self._size).tolist(), (place % self._size).tolist()
-        # Only the orders of the epochs at hand are kept: one, or those that this batch is cut from.
-        # They are replaced whole, for several threads may ask at once.
+        # Only the orders of the epochs that this batch is cut from are kept. The dict is replaced
+        # as a whole, since several threads may ask at once.
         known, orders = self._epochs, {}
         for epoch in set(epochs):
             orders[epoch] = known[epoch] if epoch in known else self._shuffle(epoch)
@@ -82,28 +83,28 @@ class BatchOrder:
         return np.array([orders[e][o] for e, o in zip(epochs, offsets, strict=True)])
 
     def _shuffle(self, epoch: int) -> np.ndarray:
-        # A generator of its own for each epoch: a resumed run starts in the middle of any.
+        # Each epoch has its own generator: a resumed run may start in the middle of any.
         places = np.random.default_rng([self._seed, epoch]).permutation(self._size)
         return self._drawn(epoch)[places] if self._shares else places
 
     def _drawn(self, epoch: int) -> np.ndarray:
-        """The rows of an epoch in their order, of each set as many as its share is.
+        """The sorted rows of an epoch, from each set as many as its share.
 
-        A set deals its own shuffled rounds, of which an epoch takes up where the last one ended: so
-        its rows come equally often, but for one time, whatever the share.
+        A set is dealt in shuffled rounds, and an epoch continues where the last one ended: so the
+        counts of its rows never differ by more than one, whatever the share.
         """
         first, found = 0, list[np.ndarray]()
         for number, (size, count) in enumerate(self._shares, start=1):
-            # The epoch has the set's draws `begin` to `end`, of all that it ever deals. A round is
-            # `size` of them, so that they lie in one round or in several.
+            # The epoch takes the draws `begin` to `end` of the set's endless sequence. A round has
+            # `size` draws, so these lie in one round or in several.
             begin, end = epoch * count, (epoch + 1) * count
             rounds = range(begin // size, -(-end // size))  # -(-a // b) rounds up
             for each in rounds:
-                # The number keeps this generator apart from an epoch's. It starts at 1, because
-                # NumPy fills seeds up with zeros: [s, e, 0] would be the generator of [s, e].
+                # The number distinguishes this generator from an epoch's. It starts at 1, because
+                # NumPy pads seeds with zeros: [s, e, 0] would be the generator of [s, e].
                 order = np.random.default_rng([self._seed, each, number]).permutation(size)
                 start = each * size
                 found.append(first + order[max(0, begin - start) : end - start])
             first += size
-        # Sorted, so that shares by which each row comes once give the order of no shares at all.
+        # Sorted, so that shares with which each row comes once give the same order as no shares.
         return np.sort(np.concatenate(found))

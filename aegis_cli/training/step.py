@@ -1,10 +1,10 @@
 """The gradients of one optimisation step, from one or two backward passes over one graph.
 
-Several processes may share the step's frames, and each may take its own in several passes
-(`train.accumulate`). The task's loss is divided by what the whole batch has, so that all passes'
-gradients add up to those of the batch; a method's own loss counts each pass alike. What a method
-measures over the frames of a pass, the transport penalty for one, it measures over those of all
-processes; over several passes it is averaged.
+Several processes may share the step's frames, and each may split its own into several passes
+(`train.accumulate`). The task's loss is divided by the size of the whole batch, so the gradients of
+all passes add up to those of the batch; a method's own loss weighs all passes equally. What a
+method measures over the frames of a pass, such as the transport penalty, it measures over those of
+all processes; over several passes it is averaged.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ NOT_PREPARED = PreparedPass(inputs=None)
 
 @dataclass(frozen=True)
 class LedgerRow:
-    """What the ledger keeps of a step: inner products [G] per group and W2^2 [L] per layer.
+    """The ledger's entries for one step: inner products [G] per group and W2^2 [L] per layer.
 
-    The groups are those of which something learns.
+    The groups are those with trainable parameters.
     """
 
     tt: Tensor
@@ -55,14 +55,14 @@ class LedgerRow:
 
 @dataclass(frozen=True)
 class StepGradients:
-    """What `compute_gradients` found; the combined gradients themselves are left in `.grad`.
+    """The results of `compute_gradients`; the combined gradients themselves are in `.grad`.
 
     Attributes:
-        loss: the task's own, whatever else the gradient is of.
+        loss: the task's own loss, even if the gradient includes other terms.
         row: None for a method that reads no anchor gradient.
-        anchor: the anchor gradient by the backbone's parameter names, as the task's was combined
-            with it; empty for such a method.
-        taken: the anchor gradient whole, as later steps may reuse it.
+        anchor: the anchor gradient by the backbone's parameter names, as it was combined with the
+            task's; empty for such a method.
+        taken: the complete anchor gradient, which later steps may reuse.
     """
 
     loss: Tensor
@@ -102,18 +102,18 @@ def compute_gradients(
     accumulate: int = 1,
     masters: Masters = NONE,
 ) -> StepGradients:
-    """Forward, backward, and what the method does to the gradient.
+    """Run the forward and backward passes, and combine the gradients as the method does.
 
     AEGIS's sequential dual backward: both gradients come from the same graph. The anchor gradient
-    is taken with respect to the backbone's parameters alone, so it never reaches the expert.
+    is taken only with respect to the backbone's parameters, so it never reaches the expert.
 
     Args:
         batch: this process's frames of the step, those of the first pass first.
-        reused: the anchor gradient that an earlier step has `taken`, in place of this step's own;
-            the ledger's row has the inner products with it, and this step's W2^2.
+        reused: the anchor gradient that an earlier step has `taken`, instead of this step's own;
+            the ledger's row has the inner products with it, but this step's W2^2.
         ranks: the processes that share the step.
-        accumulate: passes in which it is taken.
-        masters: the weights that a pass sees rounded; their gradients are float32 all the same.
+        accumulate: number of passes that the step is split into.
+        masters: the weights that a pass sees rounded; their gradients are still float32.
     """
     names = _learning_names(policy.backbone)
     groups = list(policy.backbone.learning_groups().values())
@@ -130,8 +130,8 @@ def compute_gradients(
         reuses=reused is not None,
     )
     loss, w2, taken = _all_passes(settings, batch, generator, masters)
-    # Both gradients become the whole batch's before any inner product is taken: that of two sums
-    # is not the sum of the processes' inner products.
+    # Both gradients are summed over the whole batch before any inner product is taken: the inner
+    # product of two sums is not the sum of the processes' inner products.
     parallel.add_up_gradients(policy, ranks)
     loss = ranks.total(loss)
     if w2 is None:
@@ -147,18 +147,18 @@ def compute_gradients(
         row = LedgerRow(*gram, w2)
         found = StepGradients(loss, row, _named(names, anchor), _named(names, taken))
     if parts.pull is not None:
-        parts.pull()  # after the combination: nothing projects what it adds to `.grad`
+        parts.pull()  # after the combination, so that what it adds to `.grad` is not projected
     return found
 
 
 def _all_passes(
     settings: _Settings, batch: RobotBatch, generator: torch.Generator, masters: Masters
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
-    """This process's passes of a step, forward and back.
+    """Run this process's forward and backward passes of a step.
 
     Returns:
-        What they contribute to the task's loss; the mean W2^2 of each layer [L], None without a
-        penalty; and what they contribute to the anchor gradient, by the parameters' ids.
+        Their contribution to the task's loss; the mean W2^2 of each layer [L], None without a
+        penalty; and their contribution to the anchor gradient, by the parameters' ids.
     """
     losses, distances = [], []
     taken: dict[int, Tensor | None] = {}
@@ -166,7 +166,7 @@ def _all_passes(
     device = settings.policy.backbone.device
     each_pass = passes(batch, settings.ranks, settings.accumulate, device)
     for number, (part, whole_batch) in enumerate(each_pass):
-        generator.set_state(noise)  # each pass draws the step's, and takes its own frames' of it
+        generator.set_state(noise)  # each pass draws the whole step's and uses its frames' part
         prepared = batch.prepared[number] if batch.prepared else NOT_PREPARED
         with masters.rounded():
             loss, w2, anchor = _backward(settings, part, whole_batch, generator, prepared)
@@ -174,16 +174,17 @@ def _all_passes(
         if w2 is not None:
             distances.append(w2)
         _add(taken, masters.wide(anchor))
-    # A pass's loss is its part of the whole batch's mean, but its W2^2 is that of its own frames.
+    # A pass's loss is its part of the whole batch's mean, but its W2^2 is that of its own frames
+    # only.
     loss = torch.stack(losses).sum()
     w2 = torch.stack(distances).mean(0) if distances else None  # [L]
     return loss, w2, taken
 
 
 def _combine_gradients(settings: _Settings, anchor: Mapping[int, Tensor | None]) -> Gram:
-    """Bend the task's gradient by the anchor's, group by group; their inner products before."""
+    """Combine the task's and the anchor's gradients by group; return their inner products."""
     combine = settings.parts.combine or projection.naive
-    # Only where each process has some rows are its inner products a share of the whole ones.
+    # Only with sharding, each process's inner products are partial sums.
     total = settings.ranks.total if parallel.is_sharded(settings.policy) else None
     reads = not devices.reading_stalls(settings.policy.backbone.device)
     gram, _ = combine_gradients(settings.groups, anchor, combine, total, reads)
@@ -191,7 +192,7 @@ def _combine_gradients(settings: _Settings, anchor: Mapping[int, Tensor | None])
 
 
 def own_rows(rows: Rows, ranks: Ranks, accumulate: int = 1) -> Rows:
-    """Which of a step's rows this process takes, those of its first pass first."""
+    """The rows of a step that this process takes, those of its first pass first."""
     places: list[int] = []
     for share in shares(ranks, accumulate):
         within = share.rows(len(rows))
@@ -210,14 +211,15 @@ def passes(
 ) -> Iterator[tuple[RobotBatch, WholeBatch]]:
     """This process's frames of each pass, and the batch that they are a share of."""
     if batch.of_step is not None:
-        # Counted when the batch was prepared: to ask the others would wait for a GPU in each step.
+        # Counted when the batch was prepared: asking the other processes would wait for the GPU in
+        # each step.
         frames, shown = batch.of_step
     else:
         frames, shown = len(batch), int((~batch.is_pad).sum())
         if ranks.several:
             frames, shown = ranks.total(torch.tensor([frames, shown], device=device)).tolist()
-    # `rows` are places in the whole step. Here this process's shares follow each other without a
-    # gap, so that of those places only the number counts.
+    # `rows` are indices into the whole step. In this batch the process's shares are contiguous, so
+    # only their lengths count.
     begin = 0
     for share in shares(ranks, accumulate):
         rows = share.rows(frames)
@@ -235,12 +237,12 @@ def with_prepared(
     fraction: float = 1.0,
     by_method: Callable[[RobotBatch], Any] | None = None,
 ) -> RobotBatch:
-    """The batch with what the backbone makes of each pass's frames, still to be sent to it.
+    """The batch with the backbone's inputs for each pass, which are still to be sent to its device.
 
     Args:
         batch: this process's frames.
-        size: of the whole batch, as `RobotBatch.of_step` has it.
-        fraction: of each pass's frames, which pass once more.
+        size: of the whole batch, as in `RobotBatch.of_step`.
+        fraction: share of each pass's frames that is passed a second time.
         by_method: the method's own `prepare`.
     """
     batch = replace(batch, of_step=size)
@@ -268,14 +270,14 @@ def _backward(
     generator: torch.Generator,
     prepared: PreparedPass,
 ) -> tuple[Tensor, Tensor | None, dict[int, Tensor | None]]:
-    """One pass over some frames, and back.
+    """Run one forward and backward pass over some frames.
 
     Args:
-        prepared: what was made of them ahead of the step, if anything was.
+        prepared: the inputs prepared from them ahead of the step, if any.
 
     Returns:
-        What it contributes to the task's loss, W2^2 of each layer [L], and what it contributes to
-        the anchor gradient, by the parameters' ids.
+        Its contribution to the task's loss, W2^2 of each layer [L], and its contribution to the
+        anchor gradient, by the parameters' ids.
     """
     policy, method, parts = settings.policy, settings.method, settings.parts
     device = policy.backbone.device
@@ -287,23 +289,24 @@ def _backward(
             return _encode(settings, shown, whole_batch, inputs, prepared.by_method)[1]
 
     with devices.autocast(device, settings.precision), torch.set_grad_enabled(True):
-        # A backbone that gets no gradient needs no graph, which would only take memory.
+        # A backbone that gets no gradient needs no graph, which would only waste memory.
         with torch.set_grad_enabled(not method.stop_gradient):
             inputs = prepared.inputs
             encoding, seen = _encode(settings, batch, whole_batch, inputs, prepared.by_method)
         if method.stop_gradient:
-            # Before torch 2.11 autocast keeps weights that it has rounded without a graph for later
-            # passes with one, such as a method's own, and these then give the weights no gradient.
+            # Before torch 2.11, autocast reuses weights that it rounded without a graph in later
+            # passes with one, such as a method's own, which then give the weights no gradient.
             torch.clear_autocast_cache()
         loss = policy.flow_loss(
             batch, encoding, settings.flow_samples, generator, method.stop_gradient, whole_batch
         )
-        objective = loss  # what the task's gradient is of; the report's loss stays the task's own
+        objective = loss  # what the gradient is taken of; the reported loss stays the task's own
         if parts.auxiliary is not None:
-            # The task's loss has the whole batch's divisor already; this one is a pass's own mean.
+            # The task's loss is already divided by the whole batch's size; this one is a mean over
+            # a pass.
             objective = loss + parts.auxiliary(seen) / settings.accumulate
-    # Backward passes run outside autocast, as PyTorch asks: each operation goes back in the type
-    # in which it went forward.
+    # Backward passes run outside autocast, as PyTorch asks: each operation's backward runs in the
+    # dtype of its forward.
     if parts.penalty is None:
         objective.backward()
         return loss.detach(), None, {}
@@ -318,11 +321,11 @@ def _encode(
     inputs: Batch | None,
     by_method: Any,
 ) -> tuple[Encoding, Pass]:
-    """The backbone's pass over frames, and what a method sees of it.
+    """Encode frames with the backbone; return the encoding and what a method sees of the pass.
 
     Args:
-        inputs: what the backbone has made of the frames ahead of the step; None: nothing.
-        by_method: what the method has made of them.
+        inputs: the backbone's inputs prepared ahead of the step; None: they were not prepared.
+        by_method: what the method has prepared from them.
     """
     backbone, ranks = settings.policy.backbone, settings.ranks
     if inputs is None:  # on a CPU nothing is prepared ahead
@@ -345,48 +348,48 @@ def _encode(
 def _dual_backward(
     settings: _Settings, objective: Tensor, seen: Pass, encode_part: Callable[[], Pass]
 ) -> tuple[Tensor, dict[int, Tensor | None]]:
-    """Go back from the loss and from the penalty.
+    """Run the backward passes of the loss and of the penalty.
 
     Args:
-        objective: what the task's gradient is of.
+        objective: the loss that the task's gradient is taken of.
         encode_part: passes the share of the frames that the anchor gradient is taken on.
     """
     penalty_of, parts = settings.parts.penalty, settings.parts
     assert penalty_of is not None
     if settings.reuses:
-        # The ledger has this step's own W2^2 all the same; it costs no backward pass.
+        # The ledger still gets this step's own W2^2, which needs no backward pass.
         with torch.no_grad():
             _, w2 = penalty_of(seen)
         objective.backward()
         return w2, {}
     if parts.fraction < 1:
-        objective.backward()  # lets go of the whole graph before the small one is made
+        objective.backward()  # frees the whole graph before the small one is built
         penalty, w2 = penalty_of(encode_part())
     else:
         penalty, w2 = penalty_of(seen)
         objective.backward(retain_graph=True)  # g goes into `.grad`; the penalty needs the graph
     sharded = parallel.is_sharded(settings.policy)
     again = second_backward_of_rows if sharded else second_backward
-    # a is returned and leaves `.grad` alone. Divided, so that the passes' sum is their mean.
+    # a is returned and does not touch `.grad`. Divided, so that the sum over passes is their mean.
     return w2, again(settings.groups, penalty / settings.accumulate)
 
 
 def _add(total: dict[int, Tensor | None], more: Mapping[int, Tensor | None]) -> None:
-    """Add a pass's anchor gradient to those before."""
+    """Add a pass's anchor gradient to those of earlier passes."""
     for i, gradient in more.items():
         known = total.get(i)
         if known is None:
             total[i] = gradient
         elif gradient is not None:
-            # Never in place: autograd may give several parameters one and the same tensor.
+            # Never in place: autograd may give several parameters the same tensor.
             total[i] = known + gradient
 
 
 def _learning_names(backbone: Backbone) -> dict[int, str]:
-    """Names of the parameters that learn, by their ids."""
+    """Names of the trainable parameters, by id."""
     return {id(p): name for name, p in backbone.named_parameters() if p.requires_grad}
 
 
 def _named(names: Mapping[int, str], gradients: Mapping[int, Tensor | None]) -> dict[str, Tensor]:
-    """The gradients that there are, by the parameters' names instead of their ids."""
+    """The gradients that are not None, by the parameters' names instead of their ids."""
     return {names[i]: a for i, a in gradients.items() if a is not None}

@@ -1,10 +1,10 @@
 """Losses, norms and ledger rows of the last steps, kept on the device until they are read.
 
 Reading a number from a GPU is a *sync*: the program waits for all queued work, and then the GPU
-idles. So on a GPU the figures of `train.log_every` steps are read at once. A step whose figures are
-not finite must not move the weights all the same: a flag on the device tells the optimizers to skip
-that step and those after it, until the figures are read. A count on the device tells the method and
-the weights' average how many steps have moved anything.
+idles. So on a GPU the figures of `train.log_every` steps are read at once. Still, a step whose
+figures are not finite must not update the weights: a flag on the device tells the optimizers to
+skip that step and those after it, until the figures are read. A counter on the device tells the
+method and the weights' average how many steps have updated the weights.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class StepFigures:
 
     Attributes:
         index: of the step, from 0.
-        checked: what has to be finite, by name. The ledger's row is among it: W2 can overflow
+        checked: what has to be finite, by name. It includes the ledger's row: W2 can overflow
             before the loss does.
         row: of the ledger, float64; None for a method that reads no anchor gradient.
     """
@@ -44,14 +44,14 @@ class StepFigures:
 
 @dataclass
 class UnreadFigures:
-    """Figures of steps that nobody has read yet.
+    """Figures of steps that have not been read yet.
 
     Attributes:
-        deferred: whether reading them is put off.
-        moves: 1 where the step that was noted last moves the weights, 0 from the first one on that
-            is not finite, [] float64; None where nothing is put off, for such a step ends the run.
-        moved: how many steps have moved the weights since the run began, once the optimizers have
-            taken the one that was noted last; [] float64 where reading is put off.
+        deferred: whether reading them is deferred.
+        moves: 1 if the step noted last updates the weights, 0 from the first non-finite step on, []
+            float64; None if nothing is deferred, since such a step then ends the run.
+        moved: how many steps have updated the weights since the run began, once the optimizers have
+            taken the one noted last; [] float64 if reading is deferred.
     """
 
     deferred: bool = False
@@ -64,12 +64,12 @@ class UnreadFigures:
     def of(
         cls, device: torch.device, optimizers: Sequence[Optimizer], parts: Parts, sharded: bool
     ) -> UnreadFigures:
-        """Put reading off on a GPU, unless a step that is not finite would then move the weights.
+        """Defer reading on a GPU, unless a non-finite step would then update the weights.
 
-        AdamW's fused kernel can be told to stand still, other optimizers and sharded weights
-        cannot. A method that constrains the update by the anchor gradient would move them itself.
-        One that reuses an anchor gradient would have taken another by the time it is read, and the
-        last good step's checkpoint would hold that.
+        AdamW's fused kernel can be told to skip a step; other optimizers, and AdamW with sharded
+        weights, cannot. A method that constrains the update by the anchor gradient would change the
+        weights itself. A method that reuses an anchor gradient would have taken a new one by the
+        time figures are read, and the last good step's checkpoint would hold that one.
         """
         told = all(isinstance(o, torch.optim.AdamW) for o in optimizers) and not sharded
         itself = parts.penalty is not None and parts.constrain is not None
@@ -88,7 +88,7 @@ class UnreadFigures:
         figures = torch.cat([part.detach().double() for part in parts])
         self._steps.append((index, figures, [len(part) for part in parts]))
         if self.deferred:
-            # Plain arithmetic on the device stands for `if`, which would have to read the flag.
+            # Arithmetic on the device replaces an `if`, which would have to read the flag.
             broken = (~figures.isfinite().all()).float()
             # Once 1 it stays 1: the run ends at the first broken step, and what was queued after it
             # may not move the weights either.
@@ -100,14 +100,14 @@ class UnreadFigures:
             self.moved = index + 1
 
     def stop(self, optimizers: Sequence[Optimizer]) -> None:
-        """Let the optimizers leave everything as it is from the first step that is not finite."""
+        """Make the optimizers skip all steps from the first non-finite one on."""
         if self.deferred:
             for optimizer in optimizers:
                 # As a GradScaler does: the fused kernel then skips the step and does not count it.
                 optimizer.found_inf = self._broken  # type: ignore[attr-defined]
 
     def taken(self) -> Iterator[StepFigures]:
-        """The figures in the steps' order, which are read by one transfer and then gone."""
+        """The figures in order of the steps, read in one transfer and then removed."""
         steps, self._steps = self._steps, []
         if not steps:
             return
@@ -118,6 +118,6 @@ class UnreadFigures:
             row = LedgerRow(*columns) if columns else None
             checked = {"loss": float(loss), "gradient norm": float(norm)}
             if row is not None:
-                # The largest stands for all of a column: PyTorch's max is NaN where any entry is.
+                # The largest entry represents its column: PyTorch's max is NaN if any entry is.
                 checked |= {f"largest {n}": float(x.abs().max()) for n, x in vars(row).items()}
             yield StepFigures(index, checked, row)

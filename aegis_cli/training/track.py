@@ -1,9 +1,9 @@
-"""Trackers that show a training while it runs: TensorBoard, Trackio and Weights & Biases.
+"""Trackers that show a run while it trains: TensorBoard, Trackio and Weights & Biases.
 
-Each gets the lines of metrics.jsonl, under their names there, and later what probes, rollouts and
-open-loop evaluations measure of the run. A tracker's package is imported when a recipe names it.
-Nothing leaves the machine unless the user says so to the tracker itself, as by its environment
-variables.
+Each gets the lines of metrics.jsonl, under the same names, and later what probes, rollouts and
+open-loop evaluations measure of the run. A tracker's package is imported only if a recipe names it.
+Nothing leaves the machine unless the user configures the tracker to send it, for example by its
+environment variables.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from aegis_cli.training import folder
 
 PROJECT = "aegis"
 Log = Callable[[Mapping[str, float]], None]  # one line of metrics.jsonl, its step included
-# The tables that a probe has, a rollout of a set of tasks, and one with colours.
+# The tables of a probe, of a rollout over a set of tasks, and of one with colours.
 _TABLES = ("families", "tasks", "target_colors")
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What a probe, a rollout or an open-loop evaluation found of a run.
+    """What a probe, a rollout or an open-loop evaluation measured of a run.
 
     Attributes:
-        name: of its file, `probe-scenes`.
+        name: of its file, such as `probe-scenes`.
         step: the run's last one.
-        header, rows: its table, a line per family of questions or per task; empty without one.
+        header, rows: its table, with one row per family of questions or per task; empty if there is
+            none.
         video: of some episodes.
     """
 
@@ -48,7 +49,7 @@ class Measured:
 
 
 class Tracker(NamedTuple):
-    """An open tracker: what takes a line of the log, and what takes a measurement."""
+    """An open tracker: a function for lines of the log, and one for measurements."""
 
     log: Log
     show: Callable[[Measured], None]
@@ -58,7 +59,7 @@ def check(recipe: Recipe) -> None:
     """Refuse a tracker that is not installed, before any work.
 
     Raises:
-        AegisError: one that the recipe names is not.
+        AegisError: a tracker that the recipe names is not installed.
     """
     missing = [name for name in recipe.train.track or () if find_spec(name) is None]
     if missing:
@@ -71,12 +72,12 @@ def check(recipe: Recipe) -> None:
 
 @contextmanager
 def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Generator[Log]:
-    """Trackers of a run, opened and in the end closed; without any, nothing is logged.
+    """Open a run's trackers and close them at the end; without any, nothing is logged.
 
     Args:
-        out: the run's folder, where those that write files write them.
-        done: steps behind a run that goes on.
-        speaks: whether this process is the one that writes.
+        out: the run's folder, for trackers that write files.
+        done: steps already taken by a resumed run.
+        speaks: whether this process is the one that logs.
     """
     with ExitStack() as stack:
         names = (recipe.train.track or ()) if speaks else ()
@@ -90,9 +91,10 @@ def following(recipe: Recipe, out: Path, done: int, speaks: bool = True) -> Gene
 
 
 def tell(recipe: Recipe, out: Path, name: str, report: Mapping[str, Any], step: int) -> None:
-    """Show the trackers of a run what was measured of it.
+    """Send what was measured of a run to its trackers.
 
-    One that is not installed here is left out: a run may be measured elsewhere than it was trained.
+    Trackers that are not installed are skipped: a run may be measured on another machine than it
+    was trained on.
 
     Args:
         name: of the measurement's file.
@@ -109,9 +111,9 @@ def tell(recipe: Recipe, out: Path, name: str, report: Mapping[str, Any], step: 
 
 
 def _measured(name: str, report: Mapping[str, Any], step: int) -> Measured:
-    """The plain figures of a report, and its table if it has one."""
+    """The scalar figures of a report, and its table if it has one."""
     table = next((report[key] for key in _TABLES if report.get(key)), {})
-    # The first line's figures are the columns: a measurement has the same ones for every line.
+    # The first row's figures are the columns: all rows of a measurement have the same ones.
     columns = list(_numbers(next(iter(table.values()), {})))
     rows = []
     for line, figures in table.items():
@@ -129,7 +131,7 @@ def _measured(name: str, report: Mapping[str, Any], step: int) -> Measured:
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     plain = {name: value for name, value in values.items() if isinstance(value, int | float)}
-    # A bool is an int to Python, and no curve to a tracker.
+    # In Python a bool is an int, but it makes no curve.
     return {name: value for name, value in plain.items() if not isinstance(value, bool)}
 
 
@@ -145,18 +147,18 @@ def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> 
     """Event files in the run's folder: tensorboard --logdir runs.
 
     Args:
-        done: steps behind the run; None for one that is measured, of which every step stays.
+        done: steps already taken; None for a measurement, which keeps all steps.
     """
     from torch.utils.tensorboard import SummaryWriter
 
-    # What was logged after the checkpoint that a run goes on from is repeated, or from the first
-    # step on if a run was killed before it had one.
+    # Steps logged after the checkpoint that a run is resumed from are repeated; all steps are, if
+    # it was killed before its first checkpoint.
     writer = SummaryWriter(str(out / "tensorboard"), purge_step=None if done is None else done + 1)
 
     def log(line: Mapping[str, float]) -> None:
         for name, value in _figures(line).items():
             writer.add_scalar(name, value, int(line["step"]))
-        writer.flush()  # by itself it writes every two minutes, and a killed run would lose them
+        writer.flush()  # otherwise it flushes every two minutes, and a killed run would lose lines
 
     def show(found: Measured) -> None:
         for name, value in found.figures.items():
@@ -174,14 +176,14 @@ def _tensorboard(recipe: Recipe, out: Path, done: int | None, job: str = "") -> 
 
 
 def _markdown(found: Measured) -> str:
-    """The table as TensorBoard's text plugin draws it."""
+    """The table in Markdown, for TensorBoard's text plugin."""
     shown = [[f"{x:.4g}" if isinstance(x, float) else f"{x}" for x in row] for row in found.rows]
     lines = [found.header, ["---"] * len(found.header), *shown]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _moving(name: str, video: Path) -> Any:
-    """A video as an image that moves; TensorBoard has no other, and its own way needs moviepy."""
+    """A video as a GIF, the only kind that TensorBoard shows; its own encoder needs moviepy."""
     from tensorboard.compat.proto.summary_pb2 import Summary
 
     gif, width, height = media.as_gif(video)
@@ -210,8 +212,8 @@ def _wandb(
 ) -> Generator[Tracker]:
     """Files in the run's folder; `wandb sync` or WANDB_MODE=online send them.
 
-    A run that is finished offline cannot be opened again: what is measured later is a run of the
-    same group.
+    A run that was finished offline cannot be opened again: later measurements become a new run in
+    the same group.
     """
     import wandb
 
@@ -231,7 +233,7 @@ def _wandb(
 
 
 def _tracker(module: Any, send: Callable[..., None]) -> Tracker:
-    """A tracker whose module has tables and videos, and whose `send` takes figures by name."""
+    """A tracker whose module has `Table` and `Video`, and whose `send` takes figures by name."""
 
     def log(line: Mapping[str, float]) -> None:
         send(_figures(line), step=int(line["step"]))
@@ -249,13 +251,13 @@ def _tracker(module: Any, send: Callable[..., None]) -> Tracker:
 
 
 def _name(out: Path) -> str:
-    """A name that tells the run from others: its folder's last two parts, or three of a merge's."""
+    """A name for the run: the last two parts of its folder, or three for a merged run."""
     out = out.resolve()
     return "-".join(out.parts[-2 if folder.trained_in(out) == out else -3 :])
 
 
 def _config(recipe: Recipe) -> dict[str, Any]:
-    """What a tracker shows beside the curves: what shapes the training."""
+    """The settings that affect the training, which a tracker shows beside the curves."""
     return {"recipe": recipe.name, **recipes.training_part(recipe)}
 
 

@@ -65,12 +65,12 @@ from aegis_cli.training.validation_vqa import ToldOfSet, ValidationQuestions
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
 VALIDATION_FRAMES = 512
-# A validation has progress of its own if steps with as many batches would take longer than this;
-# so have questions whose answers took longer before training, and episodes and predicted actions
-# that did the last time.
+# A validation reports its own progress if training steps on as many batches would take longer than
+# this; questions do if their answers took longer before training, and episodes and predicted
+# actions if they took longer the last time.
 _LONG_S = 20.0
 _LOGGED = ("step", "loss", "step_s")  # in every line of metrics
-# What the progress shows of such a line, and under which name.
+# The entries of such a line that the progress shows, and their labels.
 _SHOWN = {
     "loss": "loss",
     "vqa_drop_points": "VQA drop",
@@ -89,13 +89,12 @@ _Hearing = Callable[[float], OnEvent]
 class TrainReport:
     """How the run ended.
 
-    `energy_shed_mean` is what the projection of the gradient removes, or would where an option
+    `energy_shed_mean` is what the projection of the gradient removes, or would remove if an option
     projects the update or fewer groups; None for a method that reads no anchor gradient. `cameras`
-    are those of a LeRobot folder, in their order. `validation_vqa` is what the last step's weights
-    answer, by the set's name, as `validation_vqa.of_line` has it; empty where nothing was asked.
-    `validation_rollout` is how they act, as `validation_rollout.of_line` has it; empty where
-    nothing was played. `validation_actions` is how far from held-out ones their actions are, as
-    `validation_actions.of_line` has it; empty where none were predicted.
+    are those of a LeRobot folder, in order. The last three are results of the final weights:
+    `validation_vqa` on questions, by the set's name, as `validation_vqa.of_line` returns them;
+    `validation_rollout` on episodes, as from `validation_rollout.of_line`; `validation_actions` on
+    held-out actions, as from `validation_actions.of_line`. Each is empty if it was not measured.
     """
 
     method: str
@@ -124,29 +123,29 @@ def run(
     on_event: OnEvent = ignore,
     overwrite: bool = False,
 ) -> TrainReport:
-    """Train `recipe.train.steps` steps into the run folder `out`.
+    """Train for `recipe.train.steps` steps in the run folder `out`.
 
-    Only methods that train on questions read any; all others know VQA from the anchor alone.
+    Only methods that train on questions read any; all others know VQA only through the anchor.
 
-    Where torchrun has started several processes, each calls this, and they share every step.
+    If torchrun has started several processes, each calls this, and they share every step.
 
     Args:
         demos: one set of demonstrations, or several to learn from together.
-        resume: go on with the run that is there, if there is one; one that has ended goes on
-            where `recipe` has more steps, as `longer` says.
-        overwrite: remove the run that is there, once everything else has been checked.
+        resume: resume the existing run, if there is one; a finished run is extended if `recipe` has
+            more steps, as described in `longer`.
+        overwrite: remove the existing run, once everything else has been checked.
 
     Raises:
-        AegisError: inputs that do not fit together, an existing run without either, one that
-            another process is at, or a disk that cannot be written.
-        Diverged: a loss or gradient that is not finite; the checkpoint is of the last good step,
-            or, where only the validation found it, an earlier one.
+        AegisError: the inputs do not fit together, there is a run and neither option is given,
+            another process is using it, or the disk cannot be written.
+        Diverged: a loss or gradient is not finite; the checkpoint is that of the last good step or,
+            if only the validation found it, an earlier one.
     """
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     chosen = methods.get(method)
     out, places = Path(out), inputs.Inputs.given(demos, anchor)
-    # One process writes and speaks, so that one lock holds the folder for all of them.
+    # Only one process writes and reports, so its lock of the folder serves all of them.
     with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
         on_event = on_event if ranks.first else ignore
         if resume:
@@ -167,7 +166,7 @@ def run(
             training.questions = _asked_before(training, on_event)
         if goes_on:
             restored = _restore(training, places)
-            # Where all steps are behind it, `_train` takes none and reports what there is.
+            # If all steps have been taken, `_train` takes none and only reports.
             if is_finished:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
@@ -189,7 +188,7 @@ def run(
 
 
 def _has_ended(out: Path, recipe: Recipe) -> bool:
-    """Whether a run has taken all steps, and written the last one's line as well."""
+    """Whether a run has taken all steps and written the last one's metrics line."""
     steps = recipe.train.steps
     if checkpoint.step_of(checkpoint.last(out)) < steps:
         return False
@@ -198,9 +197,9 @@ def _has_ended(out: Path, recipe: Recipe) -> bool:
 
 
 def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | None:
-    """The questions that are asked while the run trains, and what its model answers before.
+    """The questions asked during training, with the model's answers before training.
 
-    A run that goes on asks them here too, before its checkpoint is put back.
+    A resumed run asks them here too, before its checkpoint is restored.
     """
     backbone = run.shown.backbone
     chosen = validation_vqa.chosen(run.recipe, backbone, on_event)
@@ -208,7 +207,8 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
         return None
 
     def answered(ranks: Ranks) -> tuple[tuple[list[Graded], ...], float]:
-        # Without the questions' images, since a single process may have to tell all others.
+        # Without the questions' images, since one process may have to send the result to all
+        # others.
         found = chosen.asked_before(backbone, ranks, on_event)
         return found.before, found.seconds
 
@@ -220,16 +220,16 @@ def _asked_before(run: TrainingRun, on_event: OnEvent) -> ValidationQuestions | 
 
 
 def _machine(run: TrainingRun) -> dict[str, str | int]:
-    """The machine, and what `train.precision` has come to there, which `auto` does not say."""
+    """The machine, and the precision that `train.precision`, such as `auto`, means on it."""
     device = run.policy.backbone.device
     taken = devices.precision_taken(device, run.recipe.train.precision)
     return machine.describe() | {"precision": taken}
 
 
 def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
-    """Warn where a run goes on with matrix products in another precision than it began with.
+    """Warn if a run is resumed with another precision of matrix products than it began with.
 
-    So it does with `train.precision: auto` on other hardware. The weights are not those of either.
+    This happens with `train.precision: auto` on other hardware. The weights then match neither.
     """
     path = run.out / machine.NAME
     said = files.load_json(path) if path.is_file() else None
@@ -245,9 +245,9 @@ def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
 
 
 def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event: OnEvent) -> None:
-    """Warn where episodes that are held out may be among those that `expert.start` learned from.
+    """Warn if held-out episodes may be among those that the run of `expert.start` was trained on.
 
-    They are drawn anew where the same demonstrations have grown, or are divided otherwise.
+    They are drawn anew if the same demonstrations have grown, or are split differently.
     """
     recipe, start = run.recipe, run.recipe.expert.start
     if start is None or not Path(start).is_dir():
@@ -259,8 +259,8 @@ def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event:
     learned = inputs.of(before)
     if learned is None or learned.demos != places.demos:
         return
-    # Which episodes are held out follows from the share, the seed, and which are learned from; and
-    # from how many there are, which the digests tell.
+    # The held-out episodes follow from the share, the seed, the selection, and the number of
+    # episodes, which the digests cover.
     begun = recipes.load(before / "recipe.yaml", kind=Recipe)
     splits = {(each.train.validation_share, each.seed, each.demos.only) for each in (begun, recipe)}
     there = artifacts.read_header(before / LEDGER).inputs
@@ -276,23 +276,25 @@ def _warn_of_learned_episodes(run: TrainingRun, places: inputs.Inputs, on_event:
 def _says_otherwise(out: Path, recipe: Recipe, places: inputs.Inputs) -> bool:
     """Whether the recipe differs from the one in the run's folder, or its inputs have moved.
 
-    Those that shape its weights are the same by now; a longer plan, questions or a gate may not be.
+    Settings that affect its weights are known to be equal by now; a longer plan, questions or a
+    gate may differ.
     """
     kept = recipes.load(out / "recipe.yaml", kind=Recipe)
-    # One place has several names, and inputs.json says whether the demonstrations lie elsewhere.
+    # A path can be written in several ways; whether the demonstrations have moved is in
+    # inputs.json.
     demos = dataclasses.replace(kept.demos, path=recipe.demos.path)
     return dataclasses.replace(kept, demos=demos) != recipe or inputs.of(out) not in (None, places)
 
 
 def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
-    """State, ledger and metrics as they were after the last checkpoint.
+    """Restore state, ledger and metrics as they were after the last checkpoint.
 
     Returns:
-        How many steps lie behind it, and the sums since the last line of metrics: of no step where
-        the last one's line has been written.
+        The number of steps taken, and the sums since the last metrics line: those of no step if the
+        last step's line has been written.
     """
     state = checkpoint.kept_state(run.out)
-    # The header alone: other inputs are refused before gigabytes of state are read.
+    # Only the header: other inputs are refused before gigabytes of state are read.
     with _reading_state(run.out):
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
@@ -304,8 +306,8 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
             run.out, run.policy, run.optimizers, run.average
         )
     _check_behind(run, done, meta, kept, lines)
-    # A run that was killed may have written more ledger and metrics than its last checkpoint
-    # knows of. The steps after that are taken again.
+    # A run that was killed may have written ledger rows and metrics beyond its last checkpoint. The
+    # steps after it are taken again.
     run.ledger = Ledger.from_tensors(run.ledger.groups, run.ledger.layers, kept.tensors)
     run.ledger.truncate(done)
     window = Window()
@@ -313,7 +315,7 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
         run.temporary = checkpoint.last(run.out).resolve()
         with reading_meta(run.temporary / checkpoint.STATE):
             summed = Window.read(meta[INTERRUPTED])
-        # The line may have been written when the run went on before, and was interrupted again.
+        # The line may have been written when the run was resumed earlier and interrupted again.
         if all(line["step"] != done for line in lines):
             window = summed
     if run.ranks.first:
@@ -322,7 +324,7 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
 
 
 def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inputs) -> AegisError:
-    """Why a run cannot go on: other cameras, demonstrations that have changed, or other files."""
+    """The error for a run that cannot be resumed: other cameras, demonstrations or files."""
     begun, out = recipes.load(run.out / "recipe.yaml", kind=Recipe), run.out
     if mixture.digests(there) != mixture.digests(run.inputs):
         if begun.demos.camera != run.recipe.demos.camera:
@@ -351,10 +353,10 @@ def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inp
 
 @contextmanager
 def _reading_state(out: Path) -> Generator[None]:
-    """Say how a run can go on whose last training state would have to be written again.
+    """In errors about the last training state, say how the run can still be resumed.
 
     Raises:
-        AegisError: what is raised inside the block.
+        AegisError: the error that was raised inside the block.
     """
     try:
         yield
@@ -363,7 +365,7 @@ def _reading_state(out: Path) -> Generator[None]:
             raise
         link = checkpoint.last(out)
         known, name = checkpoint.whole(out), link.resolve().name
-        # A copy that followed links has a folder of the name 'last'.
+        # A copy that followed links has a folder named 'last'.
         older = [at for at in known if name.isdecimal() and int(at.name) < int(name)]
         fix = "bring back a copy of it, or begin anew with --overwrite instead of --resume"
         if older:
@@ -378,11 +380,11 @@ def _check_behind(
     kept: artifacts.Artifact,
     lines: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Raise AegisError unless state, ledger and metrics are of the same run, without a gap."""
+    """Raise AegisError unless state, ledger and metrics are of the same run, without gaps."""
     method = meta.get("method")
     rows = kept.tensors["step"][:done].tolist()
     settings = run.recipe.train
-    # Steps in which the backbone stands still have no row.
+    # Steps in which the backbone is frozen have no row.
     moving = moving_steps(settings.steps, settings.backbone_until)
     moved = min(done, moving)
     wanted = list(range(1, moved + 1)) if run.parts.dual else []
@@ -411,7 +413,7 @@ def _check_behind(
 
 @dataclass
 class Window:
-    """Sums since the last line of metrics."""
+    """Sums since the last metrics line."""
 
     loss: float = 0.0
     data_s: float = 0.0
@@ -423,9 +425,9 @@ class Window:
         """The sums in a file's meta.
 
         Raises:
-            TypeError, ValueError: something else.
+            TypeError, ValueError: the meta holds something else.
         """
-        # Older files also have the figures of a measurement that is no longer made.
+        # Older files also have `leaks`, the figures of a measurement that is no longer made.
         found = cls(**{name: value for name, value in raw.items() if name != "leaks"})
         numbers = (found.loss, found.data_s, found.update_s)
         if type(found.steps) is not int or not all(isinstance(x, int | float) for x in numbers):
@@ -451,8 +453,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
         window: the sums since the last line of metrics.
 
     Raises:
-        Diverged: the steps before it are saved.
-        KeyboardInterrupt: a signal has come, and the steps up to it are saved.
+        Diverged: a step is not finite; the steps before it are saved.
+        KeyboardInterrupt: a signal was received; the steps up to it are saved.
     """
     settings = run.recipe.train
     shown: dict[str, float] = {}
@@ -465,7 +467,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     with ahead as batches, signals as signaled, tracked as log:
         if done < settings.steps:
             on_event(Progress("train", done, settings.steps, "steps"))
-        # A run that was interrupted while it validated owes the line of a step that it has taken.
+        # A run that was interrupted during a validation still has to write the line of its last
+        # step.
         owed = window.steps > 0 and _Due.after(done, settings).line
         for finished in range(done if owed else done + 1, settings.steps + 1):
             due = _Due.after(finished, settings)
@@ -473,7 +476,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 _take_step(run, finished - 1, batches, window, due)
             if finished == done + 1:
                 warn_of_written(run.policy.backbone, buffers, on_event)
-            # First the line: by its validation loss the checkpoint chooses which others stay.
+            # First the line: its validation loss decides which older checkpoints are kept.
             if due.line:
                 shown = _log(run, finished, window, due.validation, signaled, on_event)
                 log(shown)
@@ -482,7 +485,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
                 _save(run, finished)
             told |= {label: shown[name] for name, label in _SHOWN.items() if name in shown}
             on_event(Progress("train", finished, settings.steps, "steps", told))
-            # All processes leave together: one that went on alone would wait for the others.
+            # All processes leave together: one that continued alone would wait for the others.
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
                 _save_interrupted(run, finished, window)
                 signaled.leave()
@@ -491,7 +494,7 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
 
 @dataclass(frozen=True)
 class _Due:
-    """What is due after a step: a checkpoint, a validation loss, a line of metrics."""
+    """What is due after a step: a checkpoint, a validation, a metrics line."""
 
     checkpoint: bool
     validation: bool
@@ -499,9 +502,9 @@ class _Due:
 
     @classmethod
     def after(cls, finished: int, settings: Train) -> _Due:
-        """What is due after so many steps; the last has all."""
-        # The end of an earlier plan counts as well: a run that was planned as long from the start
-        # writes what one that was made longer has written.
+        """What is due after `finished` steps; after the last one everything is."""
+        # The end of an earlier plan counts too: a run planned this long from the start with
+        # `train.extended_from` writes what an extended run has written.
         last = finished in settings.plans
         save = finished % settings.checkpoint_every == 0 or last
         validate = finished % settings.validate_every == 0 or last
@@ -511,7 +514,7 @@ class _Due:
 def _take_step(
     run: TrainingRun, index: int, batches: Iterator[RobotBatch], window: Window, due: _Due
 ) -> None:
-    """Fetch a batch and take its step; the window gets both times.
+    """Fetch a batch and take its step; both times are added to the window.
 
     Raises:
         Diverged: the steps before it are saved.
@@ -532,9 +535,9 @@ def _take_step(
 
 
 def _heeds(run: TrainingRun, due: _Due) -> bool:
-    """Whether a signal is looked for after this step."""
-    # Between two constraints a step waits for the next: to constrain earlier would lead to other
-    # weights than those of a run that nobody interrupts.
+    """Whether to check for a signal after this step."""
+    # Steps between two constraints are pending: constraining them early would lead to other weights
+    # than in an uninterrupted run.
     if run.stepper.pending:
         return False
     # With several processes this is a collective, which would force a GPU sync.
@@ -542,7 +545,7 @@ def _heeds(run: TrainingRun, due: _Due) -> bool:
 
 
 def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
-    """Write the checkpoint that a run goes on from after a signal."""
+    """Write the checkpoint that a run is resumed from after a signal."""
     with _good_steps_saved(run):
         read_figures(run, window)
     _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
@@ -553,7 +556,8 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Generator[Iterator[Rob
     """This process's frames of each of these steps, fetched ahead.
 
     For a GPU several threads prepare them, as a model's own processor can take longer for a batch
-    than a GPU for a step. One more sends the next batch there, where each takes up to gigabytes.
+    than the GPU for a step. Another thread sends only the next batch to the GPU, where a batch may
+    take gigabytes.
     """
     device = run.policy.backbone.device
     if not devices.reading_stalls(device):
@@ -568,12 +572,12 @@ def batches_of(run: TrainingRun, steps: Sequence[int]) -> Generator[Iterator[Rob
 
 
 def fetched_ahead(run: TrainingRun) -> int:
-    """How many batches may be ready for a GPU before it asks for one."""
+    """How many batches may be ready for a GPU before it needs one."""
     return prefetch.workers() + 2 if devices.reading_stalls(run.policy.backbone.device) else 0
 
 
 def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
-    """What finds this process's frames of a step, by the number of steps before it.
+    """A function from the index of a step to this process's frames.
 
     Several threads may call it.
     """
@@ -588,8 +592,8 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
         frames = of_step[own]
         batch = run.demos.batch(frames, settings.chunk)
         if settings.augment is not None:
-            # A batch may have a frame twice, each time with another draw. Which of them this one is
-            # counts among all of the step's frames, whoever takes the others.
+            # A batch may contain a frame twice, each time with another draw. Repeats are counted
+            # over all frames of the step, whichever process takes them.
             repeats = torch.tensor(augment.earlier(of_step.tolist()))[own].tolist()
             images = augment.augmented(
                 batch.images,
@@ -607,27 +611,27 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
 
 
 def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) -> RobotBatch:
-    """A batch with what a step would wait for: sums over the processes, images to scale.
+    """A batch with what a step would otherwise wait for: sums over processes, scaled images.
 
     Args:
         batch: this process's frames of a step.
-        frames: the places of all of the step's frames.
-        index: how many steps come before it.
+        frames: the numbers of all frames of the step.
+        index: the index of the step.
     """
     settings, parts = run.recipe.train, run.parts
     size = run.demos.size(frames, settings.chunk)
     sharing = run.ranks, settings.accumulate
-    # A step that reuses an anchor gradient passes no frames of its own for one.
+    # A step that reuses an anchor gradient passes no frames of its own for it.
     fraction = 1.0 if parts.reuses(index) else parts.fraction
     return step.with_prepared(batch, size, run.policy.backbone, *sharing, fraction, parts.prepare)
 
 
 @contextmanager
 def _good_steps_saved(run: TrainingRun) -> Generator[None]:
-    """Write a checkpoint of the good steps where a later one turns out not to be finite.
+    """Write a checkpoint of the good steps if a later one is not finite.
 
     Raises:
-        Diverged: that, and where the good steps are.
+        Diverged: a step is not finite; the error says where the good steps are.
     """
     try:
         yield
@@ -643,8 +647,8 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
     """Write a checkpoint.
 
     Raises:
-        Diverged: a step has left weights that are not finite, though its loss was, as a method's
-            knob can do; the last checkpoint stays.
+        Diverged: a step left weights that are not finite although its loss was, which options of a
+            method can cause; the last checkpoint stays.
     """
     parameters = dict(run.policy.named_parameters())
     with devices.single_threaded():
@@ -665,10 +669,10 @@ def _save(run: TrainingRun, finished: int, going_on: Mapping[str, Any] | None = 
 
 
 def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEvent) -> None:
-    """Say which parts of the backbone passes have written to, for no method holds that.
+    """Warn of buffers of the backbone that passes have changed, which no method constrains.
 
     Args:
-        before: its buffers before these passes.
+        before: the buffers before these passes.
     """
     written = [name.removeprefix(backbone.inside) for name in before.modules()]
     if not written:
@@ -683,36 +687,36 @@ def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEven
 
 
 def _generator(run: TrainingRun, index: int, stream: int) -> torch.Generator:
-    """Noise as a function of (seed, step): a resumed run draws what the uninterrupted one drew."""
+    """A generator seeded by (seed, step): a resumed run draws what an uninterrupted one draws."""
     return torch.Generator().manual_seed(_seed(run.recipe.seed, index, stream))
 
 
 def validation_noise(seed: int) -> int:
-    """What seeds the noise of every validation loss of a run, by its recipe's seed."""
+    """The seed of the noise in every validation loss of a run with this recipe seed."""
     return _seed(seed, 0, _VALIDATION)
 
 
 def _seed(seed: int, index: int, stream: int) -> int:
     # Seeds are 1,000,003 steps apart, and a step has room for four streams. A generator on the CPU
-    # takes the lower 32 bits of this, which differ for all steps of a run below 2^30.
+    # uses the lower 32 bits of this, which differ for all steps of a run below 2^30.
     return (seed * 1_000_003 + index) * 4 + stream
 
 
 def update(
     run: TrainingRun, index: int, batch: RobotBatch, window: Window, settle: bool = False
 ) -> None:
-    """One step; with `settle`, the method constrains it now, whatever its turn.
+    """Take one step; with `settle`, the method constrains it now, even if it is not yet due.
 
     Raises:
-        AegisError: the method does not see what learns; nothing moves.
-        Diverged: something is not finite. Then nothing moves, and the steps before are constrained.
+        AegisError: the method does not cover what is trained; nothing is updated.
+        Diverged: something is not finite; nothing is updated, and earlier steps are constrained.
     """
     settings = run.recipe.train
     moving = moving_steps(settings.steps, settings.backbone_until)
     still = index >= moving
     method, parts = run.method, run.parts
     if still:
-        # No gradient reaches the backbone, and what has none the optimizer leaves as it is.
+        # No gradient reaches the backbone, and the optimizer skips parameters without one.
         method, parts = dataclasses.replace(method, stop_gradient=True), Parts()
     for optimizer in run.optimizers:
         optimizer.zero_grad()
@@ -730,8 +734,8 @@ def update(
         accumulate=settings.accumulate,
         masters=run.masters,
     )
-    # Over backbone and expert together, and after the projection, which it does not undo: a scaled
-    # gradient is as orthogonal to the anchor gradient as it was.
+    # Over backbone and expert together, and after the projection, which clipping does not undo: a
+    # scaled gradient stays orthogonal to the anchor gradient.
     norm = whole(nn.utils.clip_grad_norm_(run.learning, settings.clip_norm))
     run.unread.note(index, result, norm)
     if not run.unread.deferred:
@@ -745,26 +749,26 @@ def update(
         move = partial(_move, run, index)
         left, moves = rate_left(index, settings), run.unread.moves
         run.stepper.step(index + 1, move, result.anchor, left, moves)
-        # The backbone's last step is constrained in any case: none after it would be its turn.
+        # The backbone's last step is always constrained: no later step would do it.
         if settle or index + 1 == moving:
             run.stepper.settle()
-    # Weights that wait to be constrained do not enter the average as they are.
+    # Weights that are still to be constrained do not enter the average.
     if not run.stepper.pending:
         run.average.follow(run.unread.moved)
 
 
 def read_figures(run: TrainingRun, window: Window) -> None:
-    """Read what the steps since the last time have left, into the ledger and the window.
+    """Read the figures of the steps since the last call into the ledger and the window.
 
     Raises:
-        AegisError: the method does not see what learns.
-        Diverged: something is not finite. No optimizer has moved anything since then, and the
-            steps before are constrained.
+        AegisError: the method does not cover what is trained.
+        Diverged: something is not finite. No optimizer has updated anything since, and earlier
+            steps are constrained.
     """
     for step_figures in run.unread.taken():
         index, row = step_figures.index, step_figures.row
         if not step_figures.finite:
-            run.stepper.settle()  # who catches the error saves the weights of the good steps
+            run.stepper.settle()  # whoever catches the error saves the weights of the good steps
         check_finite(step_figures.checked, f"at step {index + 1}", LOWER, index)
         window.loss += step_figures.checked["loss"]
         if row is not None:
@@ -773,21 +777,21 @@ def read_figures(run: TrainingRun, window: Window) -> None:
 
 
 def _move(run: TrainingRun, index: int, still: bool = False) -> None:
-    """Take the optimizers' step at the schedule's rates, of which a method may leave a share.
+    """Take the optimizers' step at the scheduled rates, which a method may scale down.
 
-    With `still`, the backbone does not move.
+    With `still`, the backbone is not updated.
     """
     shares = {} if still or run.parts.shares is None else run.parts.shares()
     for group, rate in zip(run.rates, _rates(run, index, shares), strict=True):
         group["lr"] = rate
         if eight_bit.is_marked(group):
-            group["lr"] = float(group["lr"])  # its kernel takes no tensor
+            group["lr"] = float(group["lr"])  # its kernel accepts no tensor
     for optimizer in run.optimizers:
         optimizer.step()
 
 
 def _scheduled(run: TrainingRun, index: int) -> list[float]:
-    """The schedule's learning rate of each group of parameters in the step after `index` others."""
+    """The scheduled learning rate of each parameter group in the step of this index."""
     settings = run.recipe.train
     factor = rate_factor(index, settings)
     still = index >= moving_steps(settings.steps, settings.backbone_until)
@@ -801,10 +805,10 @@ def _scheduled(run: TrainingRun, index: int) -> list[float]:
 def _rates(
     run: TrainingRun, index: int, shares: Mapping[Tensor, float | Tensor]
 ) -> list[float | Tensor]:
-    """What the optimizer reads: the schedule's rates, of which a method may leave a share."""
+    """The rates that the optimizers use: the scheduled ones, which a method may scale down."""
     scheduled = _scheduled(run, index)
     found: list[float | Tensor] = [*scheduled]
-    # A method with shares has every parameter of the backbone in a group of its own.
+    # A method with shares has each of the backbone's parameters in its own group.
     left = [shares.get(group["params"][0], 1.0) for group in run.rates]
     unread = {place: share for place, share in enumerate(left) if isinstance(share, Tensor)}
     if unread:
@@ -832,7 +836,7 @@ def _log(
     rates = zip(run.rates, _scheduled(run, finished - 1), strict=True)
     line |= {f"lr_{group['name']}": rate for group, rate in rates}
     recent = run.ledger.tensors(after=finished - window.steps)
-    if len(recent["step"]):  # steps in which the backbone stands still have no row
+    if len(recent["step"]):  # steps in which the backbone is frozen have no row
         line |= {"energy_shed": energy_shed_mean(recent), "conflict": conflict_share(recent)}
     if validate:
         with _saved_where_left(run, finished, window):
@@ -845,15 +849,15 @@ def _log(
 
 @contextmanager
 def _saved_where_left(run: TrainingRun, finished: int, window: Window) -> Generator[None]:
-    """Write a checkpoint where the block, a validation, fails or is left after a signal.
+    """Write a checkpoint if the block, a validation, fails or is left after a signal.
 
-    A run goes on from it with the same validation. Of several processes none does so: where one
-    alone fails, the others would wait for it.
+    A run resumed from it repeats the validation. With several processes nothing is written: if only
+    one fails, the others would wait for it.
     """
     try:
         yield
     except Diverged:
-        raise  # its weights are no good to go on from
+        raise  # its weights are unusable
     except BaseException:
         if not run.ranks.several:
             _save_interrupted(run, finished, window)
@@ -861,10 +865,10 @@ def _saved_where_left(run: TrainingRun, finished: int, window: Window) -> Genera
 
 
 def _hearing(run: TrainingRun, signaled: interrupts.Deferred, on_event: OnEvent) -> _Hearing:
-    """What hears of the progress of a part of a validation, by the seconds that the part takes.
+    """A function from the seconds that a part of a validation takes to its progress handler.
 
-    It leaves once a signal has come: at an event no work is half-done. Several processes leave a
-    validation together, at its end.
+    The handler leaves the run once a signal was received: no work is half done at an event. Several
+    processes leave a validation together, at its end.
     """
 
     def hearing(seconds: float) -> OnEvent:
@@ -882,7 +886,7 @@ def _hearing(run: TrainingRun, signaled: interrupts.Deferred, on_event: OnEvent)
 def _validation(
     run: TrainingRun, finished: int, step_s: float, hearing: _Hearing
 ) -> dict[str, float]:
-    """The validation loss of a checkpoint written now, and what else is to be told of it.
+    """The validation loss of a checkpoint written now, and its other validation figures.
 
     Args:
         step_s: how long a step takes.
@@ -890,7 +894,7 @@ def _validation(
     settings, noise = run.recipe.train, validation_noise(run.recipe.seed)
     batches = min(len(run.demos.validation), VALIDATION_FRAMES) / settings.batch_size
     heard = hearing(batches * step_s)
-    # Of the weights that a checkpoint holds, seen as training's passes see them.
+    # With the weights that a checkpoint holds, rounded as in training passes.
     with run.average.in_place(), run.masters.rounded():
         loss = validation_loss(run.policy, run.demos, settings, noise, run.ranks, heard)
     check_finite({"validation loss": loss}, f"after step {finished}", LOWER, finished)
@@ -898,12 +902,12 @@ def _validation(
 
 
 def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, float]:
-    """What a checkpoint written now answers, how it acts, and how far its actions are from others.
+    """The figures of a checkpoint written now on questions, episodes and held-out actions.
 
-    It is empty where none of them is asked for.
+    It is empty if the recipe asks for none of them.
 
     Raises:
-        Diverged: a figure that is not finite, as an answer's likelihood can be.
+        Diverged: a figure is not finite, as can happen to an answer's likelihood.
     """
     if run.questions is None and run.episodes is None and run.actions is None:
         return {}
@@ -927,7 +931,7 @@ def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, fl
 
 
 def _warn_of_drop(run: TrainingRun, line: Mapping[str, float], on_event: OnEvent) -> None:
-    """Say the first time that more is lost than the recipe's gate will let pass."""
+    """Warn the first time that the drop exceeds what the recipe's gate allows."""
     past = validation_vqa.past_limit(run.recipe, validation_vqa.of_line(run.recipe, line))
     if not past or run.told_of_drop:
         return
@@ -953,22 +957,22 @@ def validation_loss(
 ) -> float:
     """The flow-matching loss on frames of held-out episodes, with the same noise every time.
 
-    The frames are spread evenly. They pass in batches of the training's size, of which several
-    processes have a share each, in as many passes as a step's. None of this shows in the loss: the
-    draws are a frame's own, and it is the mean over all that the frames have.
+    The frames are spread evenly. They are passed in batches of the training's size, which are
+    divided among the processes and split into as many passes as a step. None of this affects the
+    loss: the draws depend only on the frame, and the loss is the mean over all frames' steps.
 
     Args:
-        noise: seeds the draws, as `validation_noise` does for a run.
+        noise: seed of the draws; for a run, that of `validation_noise`.
     """
     held_out, backbone = len(demos.validation), policy.backbone
     frames = demos.validation[spread.rows(held_out, VALIDATION_FRAMES)]
-    # Steps of all frames' chunks that are no padding. Every batch's loss is divided by it, so that
-    # their sum is the mean over all frames.
+    # The number of steps in all frames' chunks that are not padding. Every batch's loss is divided
+    # by it, so that their sum is the mean over all frames.
     _, shown = demos.size(frames, settings.chunk)
 
     def prepare(part: Tensor) -> tuple[Tensor, RobotBatch, Ranks, int]:
-        """This process's frames of a batch, who shares it, and in how many passes."""
-        # Where there are fewer frames than processes, each passes all of them.
+        """This process's frames of a batch, the processes sharing it, and the number of passes."""
+        # If there are fewer frames than processes, each passes all of them.
         sharing = ranks if len(part) >= ranks.count else ALONE
         passes = settings.accumulate
         passes = passes if len(part) >= sharing.count * passes else 1
@@ -994,7 +998,8 @@ def validation_loss(
                 with devices.autocast(backbone.device, settings.precision):
                     encoding = backbone.encode(prepared_pass.inputs.to(backbone.device))
                     losses.append(policy.flow_loss_at(batch, encoding, *drawn, shown))
-            # `ALONE` sums over nobody: where all pass all frames, each has the whole loss already.
+            # `ALONE` does not sum: if every process passes all frames, each has the whole loss
+            # already.
             total += sharing.total(torch.stack(losses).sum()).item()
             done = min(done + settings.batch_size, len(frames))
             on_event(Progress("validation", done, len(frames), "frames"))
@@ -1002,14 +1007,14 @@ def validation_loss(
 
 
 def _draws(frames: Tensor, samples: int, batch: RobotBatch, noise: int) -> tuple[Tensor, Tensor]:
-    """The flow times [B, K] and noises [B, K, H, A] of frames [B], each drawn by its number alone.
+    """The flow times [B, K] and noises [B, K, H, A] of frames [B], seeded by the frame's number.
 
-    So they depend neither on how many frames pass at once nor on which others are held out.
+    So they depend neither on how many frames are passed at once nor on which others are held out.
     """
     shape = (samples, *batch.actions.shape[1:])  # (K, H, A)
     times, noises = [], []
     for frame in frames.tolist():
-        # A generator on the CPU takes 32 bits of its seed: those of neighbours are mixed first.
+        # A CPU generator uses 32 bits of its seed: mixing separates the seeds of neighbours first.
         mixed = np.random.SeedSequence([noise, frame]).generate_state(1)
         generator = torch.Generator().manual_seed(int(mixed[0]))
         times.append(flow.draw_times(shape[:1], generator))
@@ -1019,7 +1024,7 @@ def _draws(frames: Tensor, samples: int, batch: RobotBatch, noise: int) -> tuple
 
 @contextmanager
 def _evaluating(policy: Policy) -> Generator[None]:
-    """Let no pass inside the block write to the policy, as BatchNorm's averages in training."""
+    """Put the policy in evaluation mode inside the block, so that passes do not write buffers."""
     was_training = policy.training
     policy.eval()
     try:
@@ -1043,7 +1048,7 @@ def _report(run: TrainingRun) -> TrainReport:
         loss=lines[-1]["loss"],
         validation_loss=lines[-1]["validation_loss"],
         energy_shed_mean=energy_shed_mean(run.ledger.tensors()) if run.parts.dual else None,
-        step_s=times[len(times) // 2],  # the median: the first step pays for what is done once
+        step_s=times[len(times) // 2],  # the median: the first step includes one-time work
         cameras=list(run.demos.cameras),
         out=str(run.out),
         validation_vqa=validation_vqa.of_line(run.recipe, lines[-1]),

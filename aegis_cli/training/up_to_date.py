@@ -1,4 +1,4 @@
-"""What decides whether a stage runs again: records of what it read and of what it wrote."""
+"""Records of what a stage read and wrote, which decide whether it runs again."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from aegis_cli.common.version import __version__
 from aegis_cli.data import record
 from aegis_cli.recipes import Demos
 
-SHARED = "stages.json"  # the records of what the runs of a folder share
+SHARED = "stages.json"  # the records of stages that the runs of a folder share
 BEGUN = "begun"  # the stage of a run that has been started, finished or not
 
 
 def digest(key: Any) -> str:
     """sha256 of what a stage reads, and of the version that reads it."""
-    # Canonical JSON: equal keys give equal text, in whatever order they were put together.
+    # Canonical JSON: equal keys give equal text, whatever the order of their entries.
     text = files.canonical({"version": __version__, "key": key})
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -36,10 +36,10 @@ def _parts(key: Any) -> dict[str, str]:
 
 
 def refuse_unfinished(folder: Path, command: str) -> None:
-    """Raise AegisError for the folder of a job that has not come to its table yet.
+    """Raise AegisError for the folder of a job that has not yet written its table.
 
     Args:
-        command: which wants to tell of it, and can tell of its runs.
+        command: the command that was given the folder, and which also accepts its runs.
     """
     if not (folder / SHARED).is_file():
         return
@@ -58,7 +58,7 @@ def _load(path: Path) -> dict[str, Any]:
     """The records of a file.
 
     Raises:
-        AegisError: it holds something else.
+        AegisError: the file holds something else.
     """
     records = files.load_json(path)
     try:
@@ -83,22 +83,22 @@ class Made(NamedTuple):
 
 
 def _recording(task: str, settings: Demos) -> dict[str, Any]:
-    """What demonstrations of a simulated task follow from."""
+    """The key of recorded demonstrations: what they depend on."""
     return {"task": task, **recipes.changed(settings)}
 
 
 def _recorded_as(task: str, key: Mapping[str, Any]) -> str:
-    """The name of their file, by which task and settings are told apart."""
-    # A slash, as in `suite/cartpole-swingup`, would be a folder.
+    """The name of their file, which differs by task and settings."""
+    # A slash, as in `suite/cartpole-swingup`, would make a folder.
     return f"demos-{task.replace('/', '-')}-{digest(key)[:8]}"
 
 
 class StageRecords:
     """Which stages below a folder are up to date.
 
-    A stage is named by its run's label and its own name, `naive/train`; what runs share has no
-    label. A run's records lie in a file of its own below `stages`, the shared ones in
-    `stages.json`, so that processes with a run each do not write the same file.
+    A stage is named by its run's label and its own name, `naive/train`; shared stages have no
+    label. Each run has its own file of records below `stages`, and the shared ones are in
+    `stages.json`, so processes working on different runs do not write the same file.
     """
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -113,19 +113,19 @@ class StageRecords:
         if self.due(stage, key, outputs) is None:
             self.on_event(Progress(f"{stage} (up to date)", 1, 1, "stage"))
             return
-        # Noted only afterwards: a stage that was interrupted is not up to date.
+        # Recorded only afterwards: an interrupted stage is not up to date.
         make(self.named(stage))
         self.keep(stage, key, outputs)
 
     def due(self, stage: str, key: Any, outputs: list[Path]) -> str | None:
-        """Why a stage has to run, in words; None where it is up to date."""
+        """The reason why a stage has to run; None if it is up to date."""
         before = self.key_of(stage)
         if before is None:
             return "has not run yet"
         if before != digest(key):
             changed = self.changed(stage, key) or ["keys of the recipe, files or the version"]
             return f"what it reads has changed: {', '.join(changed)}"
-        # The key first, because outputs may be gigabytes to read.
+        # The key first, because the outputs may be gigabytes.
         kept, found = self._record(stage)["outputs"], self._hashes(outputs)
         for name in sorted(kept.keys() | found.keys()):
             if name not in found:
@@ -146,7 +146,7 @@ class StageRecords:
         """Demonstrations of a simulated task, recorded unless they are up to date.
 
         Args:
-            name: of their file; default: one that tells task and settings apart.
+            name: of their file; default: one that depends on task and settings.
         """
         key = _recording(task, settings)
 
@@ -164,7 +164,7 @@ class StageRecords:
         return self.shared(name or _recorded_as(task, key), key, make)
 
     def recorded(self, task: str, settings: Demos) -> Path:
-        """Where `demonstrations` keeps those of a task, whether or not they are there."""
+        """The path at which `demonstrations` keeps those of a task, whether or not it exists."""
         return self.folder / f"{_recorded_as(task, _recording(task, settings))}.safetensors"
 
     def key_of(self, stage: str) -> str | None:
@@ -172,7 +172,7 @@ class StageRecords:
         return self._record(stage).get("key")
 
     def changed(self, stage: str, key: Any) -> list[str]:
-        """The names of what the stage reads that was another when it ran, as far as it is known."""
+        """The names of the stage's inputs that have changed since it ran, as far as is known."""
         then, now = self._record(stage).get("parts", {}), _parts(key)
         return sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
 
@@ -185,20 +185,20 @@ class StageRecords:
         files.save_json(self._path(label), self._of(label))
 
     def begin_anew(self) -> None:
-        """Let every stage run again; that `aegis run` began a run is remembered."""
+        """Let every stage run again, but keep the record that `aegis run` began a run."""
         for path in [self._path(""), *sorted((self.folder / "stages").rglob("*.json"))]:
             if path.is_file():
                 begun = [stage for stage in _load(path) if stage.endswith(f"/{BEGUN}")]
-                # No digest is the empty text, so that the key of no stage is equal to it.
+                # No digest is an empty string, so no stage's key is equal to it.
                 files.save_json(path, {stage: {"key": "", "outputs": {}} for stage in begun})
         self._records.clear()
 
     def forget(self, stage: str) -> None:
-        """Drop what is recorded of a stage, when its label's next record is kept."""
+        """Drop the record of a stage; the file changes when its label's next record is written."""
         self._of(stage.rpartition("/")[0]).pop(stage, None)
 
     def named(self, stage: str) -> OnEvent:
-        """A stage's own events under the name of what it does here: `aegis/train`, not `train`."""
+        """Forward a stage's events under its run's label: `aegis/train`, not `train`."""
         label, slash, _ = stage.rpartition("/")
         return lambda event: self.on_event(
             dataclasses.replace(event, stage=label + slash + event.stage)
@@ -217,7 +217,7 @@ class StageRecords:
         return self.folder / "stages" / f"{label}.json" if label else self.folder / SHARED
 
     def _hashes(self, outputs: list[Path]) -> dict[str, str]:
-        """sha256 of each output that exists; a missing one makes the difference."""
+        """sha256 of each output that exists; a missing one counts as a difference."""
         return {
             str(p.relative_to(self.folder)): files.sha256_file(p) for p in outputs if p.is_file()
         }

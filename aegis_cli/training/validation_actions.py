@@ -1,8 +1,8 @@
-"""How far a policy's actions are from held-out ones while it trains, beside the validation loss.
+"""Errors of a policy's actions on held-out frames during training, beside the validation loss.
 
-That loss is of single steps of the flow; this is of the actions that the whole flow ends with, in
-a unit that can be read: 1 is the error of always predicting the training's mean. For a robot that
-is not simulated there is no other figure while it trains. Nothing learns from it.
+That loss is taken at single steps of the flow; this is the error of the actions that the whole flow
+produces, in a readable unit: 1 is the error of always predicting the training mean. For a robot
+that is not simulated there is no other such figure during training. Nothing is trained on it.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.recipes import Recipe
 
 _STAGE = "actions"
-_SEED = 0  # of the flow's noise, as `aegis evaluate` has it unless it is told another one
-# What a line of metrics calls the figures, and what a report of `aegis evaluate` does.
+_SEED = 0  # of the flow's noise, the default of `aegis evaluate`
+# The figures' names in a metrics line -> in a report of `aegis evaluate`.
 _FIGURES = {"action_error": "relative_error", "action_hold": "hold_error"}
 _ENDS = ("action_error_low", "action_error_high")
 
 
 @dataclass
 class ValidationActions:
-    """Held-out frames at which the policy predicts.
+    """Held-out frames for which the policy predicts actions.
 
     Attributes:
         at: [N], numbers of the frames.
         training_std: [A], the standard deviations that errors are relative to.
         compiled: whether the policy's passes are compiled.
-        seconds: that the predictions took the last time.
+        seconds: seconds that the predictions took the last time.
     """
 
     demos: Demonstrations
@@ -53,11 +53,11 @@ class ValidationActions:
     seconds: float = math.inf
 
     def figures(self, policy: Policy, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
-        """What a line of metrics says of the policy as it is now.
+        """The figures of the current policy for a metrics line.
 
-        An error is the mean squared error over the variance of the training's actions; the ends of
-        its 95 % interval are by Student's t over episodes. The first process predicts, and the
-        others wait: shared frames would have other noise than `aegis evaluate` draws.
+        An error is the mean squared error over the variance of the training's actions; its 95 %
+        interval is by Student's t over episodes. The first process predicts and the others wait: if
+        frames were shared, the noise would differ from what `aegis evaluate` draws.
         """
         started = time.perf_counter()
         found = ranks.by_first(lambda: self._compared(policy, on_event))
@@ -79,10 +79,10 @@ class ValidationActions:
 
 
 def of_line(line: Mapping[str, Any]) -> dict[str, Any]:
-    """What a line of metrics says of the actions, by the names in a report of `aegis evaluate`.
+    """The action errors in a metrics line, by their names in a report of `aegis evaluate`.
 
-    That is `relative_error` with its `relative_interval`, and `hold_error` where actions are
-    positions; nothing where no actions were predicted.
+    These are `relative_error` with its `relative_interval`, and `hold_error` if actions are
+    positions; nothing if no actions were predicted.
     """
     if "action_error" not in line:
         return {}
@@ -94,10 +94,10 @@ def of_line(line: Mapping[str, Any]) -> dict[str, Any]:
 def chosen(
     recipe: Recipe, policy: Policy, demos: Demonstrations, meta: PolicyMeta
 ) -> ValidationActions | None:
-    """The frames at which a recipe's training predicts actions; None where it predicts none.
+    """The frames for which a recipe's training predicts actions; None if it predicts none.
 
     Raises:
-        AegisError: actions that never vary, so that no error is relative to anything.
+        AegisError: the actions never vary, so errors cannot be relative.
     """
     count = recipe.train.validate_actions
     if count is None:
@@ -119,6 +119,6 @@ def held_out(
     batch_size: int,
     compiled: bool = False,
 ) -> ValidationActions:
-    """At most so many frames, evenly spread over the held-out episodes."""
+    """At most `most` frames, spread evenly over the held-out episodes."""
     at = demos.validation[spread.rows(len(demos.validation), most)]
     return ValidationActions(demos, at, training_std, batch_size, compiled)

@@ -1,7 +1,7 @@
-"""How well the policy acts while it trains: validation episodes beside the validation loss.
+"""How well the policy acts during training: validation episodes beside the validation loss.
 
-They choose checkpoints and learning rates, so no demonstration is of these episodes and no
-evaluation plays them, and what they show is no result. Nothing learns from them.
+They serve to choose checkpoints and learning rates, so they are neither demonstrations nor
+evaluation episodes, and their figures are no result. Nothing is trained on them.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from aegis_cli.sim.contract import VALIDATION
 from aegis_cli.training import checkpoint
 
 _STAGE = "rollout"
-_PREFIX = "rollout_"  # of its figures in a line of metrics
-# What a task can be measured by, and where a report has its interval.
+_PREFIX = "rollout_"  # of its figures in a metrics line
+# A task's possible measures -> the report's field with its interval.
 _INTERVALS = {"success": "interval", "mean_return": "return_interval"}
 _ENDS = (f"{_PREFIX}low", f"{_PREFIX}high")
 
@@ -38,10 +38,10 @@ class ValidationEpisodes:
     """The episodes that the policy acts in.
 
     Attributes:
-        acting: the policy that trains, ready to act; its weights are those of the moment.
-        count: of the episodes, from number 0 on.
+        acting: the policy in training, ready to act with its current weights.
+        count: number of episodes, from episode 0 on.
         compiled: whether its passes are compiled.
-        seconds: that they took the last time.
+        seconds: that they took last time.
     """
 
     acting: Acting
@@ -51,11 +51,12 @@ class ValidationEpisodes:
     seconds: float = math.inf
 
     def figures(self, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
-        """What a line of metrics says of the policy as it is now.
+        """The figures of the current policy for a metrics line.
 
-        A success is in [0, 1], a return in the task's rewards, and so are the ends of its 95 %
-        interval, which the return of one episode does not have. The first process acts, and the
-        others wait: a shared episode would have other noise than `aegis rollout` draws.
+        Success is in [0, 1], a return is in the task's rewards, and so are the ends of the 95 %
+        interval, which a single episode's return does not have. The first process acts and the
+        others wait: if episodes were shared, the noise would differ from what `aegis rollout`
+        draws.
         """
         started = time.perf_counter()
         report = ranks.by_first(lambda: self._played(on_event))
@@ -71,7 +72,7 @@ class ValidationEpisodes:
             placing = event.stage == PLACING
             on_event(event if placing else dataclasses.replace(event, stage=_STAGE))
 
-        # Episodes end one by one, and each number that is left would be another shape to compile.
+        # Episodes end one by one, and each remaining number would be another shape to compile.
         with uncompiled(self.compiled):
             return play(
                 self.acting, self.count, DEFAULT, VALIDATION, on_event=named, seed=self.seed
@@ -83,7 +84,7 @@ class ValidationEpisodes:
 
 
 def _line(report: RolloutReport) -> dict[str, float]:
-    """The figures of a report by their names in a line of metrics."""
+    """The figures of a report by their names in a metrics line."""
     found: dict[str, float] = {}
     for measure, interval in _INTERVALS.items():
         value, ends = getattr(report, measure), getattr(report, interval)
@@ -94,10 +95,10 @@ def _line(report: RolloutReport) -> dict[str, float]:
 
 
 def of_line(line: Mapping[str, Any]) -> dict[str, Any]:
-    """What a line of metrics says of the episodes, by the names in a report of `aegis rollout`.
+    """The episodes' figures in a metrics line, by their names in a report of `aegis rollout`.
 
-    That is `success` with its `interval`, or `mean_return` with its `return_interval`; nothing
-    where none were played.
+    These are `success` with its `interval`, or `mean_return` with its `return_interval`; nothing if
+    no episodes were played.
     """
     found: dict[str, Any] = {}
     for measure, interval in _INTERVALS.items():
@@ -111,13 +112,14 @@ def of_line(line: Mapping[str, Any]) -> dict[str, Any]:
 def chosen(
     recipe: Recipe, policy: Policy, meta: PolicyMeta, ranks: Ranks
 ) -> ValidationEpisodes | None:
-    """The episodes that a recipe's training plays; None where it plays none.
+    """The episodes that a recipe's training plays; None if it plays none.
 
     Args:
-        meta: what a user of the policy has to know, such as its task.
+        meta: the metadata that a user of the policy needs, such as its task.
 
     Raises:
-        AegisError: demonstrations of no simulated task, one that is not installed, or no OpenGL.
+        AegisError: the demonstrations are of no simulated task, the task is not installed, or there
+            is no OpenGL.
     """
     count, task = recipe.rollout.while_training, meta["task"]
     if count is None:

@@ -1,4 +1,4 @@
-"""How long a validation takes, by its first passes, which a dry run takes."""
+"""How long a validation takes, estimated in a dry run from its first passes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _STAGE = "dry run (validation)"
 
 
 class _Enough(Exception):
-    """Two parts of the work are done.
+    """Raised once two parts of the work are done.
 
     Attributes:
-        seconds: that all of it takes.
+        seconds: the estimate for all of it.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -32,12 +32,12 @@ class _Enough(Exception):
 
 
 def expected_s(work: Callable[[OnEvent], object]) -> float:
-    """About how many seconds some work takes, by the second part of it that it tells of.
+    """About how many seconds some work takes, from the second part whose progress it reports.
 
-    The first one also pays for what is done once. Then the work is left, by an exception through
-    its own events.
+    The first part includes one-time work. After the second, an exception raised in the event
+    handler ends the work.
     """
-    told: list[tuple[int, float]] = []  # what was done at which time
+    told: list[tuple[int, float]] = []  # (parts done, time)
 
     def heard(event: Event) -> None:
         if not isinstance(event, Progress) or event.done == 0:
@@ -56,14 +56,14 @@ def expected_s(work: Callable[[OnEvent], object]) -> float:
 
 
 def measured(run: TrainingRun, on_event: OnEvent) -> dict[str, float]:
-    """About how many seconds the parts of one validation take, the loss and what is asked for.
+    """About how many seconds each part of a validation takes: the loss and what is asked for.
 
-    Of several processes the first asks, acts and predicts; questions are divided among all that
-    have whole weights.
+    With several processes the first one asks, acts and predicts; questions are divided among all
+    that have whole weights.
     """
     masters = run.masters
     parts = {"loss": (masters.rounded, partial(_loss_s, run))}
-    # A backbone of which nothing learns is not asked again.
+    # A frozen backbone is not asked again.
     if run.questions is not None and any(p.requires_grad for p in run.policy.backbone.parameters()):
         asking = partial(_questions_s, run.questions, run.shown.backbone)
         parts["questions"] = masters.as_written, partial(run.by_whole, asking)

@@ -1,7 +1,7 @@
-"""What the VLM still knows while it trains: validation questions beside the validation loss.
+"""What the VLM still knows during training: validation questions beside the validation loss.
 
-They choose checkpoints and learning rates, so they are of images that neither an anchor nor a probe
-is of, and what they show is no result. Nothing learns from them.
+They serve to choose checkpoints and learning rates, so their images are in neither an anchor nor a
+probe, and their figures are no result. Nothing is trained on them.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Recipe
 
 _BEFORE = "VQA before training"  # the stage's name
-_PREFIX = "vqa_"  # of its figures in a line of metrics
+_PREFIX = "vqa_"  # of its figures in a metrics line
 _FIGURES = ("accuracy", "cross_entropy", "drop_points", "drop_low", "drop_high")
-ToldOfSet = dict[str, Any]  # floats, and under `drop_interval` two
+ToldOfSet = dict[str, Any]  # floats; `drop_interval` holds two
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class ValidationQuestions:
     """The questions of each set that the recipe probes.
 
     Attributes:
-        before: the answers of the backbone as it began to each set; empty until it was asked.
-        seconds: that these answers took.
+        before: the initial backbone's answers to each set; empty until it was asked.
+        seconds: how long these answers took.
     """
 
     asked: tuple[VQASet, ...]
@@ -45,14 +45,14 @@ class ValidationQuestions:
     def asked_before(
         self, backbone: Backbone, ranks: Ranks, on_event: OnEvent
     ) -> ValidationQuestions:
-        """The same, with the answers of a backbone that has not learned yet."""
+        """The same, with the answers of a backbone before training."""
         started = time.perf_counter()
         before = self._answers(backbone, ranks, on_event, _BEFORE)
         taken = time.perf_counter() - started
         return dataclasses.replace(self, before=before, seconds=taken)
 
     def warn_of_little_knowledge(self, recipe: Recipe, on_event: OnEvent) -> None:
-        """Warn of each set whose answers the backbone did not know: none of it can be lost."""
+        """Warn of sets that the backbone could hardly answer at the start: nothing can be lost."""
         model, prompt = recipe.backbone, recipe.probe.ask
         for then in self.before:
             known = score(then)
@@ -61,11 +61,11 @@ class ValidationQuestions:
             )
 
     def figures(self, backbone: Backbone, ranks: Ranks, on_event: OnEvent) -> dict[str, float]:
-        """What a line of metrics says of the backbone as it is now.
+        """The figures of the current backbone for a metrics line.
 
         Accuracies are in [0, 1], cross-entropies in nats per answer, and the drop and the ends of
         its 95 % interval in percentage points. The first set's figures have plain names, those of
-        the others end in their number. A backbone of which nothing learns is not asked again.
+        later sets end in the set's number. A frozen backbone is not asked again.
         """
         found: dict[str, float] = {}
         learns = any(p.requires_grad for p in backbone.parameters())
@@ -95,15 +95,15 @@ class ValidationQuestions:
 
 
 def _named(figure: str, number: int) -> str:
-    """What a line of metrics calls a figure of the set of that number, from 1."""
+    """The name in a metrics line of a figure of set `number`, counted from 1."""
     return f"{_PREFIX}{figure}" if number == 1 else f"{_PREFIX}{figure}_{number}"
 
 
 def of_line(recipe: Recipe, line: Mapping[str, Any]) -> dict[str, ToldOfSet]:
-    """The figures that a line of metrics has of each set, by the set's name in the recipe.
+    """The figures of each set in a metrics line, by the set's name in the recipe.
 
     They are `accuracy`, `cross_entropy`, `drop_points` and `drop_interval`, in the units of
-    `ValidationQuestions.figures`. A set of which the line has nothing is left out.
+    `ValidationQuestions.figures`. A set without figures in the line is left out.
     """
     found: dict[str, ToldOfSet] = {}
     for number, name in enumerate(recipe.probe.sets, start=1):
@@ -116,7 +116,7 @@ def of_line(recipe: Recipe, line: Mapping[str, Any]) -> dict[str, ToldOfSet]:
 
 
 def past_limit(recipe: Recipe, asked: Mapping[str, ToldOfSet]) -> dict[str, ToldOfSet]:
-    """Those sets that have lost more than the recipe's gate lets pass, of what `of_line` tells."""
+    """The sets in the result of `of_line` whose drop exceeds what the recipe's gate allows."""
     limit, gate = recipe.probe.max_drop, recipe.probe.gate
     if limit is None:
         return {}
@@ -128,10 +128,10 @@ def past_limit(recipe: Recipe, asked: Mapping[str, ToldOfSet]) -> dict[str, Told
 
 
 def chosen(recipe: Recipe, backbone: Backbone, on_event: OnEvent) -> ValidationQuestions | None:
-    """The questions that a recipe's training asks; None where it asks none.
+    """The questions that a recipe's training asks; None if it asks none.
 
     Raises:
-        AegisError: a set that cannot be read, or a question that the backbone cannot be asked.
+        AegisError: a set cannot be read, or the backbone cannot be asked a question.
     """
     probe, count = recipe.probe, recipe.probe.while_training
     if count is None:

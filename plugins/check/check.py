@@ -5,7 +5,7 @@
     pip install -e '.[hf]' -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
     python plugins/check/check.py
 
-It takes about ten minutes of two cores, and is no part of the tests.
+It takes about twelve minutes of two cores, and is no part of the tests.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # nothing is fetched
 
 import augmentation
+import foreign_vlm
 import numpy as np
 import robot
 import torch
@@ -94,6 +95,10 @@ def failures(folder: Path) -> int:
         robot.another_robot_is_refused,
         smolvla_moves_orthogonally,
         smolvla_at_strength_0_is_adamw,
+        foreign_vlm.smolvla_gives_and_takes_its_vlm,
+        foreign_vlm.pi0_gives_and_takes_its_vlm,
+        foreign_vlm.pi05_gives_and_takes_its_vlm,
+        foreign_vlm.pi0_fast_gives_its_vlm,
         frames_are_augmented_as_by_torchvision,
         actions_are_relative_as_in_lerobot,
     )

@@ -26,15 +26,19 @@ def save_vlm(folder: Path) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **named}))
 
 
-def save_smolvla(folder: Path, vlm: Path, dataset: Path) -> None:
-    """A SmolVLA that begins with the weights of the VLM, in float32."""
+def save_smolvla(folder: Path, vlm: Path, dataset: Path, layers: int = 2) -> None:
+    """A SmolVLA that begins with the weights of the VLM, in float32.
+
+    Args:
+        layers: how many of the VLM's language layers it computes.
+    """
     torch.manual_seed(0)
     meta = LeRobotDatasetMetadata("local/reach", root=dataset)
     config = SmolVLAConfig(
         vlm_model_name=str(vlm),
         load_vlm_weights=False,  # LeRobot would load them in bfloat16
-        num_vlm_layers=2,
-        num_expert_layers=2,
+        num_vlm_layers=layers,
+        num_expert_layers=layers,
         expert_width_multiplier=0.75,
         resize_imgs_with_padding=(hf.SIZE, hf.SIZE),
         chunk_size=8,

@@ -24,7 +24,7 @@ import torch
 import typer
 from samples.command import ROOT, finding, python, refused
 
-from aegis_cli.cli import other_trainers, render, stages
+from aegis_cli.cli import exits, other_trainers, render, stages
 from aegis_cli.cli.app import app
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
@@ -846,7 +846,7 @@ def test_of_several_processes_the_launcher_is_named_too(
 
 
 def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
-    for name in ("train", "dry-run", "pipeline", "demos", "probe", "rollout"):
+    for name in ("train", "dry-run", "pipeline", "demos", "probe", "rollout", "anchor"):
         stage(name, error=KeyboardInterrupt())
     code, out, err = aegis("train", recipe, "--demos", "a b", "--out", "r")
     assert (code, out) == (130, "") and "Traceback" not in err
@@ -860,7 +860,22 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     for command, kept in (("probe", "answers so far"), ("rollout", "groups of episodes")):
         said = aegis(command, "r")[2]
         assert f"interrupted; {kept}" in said and said.endswith(f"go on with: aegis {command} r\n")
+    said = aegis("anchor", "--out", "x")[2]
+    kept = "interrupted; what is measured so far is kept; go on with: aegis anchor"
+    assert said.endswith(f"{kept} --out x\n")
     whole = "interrupted; no half-written file is left; begin again with: aegis"
     assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")
     dry = ("--demos", "d", "--out", "r", "--dry-run")
     assert aegis("train", recipe, *dry)[2].endswith(f"{whole} train {recipe} {' '.join(dry)}\n")
+
+
+@pytest.mark.parametrize(
+    ("command", "begins"),
+    [
+        ("evaluate r --demos d", "predictions so far are kept; go on with: "),
+        ("merge r --sweep 1,10", "the strengths so far are kept; go on with: "),
+        ("merge r --strength=1 --out x", "no half-written file is left; begin again with: "),
+    ],
+)
+def test_what_is_kept_of_a_command_that_was_ended(command: str, begins: str) -> None:
+    assert exits._what_now({"aegis.args": command.split()}) == f"{begins}aegis {command}"

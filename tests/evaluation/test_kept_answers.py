@@ -13,13 +13,13 @@ import torch
 from samples.vqa_files import picture, write_jsonl
 from torch import Tensor
 
-from aegis_cli.common import cache
+from aegis_cli.common import cache, circumstances
 from aegis_cli.common.events import Event, Progress, ignore
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.data.vqa import sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
-from aegis_cli.evaluation import circumstances, kept_answers
+from aegis_cli.evaluation import kept_answers
 from aegis_cli.models.backbones.embedded import EmbeddedVLM
 
 BATCH = 4

@@ -165,6 +165,8 @@ def test_a_repository_of_something_else_says_what_it_is(
     for command in (("rollout", REPO), ("evaluate", REPO, "--demos", demos_file)):
         err = refused(aegis(*command))
         assert f"'{REPO}' of the hub has no policy of Aegis" in err and said in err
+        # Of a policy of LeRobot's the error tells how its VLM is had.
+        assert (f"aegis extract {REPO} --base VLM" in err) == ("smolvla" in said)
     assert "model.safetensors" not in hub.downloaded
 
 

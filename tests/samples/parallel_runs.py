@@ -16,9 +16,9 @@ import pytest
 import torch
 from torch import nn
 
-from aegis_cli.anchors import measure
+from aegis_cli.anchors import kept_work, measure
 from aegis_cli.cli.app import app
-from aegis_cli.common import files, launch, leading, ranks
+from aegis_cli.common import cache, files, kept_tensors, launch, leading, ranks
 from aegis_cli.common.errors import AegisError, Diverged, PeerLost
 from aegis_cli.common.events import Event, OnEvent, Progress, ignore
 from aegis_cli.evaluation import probe
@@ -128,6 +128,63 @@ class Measuring:
         probe.run(
             str(self.model), "scenes", 21, None, None, None, batch_size=4, predictions=predictions
         )
+
+
+@dataclass(frozen=True)
+class MeasuringAgain:
+    """An anchor that is interrupted, and measured again.
+
+    Attributes:
+        memory: bytes of a group of maps' sums.
+        stops: how often each process has kept something when it ends; None: none ends.
+        lost: whether the last process finds nothing of its own.
+    """
+
+    model: Path
+    out: Path
+    settings: Anchor
+    memory: int
+    stops: Sequence[int] | None
+    lost: bool
+
+    def run(self) -> None:
+        """Measure here, alone or with the processes that the environment speaks of."""
+        self.out.mkdir(exist_ok=True, parents=True)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(measure._PartMeasurement, "_memory", self.memory)
+            patch.setattr(kept_work, "_EVERY_S", 0.0)
+            patch.setattr(kept_work, "_TIMES", 0)
+            if self.stops is not None:
+                self._begin(self.stops)
+            begun: dict[str, int] = {}
+
+            def note(event: Event) -> None:
+                if isinstance(event, Progress) and event.stage.startswith("anchor"):
+                    begun.setdefault(event.stage, event.done)
+
+            measure.run(str(self.model), self.settings, self.out / "anchor.safetensors", note)
+            assert any(begun.values()) == (self.stops is not None)
+
+    def _begin(self, stops: Sequence[int]) -> None:
+        """Keep so many times; what comes later is not kept, as if this process had ended."""
+        plain, written = kept_tensors.write, 0
+
+        def write(path: Path, kept: kept_tensors.Kept) -> None:
+            nonlocal written
+            written += 1
+            if written <= stops[launch.rank()]:
+                plain(path, kept)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kept_tensors, "write", write)
+            patch.setattr(kept_work.Work, "remove", lambda _: None)
+            patch.setattr(kept_work.Work, "forget", lambda *_: None)
+            measure.run(str(self.model), self.settings, self.out / "begun.safetensors")
+        own = list(cache.folder("anchors").glob(f"*process-{launch.rank()}"))
+        assert own
+        if self.lost and launch.rank():
+            for path in own:
+                path.unlink()
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from aegis_cli.cli.render.foreign import extracted, inserted
 from aegis_cli.cli.render.frontier import frontier_plot, has_frontier
 from aegis_cli.cli.render.inspected import compared, inspect, questions
 from aegis_cli.cli.render.markdown import save_table
@@ -49,9 +50,11 @@ __all__ = [
     "dual",
     "energy_plot",
     "error",
+    "extracted",
     "facts",
     "frontier_plot",
     "has_frontier",
+    "inserted",
     "inspect",
     "measured",
     "merge",

@@ -1,4 +1,4 @@
-"""A dataset's meta folder: its episodes, where their frames are, and the texts of its tasks."""
+"""A dataset's meta folder: its episodes, where their frames are, and its task texts."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from aegis_cli.data.renaming import Renaming
 
 @dataclass(frozen=True)
 class Dataset:
-    """What the meta folder says; the folders `data` and `videos` have not been read.
+    """The contents of the meta folder; the folders `data` and `videos` have not been read.
 
     Attributes:
         tasks: texts, in the order of their `task_index`.
-        episodes: in the order of their frames, which are numbered through from 0.
-        rename: what cameras, features and joints are called by who reads it. `info`, and what is
-            kept in files, has the dataset's own names.
+        episodes: in the order of their frames, which are numbered consecutively from 0.
+        rename: the reader's names for cameras, features and joints. `info` and stored files have
+            the dataset's own names.
     """
 
     folder: Path
@@ -35,9 +35,9 @@ class Dataset:
 
     @cached_property
     def stats(self) -> Mapping[str, Mapping[str, Any]] | None:
-        """By feature and statistic a (nested) list of numbers; None where the dataset has none.
+        """A (nested) list of numbers per feature and statistic; None if the dataset has none.
 
-        Nothing that is learned depends on them, and version 2.1 has those of each episode.
+        Training does not depend on them. Version 2.1 has them per episode.
         """
         if self.info.has_episode_files:
             return version_2.read_stats(self.folder)
@@ -50,11 +50,11 @@ class Dataset:
         return reader.table_files(self.folder)
 
     def called(self, feature: str) -> str:
-        """What a feature of the dataset is called by who reads it."""
+        """The reader's name of a feature of the dataset."""
         return renaming.feature(self.rename, feature)
 
     def own(self, feature: str) -> str:
-        """The dataset's own name of a feature; the name itself where it has none."""
+        """The dataset's own name of a feature; the given name if there is none."""
         return self._own_names.get(feature, feature)
 
     @cached_property
@@ -62,12 +62,13 @@ class Dataset:
         return {self.called(own): own for own in self.info.features}
 
     def cameras(self, names: str | Sequence[str] | None) -> tuple[str, ...]:
-        """The dataset's own features that one or several names stand for, in their order.
+        """The dataset's own camera features that one or several names stand for, in order.
 
-        None stands for the only one there is.
+        None stands for the dataset's only camera.
 
         Raises:
-            AegisError: no such camera, one twice, or several to choose among.
+            AegisError: there is no such camera, one is named twice, or there are several to choose
+                from.
         """
         cameras = tuple(map(self.called, self.info.cameras))
         if names is None:
@@ -77,7 +78,7 @@ class Dataset:
             return self.info.cameras
         listed = (names,) if isinstance(names, str) else names
         found = tuple(self._camera(name) for name in listed)
-        # Compared as they are found: one camera may be named in short, and by its feature.
+        # Compared after lookup: a camera may be named both by its short name and by its feature.
         twice = [camera for i, camera in enumerate(found) if camera in found[:i]]
         if twice:
             raise AegisError(
@@ -103,10 +104,10 @@ class Dataset:
         return feature is not None and feature.is_depth
 
     def size(self, feature: str) -> int:
-        """How many numbers a vector feature has in each frame.
+        """The size of a vector feature in each frame.
 
         Raises:
-            AegisError: the feature is missing, or is no vector.
+            AegisError: the feature is missing, or is not a vector.
         """
         found = self.info.features.get(self.own(feature))
         if found is None:
@@ -126,14 +127,14 @@ class Dataset:
         return found.shape[0]
 
     def names(self, features: Sequence[str]) -> tuple[str, ...]:
-        """What the numbers of features side by side are called; empty where none has names.
+        """The names of the numbers of concatenated features; empty if none has names.
 
-        A feature without names, beside one that has some, gets its own and a number: `joints.0`.
-        Where two features use one name, as those of two arms do, all but LeRobot's own features of
-        state and action put theirs before it: `left_arm.gripper`.
+        If only some features have names, the numbers of the others are named by their feature and
+        index: `joints.0`. If two features share a name, as those of two arms do, all but LeRobot's
+        own features of state and action prefix theirs: `left_arm.gripper`.
 
         Raises:
-            AegisError: a renaming would give two of them one name.
+            AegisError: a renaming would give two of them the same name.
         """
         told = [self.info.features[self.own(feature)].components for feature in features]
         if not any(map(any, told)):
@@ -143,30 +144,30 @@ class Dataset:
         own = [renaming.joints(self.rename, components, where) for components in named]
         alone = tuple(itertools.chain(*own))
         if len({*alone}) == len(alone) or len(own) == 1:
-            # Each feature was checked by itself; two of them may have been given one name.
+            # Each feature was checked by itself; two of them may now share a name.
             renaming.check_apart(self.rename, tuple(itertools.chain(*named)), alone, where)
             return alone
         within = list[str]()
         for feature, said, components in zip(features, told, own, strict=True):
-            # Numbered ones have their feature's name already.
+            # Numbered names already contain their feature's name.
             within += _within(feature, components) if any(said) else components
-        # A second time: a renaming may speak of `left_arm.gripper`, or of `gripper`.
+        # Renamed again: a renaming may name `left_arm.gripper` or `gripper`.
         return renaming.joints(self.rename, within, where)
 
     @property
     def all_names(self) -> set[str]:
-        """The dataset's own names of its features, its cameras in short, and its numbers."""
+        """The dataset's own names of its features, its cameras (short) and its numbers."""
         features = self.info.features
         found = {*features, *map(layout.short, self.info.cameras)}
         for name, feature in features.items():
-            if name in self.info.cameras:  # whose components are red, green and blue
+            if name in self.info.cameras:  # their components are red, green and blue
                 continue
             found.update(_named(name, feature.components), _within(name, feature.components))
         return found
 
 
 def _named(feature: str, components: Sequence[str]) -> Sequence[str]:
-    """The names of a feature's numbers; those of one without any are its own name and a number."""
+    """The names of a feature's numbers; if it has none, its own name with an index."""
     if any(components):
         return components
     short = _short(feature)
@@ -174,7 +175,7 @@ def _named(feature: str, components: Sequence[str]) -> Sequence[str]:
 
 
 def _within(feature: str, components: Sequence[str]) -> tuple[str, ...]:
-    """The names of a feature's numbers with the feature's before them, except of LeRobot's own."""
+    """The names of a feature's numbers prefixed with the feature's, except for LeRobot's own."""
     if feature in (layout.STATE, layout.ACTION):
         return tuple(components)
     short = _short(feature)
@@ -207,11 +208,11 @@ def load(folder: Path, rename: Renaming = ()) -> Dataset:
     """Read the meta folder and check that its parts agree.
 
     Raises:
-        AegisError: no dataset, another version, a missing or damaged file, counts that do not
-            agree, or two features that would be called alike.
+        AegisError: there is no dataset, its version is unsupported, a file is missing or damaged,
+            counts do not agree, or two features would get the same name.
     """
     folder = Path(folder)
-    info = layout.read_info(folder)  # JSON: what is no dataset is said without the package, too
+    info = layout.read_info(folder)  # JSON: errors here do not need the package
     layout.require_pyarrow()
     reader = version_2 if info.has_episode_files else version_3
     if not info.episodes and not all(path.exists() for path in reader.table_files(folder)):

@@ -1,4 +1,4 @@
-"""A dataset of the hub, downloaded into the hub's own cache."""
+"""Download a dataset from the hub into the hub's own cache."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from aegis_cli.data.lerobot import layout, source
 from aegis_cli.data.lerobot.dataset import Dataset
 
 _META, _ROWS = "meta/*", "data/*"
-_MOST_NAMED = 1000  # files that are asked for one by one; the hub's client compares each with all
+_MOST_NAMED = 1000  # the most files requested by name; the hub's client compares each with all
 
 
 def is_dataset(name: str) -> bool:
-    """Whether a repository on the hub is a LeRobot dataset, whose meta folder is then here.
+    """Whether a repository on the hub is a LeRobot dataset; downloads its meta folder.
 
     Raises:
-        AegisError: it is neither in the cache nor to be had.
+        AegisError: it is neither in the cache nor can be downloaded.
     """
     _require_hub(name)
     return layout.is_dataset(_snapshot(name, (_META,)))
 
 
 def _require_hub(name: str) -> None:
-    """Raise AegisError if there is no package that asks the hub."""
+    """Raise AegisError if the hub's package is not installed."""
     if not hub.is_installed():
         raise AegisError(
             f"no file or folder '{name}', and no package 'huggingface_hub' to ask the hub for it",
@@ -38,12 +38,13 @@ def _require_hub(name: str) -> None:
 
 
 def meta(name: str) -> Path:
-    """The local folder of a dataset on the hub, of which the meta folder is there.
+    """The local folder of a dataset on the hub, with at least its meta folder.
 
-    The folder is the same one as long as the process lives.
+    The folder stays the same for the lifetime of the process.
 
     Raises:
-        AegisError: neither in the cache nor to be had, or no LeRobot dataset that Aegis reads.
+        AegisError: it is neither in the cache nor can be downloaded, or is no LeRobot dataset that
+            Aegis reads.
     """
     _require_hub(name)
     layout.require_pyarrow()
@@ -61,7 +62,7 @@ def meta(name: str) -> Path:
 def fetch(
     name: str, found: Dataset, cameras: Sequence[str], episodes: Sequence[int] | None = None
 ) -> Path:
-    """The same folder, with the rows of these episodes and their videos of these cameras.
+    """The folder of `meta`, with the rows of these episodes and their videos of these cameras.
 
     Args:
         found: what the meta folder says.
@@ -69,7 +70,7 @@ def fetch(
         episodes: their numbers; None: all.
 
     Raises:
-        AegisError: what is not in the cache cannot be had.
+        AegisError: what is not in the cache cannot be downloaded.
     """
     if episodes is not None:
         named = _named(found, cameras, episodes)
@@ -77,7 +78,7 @@ def fetch(
             folder = _snapshot(name, (_META, *named))
             if _has_rows(replace(found, folder=folder), episodes):
                 return folder
-            # The meta folder can name the file before the right one (see `source`).
+            # The meta folder may name the file before the right one (see `source`).
             return _snapshot(name, (_META, _ROWS, *named))
     videos = [f"videos/{glob.escape(camera)}/*" for camera in cameras]  # version 3.0
     videos += [f"videos/*/{glob.escape(camera)}/*" for camera in cameras]
@@ -85,7 +86,7 @@ def fetch(
 
 
 def _named(found: Dataset, cameras: Sequence[str], episodes: Sequence[int]) -> list[str]:
-    """Patterns of the files that these episodes are in, as far as the meta folder knows."""
+    """Patterns of the files that hold these episodes, according to the meta folder."""
     wanted = set[Path]()
     for number in episodes:
         episode = found.episodes[number]
@@ -95,10 +96,10 @@ def _named(found: Dataset, cameras: Sequence[str], episodes: Sequence[int]) -> l
 
 
 def _has_rows(found: Dataset, episodes: Sequence[int]) -> bool:
-    """Whether the files that are here hold all rows of these episodes."""
+    """Whether the downloaded files hold all rows of these episodes."""
     try:
         source.find(found, episodes)
-    except AegisError:  # the reader raises it again, once every file of rows is here
+    except AegisError:  # the reader raises it again once all row files are downloaded
         return False
     return True
 

@@ -1,10 +1,10 @@
-"""A camera's frames, decoded once into a file that stays on disk and is read as an array.
+"""A camera's frames, decoded once into a file that stays on disk and is memory-mapped.
 
 Several processes decode.
 
-The file's name is the digest of what it was decoded from, so that runs share it and a changed
-dataset has another. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis;
-deleting it costs the decoding.
+The file is named by the digest of its source, so runs share it, and a changed dataset gets a new
+one. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis; if it is deleted, the
+frames are decoded again.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from aegis_cli.data.lerobot.dataset import Dataset
 from aegis_cli.data.lerobot.rows import Index
 from aegis_cli.data.lerobot.source import DataFile, Source
 
-_PART = 256  # frames that one call decodes, or a little more
-_PER_WORKER = 8  # parts that repay a worker's start
-# Python names it since 3.13. Linux then charges no memory for a private mapping as a whole.
+_PART = 256  # frames decoded per call, or slightly more
+_PER_WORKER = 8  # parts that are worth starting a worker for
+# In Python since 3.13. With it, Linux reserves no memory for a private mapping.
 _NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
-_SHARE = 0.25  # of the free disk, which decoded frames may take unasked
-_SAME = 2.0  # of 255: by how much decoders of several machines may differ in the mean
+_SHARE = 0.25  # of the free disk space, which decoded frames may take by default
+_SAME = 2.0  # of 255: the mean difference allowed between decoders of different machines
 
 
 @dataclass(frozen=True)
 class ImagePart:
-    """Rows of a data file that follow each other, in `groups` of its row groups.
+    """Consecutive rows of a data file, which lie in the row groups `groups`.
 
     `skip` rows of these groups come before them.
     """
@@ -68,7 +68,7 @@ class ImagePart:
     def _cells(self) -> Any:
         with layout.reading_parquet(self.path):
             file = layout.open_parquet(self.path)
-            # Row groups are the smallest piece of a file that can be read alone.
+            # Row groups are the smallest part of a file that can be read separately.
             groups = file.read_row_groups(list(self.groups), columns=[self.camera])
             return groups.column(self.camera).slice(self.skip, self.count)
 
@@ -82,7 +82,7 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class VideoPart:
-    """Frames of a video file at rising times."""
+    """Frames of a video file at ascending times."""
 
     path: Path
     times: tuple[float, ...]
@@ -114,30 +114,29 @@ def load(
     workers: int | None,
     on_event: OnEvent,
 ) -> tuple[np.ndarray, Path]:
-    """All frames of a camera, memory-mapped; decoded first if no file has them.
+    """All frames of a camera, memory-mapped; they are decoded first if they are not cached.
 
-    Frames of episodes that are not read have their places, which take no room on the disk.
+    Frames of episodes that are not read keep their places, which take no disk space.
 
     Args:
-        side: pixels of the square that each frame is fitted into; None: as is, or fitted to the
-            first one's size.
-        digest: digest of everything that the frames are decoded from.
+        side: pixels of the square that each frame is fitted into; None: frames keep their size, or
+            are fitted to the first one's.
+        digest: digest of everything the frames are decoded from.
         workers: processes; the frames do not depend on it. Default: up to one per core, fewer for
             few frames.
 
     Returns:
-        The frames [N, H, W, 3] uint8, and the file that has them.
+        The frames [N, H, W, 3] uint8, and the file that holds them.
 
     Raises:
-        AegisError: a picture or video that is missing or damaged, or a cache that cannot be
-            written.
+        AegisError: a picture or video is missing or damaged, or the cache cannot be written.
     """
     path, count = _file(source, camera, side, digest), source.dataset.info.frames
     kept = path.exists()
     if not kept:
         parts = list(split(source, index, camera))
         _make_cache(path.parent, parts)
-        # Without a side the first frame tells the size, which others are fitted to.
+        # Without a side, the first frame determines the size that others are fitted to.
         height, width = (side, side) if side is not None else parts[0].at(0).shape[:2]
         _write(path, parts, (count, height, width, 3), workers, camera, on_event)
     frames = _open(path, count)
@@ -147,10 +146,10 @@ def load(
 
 
 def _make_cache(folder: Path, parts: Sequence[Part]) -> None:
-    """Make the folder of decoded frames.
+    """Create the folder of decoded frames.
 
     Raises:
-        AegisError: it cannot be made.
+        AegisError: it cannot be created.
     """
     try:
         files.make_folder(folder)
@@ -160,24 +159,24 @@ def _make_cache(folder: Path, parts: Sequence[Part]) -> None:
 
 
 def _without(parts: Sequence[Part]) -> str:
-    """How to do without the cache, where that can be: the end of an advice."""
+    """The end of an advice: how to avoid the cache, if that is possible."""
     return ", or --set demos.cache=false" if isinstance(parts[0], VideoPart) else ""
 
 
 def are_kept(source: Source, camera: str, side: int | None, digest: str) -> bool:
-    """Whether `load` would find the frames, and decode none."""
+    """Whether `load` would find the frames without decoding any."""
     return _file(source, camera, side, digest).exists()
 
 
 def have_room(
     source: Source, cameras: Mapping[str, str], side: int | None, on_event: OnEvent
 ) -> bool:
-    """Whether the frames that are to be decoded take at most `_SHARE` of the free disk.
+    """Whether the frames to be decoded take at most `_SHARE` of the free disk space.
 
-    A warning says where they do not.
+    If not, a warning says so.
 
     Args:
-        cameras: the digest of each camera that is read, as `load` takes it.
+        cameras: the digest of each camera that is read, as for `load`.
     """
     features = source.dataset.info.features
     count = sum(source.dataset.episodes[number].length for number in source.episodes)
@@ -202,11 +201,11 @@ def have_room(
 
 
 def _file(source: Source, camera: str, side: int | None, digest: str) -> Path:
-    """Where the frames that are decoded from what has this digest are kept.
+    """The cache file of frames decoded from a source with this digest.
 
-    Those of some episodes are a file of their own, unless all episodes of the same files are there.
+    A selection of episodes has its own file, unless the file of all episodes exists.
     """
-    # Another decoder or filter makes other pixels of the same files.
+    # Another decoder or filter makes other pixels from the same files.
     made = {"decoder": fitting.DECODER, "filter": fitting.FILTER}
     key = {"dataset": digest, "camera": camera, "side": side, **made}
     whole = cache.folder("frames") / _name(key)
@@ -220,7 +219,7 @@ def _name(key: Mapping[str, Any]) -> str:
 
 
 def pick(source: Source, index: Index, camera: str, numbers: Sequence[int]) -> list[np.ndarray]:
-    """Some of a camera's frames as they are, by their rising numbers."""
+    """Some of a camera's frames in their own size, by their ascending numbers."""
     found = []
     for part in split(source, index, camera):
         of_part = range(part.first_frame, part.first_frame + part.count)
@@ -238,7 +237,7 @@ def split(source: Source, index: Index, camera: str) -> Iterator[Part]:
 
 
 def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
-    """The file's rows that are read, cut between row groups where there are enough."""
+    """The rows of a file that are read, divided at row groups into parts of sufficient size."""
     with layout.reading_parquet(file.path):
         found = layout.open_parquet(file.path)
         if camera not in found.schema_arrow.names:
@@ -254,7 +253,7 @@ def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
         first, last = rows.first, rows.first + rows.count
         for end in ends[np.searchsorted(ends, first, side="right") :].tolist():
             stop = min(end, last)
-            # A part begins where one ends: groups of few rows are put together.
+            # A part ends at the end of a row group: small groups are put together.
             if stop - first >= _PART or stop == last:
                 groups = np.searchsorted(ends, [first, stop - 1], side="right")
                 chosen = tuple(range(groups[0], groups[1] + 1))
@@ -267,7 +266,7 @@ def _image_parts(file: DataFile, camera: str) -> Iterator[ImagePart]:
 
 
 def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart]:
-    """Episodes that follow each other, also in one file, are read in one go."""
+    """A camera's frames in videos; consecutive episodes of one file are read together."""
     dataset = source.dataset
     tolerance = 0.5 / dataset.info.fps
     ends = _clip_ends(dataset, camera)
@@ -279,7 +278,7 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
         own = clip.start_s + index.timestamp[frame : starts[number + 1]]
         _check_within_clip(own, ends[number], number, source, camera)
         goes_on = clip.file == path and frame == first + len(times)
-        # `video.read` wants rising times: an episode may lie before the one with a lower number.
+        # `video.read` needs ascending times: an episode may lie before one of a lower number.
         if times and (not goes_on or own[0] <= times[-1] or len(times) >= _PART):
             yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
             times = []
@@ -290,11 +289,11 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
 
 
 def _clip_ends(dataset: Dataset, camera: str) -> list[float]:
-    """Where the clip of each episode ends in its file, in seconds: the next begins there at last.
+    """Where each episode's clip ends in its file, in seconds: at the latest where the next begins.
 
-    Infinity for the last one of a file of which the meta folder does not tell the end.
+    Infinity for the last clip of a file, if the meta folder does not give its end.
     """
-    # All episodes, also those that are not read: a neighbour's frames begin where one's own end.
+    # Of all episodes, including those not read: an episode ends where its neighbour begins.
     clips = [episode.clips[camera] for episode in dataset.episodes]
     begun: dict[Path, list[float]] = {}
     for clip in clips:
@@ -312,11 +311,11 @@ def _clip_ends(dataset: Dataset, camera: str) -> list[float]:
 def _check_within_clip(
     times: np.ndarray, end_s: float, number: int, source: Source, camera: str
 ) -> None:
-    """Raise AegisError where an episode's times in its file [L] are nearest to another's frames.
+    """Raise AegisError if times of an episode in its file [L] are nearest to another's frames.
 
-    So they are where its timestamps have a gap, or the camera has lost frames.
+    This happens if its timestamps have a gap, or the camera has lost frames.
     """
-    # Later than this, a time is nearer to the next episode's first frame.
+    # A later time is nearer to the next episode's first frame.
     last_s = end_s - 0.5 / source.dataset.info.fps
     past = int((times > last_s).sum())
     if past:
@@ -339,7 +338,7 @@ def _write(
     on_event: OnEvent,
 ) -> None:
     """Decode a camera's frames into a file beside `path`, then rename it."""
-    files.sweep_all(path.parent)  # what decodings have left that were killed
+    files.sweep_all(path.parent)  # left over from killed processes
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:
@@ -350,7 +349,7 @@ def _write(
         )
     try:
         with files.aside(path) as (aside, file):
-            # The file gets its whole size at once; each process writes its parts to their places.
+            # The file gets its full size at once; each process writes its parts at their offsets.
             offset = npy.open_memmap(aside, "w+", np.uint8, shape).offset
             done, stage = 0, f"decode {layout.short(camera)}"
             workers = workers or worker_count(len(parts) // _PER_WORKER)
@@ -362,7 +361,7 @@ def _write(
                 for decoded in counts:
                     done += decoded
                     on_event(Progress(stage, done, count, "frames"))
-            os.fsync(file.fileno())  # else the name could outlive the frames in a power failure
+            os.fsync(file.fileno())  # else a power failure could leave a name without frames
             os.replace(aside, path)
     except OSError as error:
         raise AegisError(
@@ -373,7 +372,7 @@ def _write(
 
 
 def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
-    """Write a part's frames to their place in the file."""
+    """Write a part's frames at their offset in the file."""
     height, width = size
     count = 0
     with open(file, "r+b") as out:
@@ -387,7 +386,7 @@ def _decode(file: Path, offset: int, size: tuple[int, int], part: Part) -> int:
 def _check_some(path: Path, frames: np.ndarray, source: Source, index: Index, camera: str) -> None:
     """Compare the first, a middle and the last cached frame with the dataset's.
 
-    To read all of them would take as long as the cache saves.
+    Comparing all would take as long as the cache saves.
 
     Raises:
         AegisError: the file holds other frames.
@@ -397,7 +396,7 @@ def _check_some(path: Path, frames: np.ndarray, source: Source, index: Index, ca
     chosen = [(first, 0), (middle, middle.count // 2), (last, last.count - 1)]
     for part, place in chosen:
         number = part.first_frame + place
-        # In floats, because the difference of two uint8 wraps around.
+        # In floats, because differences of uint8 wrap around.
         wanted = fitting.fit(part.at(place), *frames.shape[1:3]).astype(float)
         if np.abs(frames[number] - wanted).mean() > _SAME:
             raise AegisError(
@@ -425,11 +424,11 @@ def _open(path: Path, frames: int) -> np.ndarray:
 def _mapped(path: Path) -> np.ndarray:
     """The array of a .npy file, which may be larger than the memory.
 
-    The mapping is private to this process. As far as torch knows, a tensor over it may be written
-    to; the file never is. NumPy's own mapping of that kind has to fit into memory as a whole.
+    The mapping is private to this process: torch regards a tensor over it as writable, but the file
+    is never written. NumPy's own mapping of this kind has to fit into memory as a whole.
 
     Raises:
-        OSError, ValueError: a file that cannot be read, or is damaged.
+        OSError, ValueError: the file cannot be read, or is damaged.
     """
     with open(path, "rb") as file:
         version = npy.read_magic(file)

@@ -1,4 +1,4 @@
-"""Where LeRobot's dataset format keeps what, and `meta/info.json`, which says so.
+"""The layout of LeRobot's dataset format, and `meta/info.json`, which describes it.
 
 Version 3.0, which is also written:
 
@@ -7,7 +7,7 @@ Version 3.0, which is also written:
     data/chunk-000/file-000.parquet             a row per frame; embedded images are in it
     videos/<camera>/chunk-000/file-000.mp4      episodes one after the other
 
-Versions 2.0 and 2.1, which have a file for each episode:
+Versions 2.0 and 2.1, which have one file per episode:
 
     meta/info.json  meta/tasks.jsonl  meta/episodes.jsonl
     meta/stats.json (2.0)  meta/episodes_stats.jsonl (2.1)
@@ -32,15 +32,15 @@ from typing import Any, TypeVar
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
-VERSION = "v3.0"  # of what is written
+VERSION = "v3.0"  # the version that is written
 READ = "version 2.0, 2.1 or 3.0"
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
 EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 STATE, ACTION, CAMERA = "observation.state", "action", "observation.images."
-ROBOT = "aegis/"  # robot type of a simulated task; LeRobot's own tools carry it along
-# What every dataset has besides its own features, in this order.
+ROBOT = "aegis/"  # prefix of a simulated task's robot type; LeRobot's own tools keep it
+# The columns that every dataset has besides its own features, in this order.
 INDEX_FEATURES = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -48,10 +48,10 @@ INDEX_FEATURES = {
     "index": "int64",
     "task_index": "int64",
 }
-_NUMBER = re.compile(r"(0?[1-9])?d?")  # how a path's number may be formatted
-AGAIN = "get the dataset again, or another one"  # the cure for one that is not whole
+_NUMBER = re.compile(r"(0?[1-9])?d?")  # the allowed formats of a path's number
+AGAIN = "get the dataset again, or another one"  # the advice for an incomplete dataset
 
-Place = Mapping[str, int]  # the numbers that a template of paths has fields for
+Place = Mapping[str, int]  # the numbers for the fields of a path template
 
 _T = TypeVar("_T")
 
@@ -60,7 +60,7 @@ _T = TypeVar("_T")
 class Feature:
     """One column, or one video per file.
 
-    `names` is a list, a mapping or None, as the dataset has it.
+    `names` is a list, a mapping or None, as in the dataset.
     """
 
     dtype: str
@@ -72,12 +72,12 @@ class Feature:
     def components(self) -> tuple[str, ...]:
         """The names of its numbers, or of a picture's channels.
 
-        They are empty texts where it has none, or another number of them: openpi's datasets call
-        eight positions `["state"]`. An array, such as a depth map in the rows, has none at all: it
-        may be of hundreds of thousands of numbers.
+        They are empty strings if it has none, or a wrong number of them: openpi's datasets name
+        eight positions `["state"]`. An array, such as a depth map in the rows, has no components:
+        it may hold hundreds of thousands of numbers.
         """
         if self.dtype in ("image", "video"):
-            # Datasets name a picture's axes instead: height, width and channels.
+            # For pictures, datasets name the axes instead: height, width and channels.
             return ("depth",) if self.is_depth else ("red", "green", "blue")
         if len(self.shape) > 1:
             return ()
@@ -91,10 +91,10 @@ class Feature:
 
 
 def _listed(names: Mapping[Any, Any], count: int) -> list[Any] | None:
-    """The names of so many numbers in a mapping; None where it has none.
+    """The names of `count` numbers in a mapping; None if it has none.
 
-    Some datasets have {"motors": [...]}, and those of LeRobot's teleoperators that move the hand
-    {"delta_x": 0, "delta_y": 1}, a place for each name.
+    Some datasets have {"motors": [...]}; those of LeRobot's end-effector teleoperators have
+    {"delta_x": 0, "delta_y": 1}, an index for each name.
     """
     places = {place: name for name, place in names.items() if isinstance(place, int)}
     if len(names) == count and places.keys() == set(range(count)):
@@ -104,10 +104,10 @@ def _listed(names: Mapping[Any, Any], count: int) -> list[Any] | None:
 
 @dataclass(frozen=True)
 class Info:
-    """What `meta/info.json` says, as far as Aegis reads it.
+    """The contents of `meta/info.json` that Aegis reads.
 
     Attributes:
-        chunk_episodes: how many episodes a folder of files holds in versions 2.0 and 2.1.
+        chunk_episodes: the number of episodes per chunk folder in versions 2.0 and 2.1.
     """
 
     version: str
@@ -123,7 +123,7 @@ class Info:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The features that are colour pictures, as images or video."""
+        """The features that are colour pictures, stored as images or video."""
         found = list[str]()
         for name, feature in self.features.items():
             if feature.dtype in ("image", "video") and not feature.is_depth:
@@ -132,12 +132,12 @@ class Info:
 
     @property
     def videos(self) -> tuple[str, ...]:
-        """The features that are video, those of depth among them."""
+        """The features stored as video, including depth."""
         return tuple(name for name, feature in self.features.items() if feature.dtype == "video")
 
     @property
     def has_episode_files(self) -> bool:
-        """Whether each episode has files of its own, as before version 3.0."""
+        """Whether each episode has its own files, as before version 3.0."""
         return _numbers_of(self.version)[0] < 3
 
     @property
@@ -148,9 +148,9 @@ class Info:
 
 @dataclass(frozen=True)
 class Clip:
-    """The video file that an episode is in, and where it begins and ends there, in seconds.
+    """The video file of an episode, and its start and end in that file, in seconds.
 
-    The end is infinity where the meta folder does not tell it.
+    The end is infinity if the meta folder does not give it.
     """
 
     file: Path
@@ -160,13 +160,13 @@ class Clip:
 
 @dataclass(frozen=True)
 class EpisodeIndex:
-    """Where an episode is; paths are relative to the dataset's folder.
+    """The location of an episode; paths are relative to the dataset's folder.
 
     Attributes:
         length: number of its frames.
-        data: the parquet file with its rows, as far as the meta folder knows (see `source`).
+        data: the parquet file with its rows, according to the meta folder (see `source`).
         clips: its clip for each video feature.
-        tasks: its instructions; empty where the meta folder does not tell them.
+        tasks: its instructions; empty if the meta folder does not give them.
     """
 
     length: int
@@ -176,9 +176,9 @@ class EpisodeIndex:
 
 
 def tasks_of(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """The instructions that an episode's row of the meta folder has; () where they are no texts.
+    """The instructions in an episode's row of the meta folder; () if they are not texts.
 
-    What is learned has the instructions of the data files. These only help to choose.
+    Training uses the instructions of the data files. These only help to select episodes.
     """
     told = row.get("tasks")
     is_list = isinstance(told, list) and all(isinstance(text, str) for text in told)
@@ -192,7 +192,7 @@ def simulated_task(robot_type: str | None) -> str | None:
 
 
 def short(camera: str) -> str:
-    """A camera's name without what LeRobot's names of cameras begin with."""
+    """A camera's name without LeRobot's prefix."""
     return camera.removeprefix(CAMERA)
 
 
@@ -207,16 +207,16 @@ def require_pyarrow() -> None:
 
 
 def is_dataset(folder: Path) -> bool:
-    """Whether this is a folder with a dataset of any version in it."""
+    """Whether this folder holds a dataset of any version."""
     return (folder / INFO).is_file()
 
 
 def read_info(folder: Path) -> Info:
-    """What the dataset in `folder` is.
+    """Read `meta/info.json` of the dataset in `folder`.
 
     Raises:
-        AegisError: no dataset, one of another version, an `info.json` that is not sound, or a path
-            that is no text, which pyarrow does not take.
+        AegisError: there is no dataset, its version is unsupported, `info.json` is invalid, or the
+            path is not valid UTF-8, which pyarrow does not accept.
     """
     if not is_dataset(folder):
         raise AegisError(
@@ -245,9 +245,9 @@ def _numbers_of(version: str) -> tuple[int, int]:
     """The first two numbers of a version.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is no version.
     """
-    padded = f"{version.lstrip('v')}.0"  # `v3` alone is version 3.0
+    padded = f"{version.lstrip('v')}.0"  # `v3` is version 3.0
     major, minor = padded.split(".")[:2]
     return int(major), int(minor)
 
@@ -272,7 +272,7 @@ def _parse(raw: Mapping[str, Any]) -> Info:
         raise ValueError(f"robot_type is {info.robot_type}")
     if info.chunk_episodes < 1:
         raise ValueError(f"chunks_size is {info.chunk_episodes}")
-    # The first paths are made to see that the templates are sound, before anything is read by them.
+    # Make the first paths to check that the templates are valid, before anything is read.
     first = episode_place(info, 0) if info.has_episode_files else file_place(0, 0)
     data_file(info, first)
     for name in info.videos:
@@ -281,9 +281,9 @@ def _parse(raw: Mapping[str, Any]) -> Info:
 
 
 def _splits(raw: Any) -> dict[str, str]:
-    """Names of splits and their episodes; what is said in another way than LeRobot's is left out.
+    """Names of splits and their episodes; those in another form than LeRobot's are left out.
 
-    Nothing but a split's own name in a recipe asks for it.
+    A split is only used if a recipe names it.
     """
     if not isinstance(raw, Mapping):
         return {}
@@ -291,27 +291,27 @@ def _splits(raw: Any) -> dict[str, str]:
 
 
 def file_place(chunk: int, file: int) -> Place:
-    """The numbers of a file of version 3.0."""
+    """The path numbers of a file in version 3.0."""
     return {"chunk_index": chunk, "file_index": file}
 
 
 def episode_place(info: Info, number: int) -> Place:
-    """The numbers of an episode's own file, before version 3.0."""
+    """The path numbers of an episode's own file, before version 3.0."""
     return {"episode_chunk": number // info.chunk_episodes, "episode_index": number}
 
 
 def data_file(info: Info, place: Place) -> Path:
-    """The parquet file with these numbers, from the dataset's folder.
+    """The parquet file with these numbers, relative to the dataset's folder.
 
     Raises:
-        KeyError: the dataset's template has a field that is none of them.
-        ValueError: it is no template, or leads out of the folder.
+        KeyError: the dataset's template has another field.
+        ValueError: the template is invalid, or leads out of the folder.
     """
     return _filled(info.data_path, place)
 
 
 def data_files(info: Info, folder: Path) -> list[Path]:
-    """The parquet files below `folder` whose names the dataset's template can give."""
+    """The parquet files below `folder` whose names match the dataset's template."""
     pattern, name = "", ""
     for text, field_name, _, _ in string.Formatter().parse(info.data_path):
         pattern += glob.escape(text)
@@ -319,34 +319,34 @@ def data_files(info: Info, folder: Path) -> list[Path]:
         if field_name is not None:
             pattern += "*"
             name += r"\d+"
-    # A glob knows no numbers: it would also find a copy such as `file-000 (1).parquet`.
+    # A glob cannot match numbers only: it would also find a copy such as `file-000 (1).parquet`.
     fits = re.compile(name)
     found = sorted(folder.glob(pattern))
     return [path for path in found if fits.fullmatch(path.relative_to(folder).as_posix())]
 
 
 def video_file(info: Info, camera: str, place: Place) -> Path:
-    """The video file of a camera with these numbers, from the dataset's folder.
+    """The video file of a camera with these numbers, relative to the dataset's folder.
 
     Raises:
-        KeyError: the dataset's template has a field that is none of them.
-        ValueError: it is no template, or it or the camera's name leads out of the folder.
+        KeyError: the dataset's template has another field.
+        ValueError: the template is invalid, or it or the camera's name leads out of the folder.
     """
     return _filled(str(info.video_path), {"video_key": camera, **place})
 
 
 def _filled(template: str, values: Mapping[str, str | int]) -> Path:
-    """A template with its numbers filled in.
+    """Fill the numbers into a path template.
 
-    Python's own formatting would follow attributes, and pad to a billion digits.
+    Python's own formatting would follow attributes, or pad to a billion digits.
 
     Raises:
-        KeyError: a field that is no value's name.
-        ValueError: another format than that of a plain number, or a path that leads out.
+        KeyError: a field is not among the values.
+        ValueError: a field has another format than a plain number's, or the path leads out.
     """
     for _, name, form, conversion in string.Formatter().parse(template):
         if name is None or form is None:
-            continue  # text alone
+            continue  # only text
         value = values[name]
         plain = _NUMBER.fullmatch(form) if isinstance(value, int) else not form
         if conversion or not plain:
@@ -358,7 +358,7 @@ def _filled(template: str, values: Mapping[str, str | int]) -> Path:
 
 
 def _feature(entry: Mapping[str, Any]) -> Feature:
-    # Versions differ in where they say it, and under which key.
+    # Versions differ in where this is stored, and under which key.
     notes = [entry.get("info") or {}, entry.get("video_info") or {}]
     depth = any(note.get("is_depth_map") or note.get("video.is_depth_map") for note in notes)
     shape = tuple(int(side) for side in entry["shape"])
@@ -366,7 +366,7 @@ def _feature(entry: Mapping[str, Any]) -> Feature:
 
 
 def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
-    """`meta/stats.json`; None where it is missing, for LeRobot does without it, too."""
+    """`meta/stats.json`; None if it is missing, which LeRobot accepts too."""
     if not (folder / STATS).is_file():
         return None
     stats = files.load_json(folder / STATS)
@@ -375,10 +375,10 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
 
 
 def by_number(entries: Iterable[tuple[Any, _T]]) -> dict[int, _T]:
-    """What a file says of episodes or tasks, by their rising numbers.
+    """The entries of a file of episodes or tasks, by number in ascending order.
 
     Raises:
-        ValueError: a number is none, or stands there twice.
+        ValueError: a number is invalid, or occurs twice.
     """
     found: dict[int, _T] = {}
     for said, entry in entries:
@@ -390,10 +390,10 @@ def by_number(entries: Iterable[tuple[Any, _T]]) -> dict[int, _T]:
 
 
 def texts_of(tasks: Mapping[int, Any]) -> tuple[str, ...]:
-    """The tasks' texts by their numbers.
+    """The tasks' texts in order of their numbers.
 
     Raises:
-        ValueError: they are no texts, or a number is missing.
+        ValueError: a text is no string, or a number is missing.
     """
     if list(tasks) != list(range(len(tasks))):
         raise ValueError("the tasks are not numbered from 0")
@@ -403,10 +403,10 @@ def texts_of(tasks: Mapping[int, Any]) -> tuple[str, ...]:
 
 
 def check_episodes(where: Path, info: Info, episodes: Mapping[int, EpisodeIndex]) -> None:
-    """Raise AegisError unless these are all episodes and frames of which `info.json` speaks."""
+    """Raise AegisError unless these are exactly the episodes and frames that `info.json` counts."""
     numbers = list(episodes)
     if len(numbers) != info.episodes or numbers != list(range(len(numbers))):
-        # Among one more than there are rows, a number is always missing.
+        # Of one more candidate than there are rows, at least one is always missing.
         missing = sorted(set(range(min(info.episodes, len(numbers) + 1))) - set(numbers))
         which = f"episode {missing[0]} is missing" if missing else f"{len(numbers)} rows"
         raise AegisError(
@@ -419,12 +419,12 @@ def check_episodes(where: Path, info: Info, episodes: Mapping[int, EpisodeIndex]
 
 @contextlib.contextmanager
 def damaged(path: Path) -> Generator[None]:
-    """Turn exceptions of wrong types, missing keys or wrong values into an error about a file."""
+    """Turn exceptions about types, missing keys or values into an AegisError about a file."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        files.refuse_pointer(path)  # of Git LFS, in place of the file: that has a cure of its own
-        # What Python says of a missing key is the key alone.
+        files.refuse_pointer(path)  # a Git LFS pointer has its own advice
+        # The text of a KeyError is only the key.
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise AegisError(
             f"'{path}' is damaged: {what}", "a file of LeRobot's dataset format", AGAIN
@@ -433,7 +433,7 @@ def damaged(path: Path) -> Generator[None]:
 
 @contextlib.contextmanager
 def reading_parquet(path: Path) -> Generator[None]:
-    """Turn a parquet file that is missing or damaged into the one error a user sees."""
+    """Turn errors of a missing or damaged parquet file into an AegisError."""
     from pyarrow import ArrowException
 
     try:
@@ -444,12 +444,12 @@ def reading_parquet(path: Path) -> Generator[None]:
         ) from error
     except (ArrowException, OSError, ValueError, MemoryError) as error:
         files.refuse_pointer(path)
-        what = (str(error).splitlines() or ["it cannot be read"])[0]  # pyarrow may say pages
+        what = (str(error).splitlines() or ["it cannot be read"])[0]  # the rest may fill pages
         raise AegisError(f"'{path}' is damaged: {what}", "a parquet file", AGAIN) from error
 
 
 def open_parquet(path: Path) -> Any:
-    """A `pyarrow.parquet.ParquetFile` that checks the pages' checksums, where the file has them."""
+    """A `pyarrow.parquet.ParquetFile` that checks the pages' checksums, if the file has them."""
     from pyarrow import parquet
 
     files.refuse_special(path)
@@ -457,7 +457,7 @@ def open_parquet(path: Path) -> Any:
 
 
 def next_file(chunk: int, file: int, per_chunk: int) -> tuple[int, int]:
-    """The place after this one: files are counted within their chunk."""
+    """The (chunk, file) after this one: files are counted within their chunk."""
     return (chunk + 1, 0) if file == per_chunk - 1 else (chunk, file + 1)
 
 

@@ -1,13 +1,13 @@
-"""What a robot sees at one step in one mapping, as LeRobot has it.
+"""A robot's observation at one step as one mapping, in LeRobot's form.
 
 Two kinds are read:
 
-- LeRobot's observation, of a dataset's frame or out of its processors: `observation.images.top`,
+- LeRobot's observation, from a dataset's frame or from its processors: `observation.images.top`,
   `observation.state`, `task`.
-- What a robot's `get_observation()` returns: a number for each motor (`shoulder_pan.pos`) and a
-  picture for each camera (`top`). LeRobot's `hw_to_dataset_features` makes a dataset's features of
-  these: the motors' names are those of `observation.state`, and a camera's name has
-  `observation.images.` before it.
+- The result of a robot's `get_observation()`: a number for each motor (`shoulder_pan.pos`) and a
+  picture for each camera (`top`). LeRobot's `hw_to_dataset_features` turns these into a dataset's
+  features: the motors' names become those of `observation.state`, and cameras get the prefix
+  `observation.images.`.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import layout
 
 TASK = "task"
-_OBSERVED = "observation."  # what LeRobot's names of observations begin with
-_PICTURES = "observation.image"  # and those of pictures: `observation.images.top`, or PushT's
+_OBSERVED = "observation."  # prefix of LeRobot's names of observations
+_PICTURES = "observation.image"  # prefix of its pictures: `observation.images.top`, or PushT's
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What a policy acts on.
+    """A policy's input.
 
     Attributes:
-        pictures: of each camera by its name in the policy, or the only one, as `picture` gives it.
+        pictures: each camera's picture by its name in the policy, or the only one, as returned by
+            `picture`.
         positions: [P] numbers.
         task: the instruction, if the observation has one.
     """
@@ -47,7 +48,7 @@ def is_one(
     state_names: Sequence[str] | None,
     state: Sequence[str] = (layout.STATE,),
 ) -> bool:
-    """Whether a mapping has a key of LeRobot's observation, that of a motor, or all of `state`."""
+    """Whether a mapping has a key of LeRobot's observation or of a motor, or all of `state`."""
     motors = state_names or ()
     keys = [key for key in mapping if isinstance(key, str)]
     named = any(key.startswith(_OBSERVED) or key in motors for key in keys)
@@ -62,23 +63,24 @@ def read(
 ) -> Observed:
     """The pictures, the positions and the task of an observation of either kind.
 
-    Pictures of further cameras and other texts than the task are ignored, and of LeRobot's
-    observation every key that is no picture, such as `action` or `timestamp` of a dataset's frame.
+    Pictures of further cameras and texts other than the task are ignored; so is, in LeRobot's
+    observation, every other key, such as `action` or `timestamp` of a dataset's frame.
 
     Args:
-        cameras: the policy's, in its order; empty for one picture of any name.
-        state_names: of the policy's positions, in their order; None where it does not know them.
-        state: the features that its positions were in its demonstrations. Where an observation has
-            all of these, they are read; else `observation.state` has them side by side.
+        cameras: the policy's cameras, in order; empty for one picture of any name.
+        state_names: names of the policy's positions, in order; None if it does not know them.
+        state: the features that its positions were made from in its demonstrations. If an
+            observation has all of these, they are read; otherwise `observation.state` holds them
+            concatenated.
 
     Raises:
-        AegisError: cameras or positions that are missing, or that the policy does not know.
+        AegisError: cameras or positions are missing, or unknown to the policy.
     """
     observation = {key: value for key, value in observation.items() if isinstance(key, str)}
     read_from = state if all(name in observation for name in state) else (layout.STATE,)
     if all(name in observation for name in read_from):
         parts = [_unbatched(_array(observation[name]), 1) for name in read_from]
-        # A single one keeps its shape, of which the policy tells what is wrong.
+        # A single feature keeps its shape, so that the policy can report a wrong one.
         positions = parts[0] if len(parts) == 1 else np.concatenate([p.reshape(-1) for p in parts])
         shown = {name: v for name, v in observation.items() if _is_picture(name, cameras)}
         shown = _known(shown, cameras)
@@ -92,7 +94,7 @@ def read(
                 f"put the positions there, in the demonstrations' order, and the pictures at "
                 f"'{layout.CAMERA}NAME'",
             )
-        # A robot's own keys do not say what they are: pictures are what has several dimensions.
+        # A robot's own keys do not show their kind: values with several dimensions are pictures.
         kinds = {name: _dimensions(value) for name, value in observation.items()}
         _check_frames(observation, kinds, cameras, state_names)
         shown = {name: observation[name] for name, count in kinds.items() if count > 1}
@@ -100,7 +102,7 @@ def read(
         told = [name for name, count in kinds.items() if 0 <= count < 2 and name != TASK]
         _check(shown, cameras, told, state_names)
         positions = np.array([_number(name, observation[name]) for name in state_names], np.float32)
-    own = {layout.short(name): name for name in cameras}  # as the policy calls them
+    own = {layout.short(name): name for name in cameras}  # in the policy's names
     named = {}
     for name, value in shown.items():
         named[own.get(layout.short(name), name)] = picture(name, value)
@@ -109,21 +111,21 @@ def read(
 
 
 def picture(name: str, given: Any) -> np.ndarray:
-    """RGB [H, W, 3] uint8 of a picture as cameras give it, or of one as LeRobot's processors do.
+    """Convert a picture from a camera or from LeRobot's processors to RGB [H, W, 3] uint8.
 
     Args:
         given: [H, W, 3] uint8, or [3, H, W] of floats in [0, 1] or uint8; each with or without a
             leading dimension of 1.
 
     Raises:
-        AegisError: floats of another range or shape.
+        AegisError: floats have another range or shape.
     """
     found = _unbatched(_array(given), 3)
     if found.dtype.kind != "f":
-        # Three by both ends could be either: a camera's own order is the likelier.
+        # If both outer dimensions are 3, channels last, as from cameras, is more likely.
         first = found.ndim == 3 and found.shape[0] == 3 != found.shape[2]
         return np.ascontiguousarray(found.transpose(1, 2, 0)) if first else found
-    # A comparison with NaN is false, too.
+    # Comparisons with NaN are false, too.
     if found.ndim != 3 or found.shape[0] != 3 or not ((found >= 0) & (found <= 1)).all():
         span = f" from {found.min():g} to {found.max():g}" if found.size else ""
         raise AegisError(
@@ -135,12 +137,12 @@ def picture(name: str, given: Any) -> np.ndarray:
 
 
 def _is_picture(name: str, cameras: Sequence[str]) -> bool:
-    """Whether a key of LeRobot's observation is that of a picture."""
+    """Whether a key of LeRobot's observation belongs to a picture."""
     return name.startswith(_PICTURES) or name in cameras
 
 
 def _known(shown: dict[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
-    """The pictures of the policy's cameras where all are there, which a robot may have more of."""
+    """The pictures of the policy's cameras if all are there; a robot may have further cameras."""
     wanted = {layout.short(name) for name in cameras}
     known = {name: value for name, value in shown.items() if layout.short(name) in wanted}
     return known if wanted and wanted <= {*map(layout.short, known)} else shown
@@ -160,12 +162,12 @@ def _array(given: Any) -> np.ndarray:
 
 
 def _unbatched(given: np.ndarray, dimensions: int) -> np.ndarray:
-    """The only one of a batch; everything else as it is."""
+    """Remove a batch dimension of size 1; everything else is returned unchanged."""
     return given[0] if given.ndim == dimensions + 1 and len(given) == 1 else given
 
 
 def _dimensions(value: Any) -> int:
-    """How many dimensions a robot's value has; -1 for a text, and 0 for what is no array."""
+    """The number of dimensions of a robot's value; -1 for a text, 0 for anything but arrays."""
     if isinstance(value, str):
         return -1
     return int(getattr(value, "ndim", 0))
@@ -177,10 +179,10 @@ def _check_frames(
     cameras: Sequence[str],
     motors: Sequence[str],
 ) -> None:
-    """Raise AegisError where a camera of the policy has given what is no picture.
+    """Raise AegisError if a camera of the policy has returned something else than a picture.
 
     Args:
-        kinds: how many dimensions each value has.
+        kinds: the number of dimensions of each value.
     """
     wanted = {layout.short(name) for name in cameras}
     for name, count in kinds.items():
@@ -204,7 +206,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _task(observation: Mapping[str, Any]) -> str | None:
-    """The text at `task`, which LeRobot's processors put into a list; None for an empty one."""
+    """The text at `task`, which LeRobot's processors put into a list; None if it is empty."""
     found = observation.get(TASK)
     if isinstance(found, list | tuple) and len(found) == 1:
         found = found[0]
@@ -214,7 +216,7 @@ def _task(observation: Mapping[str, Any]) -> str | None:
 def _check(
     shown: Iterable[str], cameras: Sequence[str], told: Sequence[str], positions: Sequence[str]
 ) -> None:
-    """Raise AegisError unless there are the policy's cameras and positions, and no others."""
+    """Raise AegisError unless these are exactly the policy's cameras and positions."""
     seen = [layout.short(name) for name in shown]
     wanted = [layout.short(name) for name in cameras]
     is_only = not cameras and len(seen) == 1

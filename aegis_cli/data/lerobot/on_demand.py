@@ -1,4 +1,4 @@
-"""A camera's frames that stay in their videos until somebody asks for them."""
+"""A camera's frames that stay in their videos until they are read."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from aegis_cli.data.lerobot.frames import VideoPart
 
 
 class FramesOnDemand:
-    """Frames [N, H, W, 3] uint8 that are decoded as they are asked for; nothing is written.
+    """Frames [N, H, W, 3] uint8 that are decoded when they are read; nothing is written.
 
-    They are those of `frames.load`, which keeps them on the disk. Several threads may ask.
+    They equal those of `frames.load`, which caches them on disk. Several threads may read them.
 
     Attributes:
         shape: (N, H, W, 3).
     """
 
     def __init__(self, parts: Sequence[VideoPart], count: int, side: int | None) -> None:
-        """Decode the first frame, which tells their size unless `side` does, in pixels.
+        """Determine the frames' size: `side` in pixels, or that of the decoded first frame.
 
         Args:
-            parts: the frames that may be asked for, rising.
-            count: N, how many there are with those that are in no part.
+            parts: the frames that may be read, in ascending order.
+            count: N, including frames that are in no part.
         """
         self._parts = parts
         self._begin_at = [part.first_frame for part in parts]
@@ -45,7 +45,7 @@ class FramesOnDemand:
         """Frames [B, H, W, 3] by their numbers [B] int64.
 
         Raises:
-            AegisError: a video that is missing or damaged.
+            AegisError: a video is missing or damaged.
         """
         _, height, width, _ = self.shape
         fitted = np.empty((len(numbers), height, width, 3), np.uint8)
@@ -54,16 +54,16 @@ class FramesOnDemand:
         return torch.from_numpy(fitted)
 
     def _decoded(self, number: int) -> np.ndarray:
-        # Of the parts that begin at this frame or before it, the last.
+        # The last part that starts at or before this frame.
         part = self._parts[bisect_right(self._begin_at, number) - 1]
         time = part.times[number - part.first_frame]
         return self._readers.own.frame(part.path, time, part.tolerance)
 
 
 class _Readers(threading.local):
-    """A reader of each thread's own, since none is for several at once.
+    """One reader per thread, since a reader is not thread-safe.
 
-    Python calls `__init__` anew in each thread that asks.
+    Python calls `__init__` again in each thread.
     """
 
     def __init__(self) -> None:

@@ -24,7 +24,7 @@ def from_bytes(data: bytes | None, where: str) -> np.ndarray:
     """The picture [H, W, 3] uint8 in the bytes of an image file; `where` names it in errors.
 
     Raises:
-        AegisError: no bytes, or none that are a whole picture.
+        AegisError: there are no bytes, or they are no complete picture.
     """
     if not data:
         fix = "embed the images in the parquet files"

@@ -14,12 +14,12 @@ from aegis_cli.data.episodes import as_text
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.lerobot.source import CHOOSING, WITHOUT, DataFile, Source, column, numbers
 
-_RATE_TOLERANCE = 0.1  # share of a step by which the usual one may differ from 1 / fps
+_RATE_TOLERANCE = 0.1  # the share of 1 / fps by which the median step may differ from it
 
 
 @dataclass(frozen=True)
 class Index:
-    """What the rows say about all N frames of a dataset; 0 for a frame that is not read.
+    """Times and tasks of all N frames of a dataset; 0 for frames that are not read.
 
     Attributes:
         timestamp: [N] float64, seconds from the episode's start.
@@ -34,8 +34,8 @@ def read_index(source: Source) -> Index:
     """Times and tasks of the frames, after a check that the frames of an episode are in order.
 
     Raises:
-        AegisError: a file that is missing or damaged, rows that are out of place, a task without a
-            text, times of another rate than the dataset's.
+        AegisError: a file is missing or damaged, rows are out of order, a task has no text, or
+            times have another rate than the dataset's.
     """
     frames, texts = source.dataset.info.frames, len(source.dataset.tasks)
     index = Index(np.zeros(frames), np.zeros(frames, np.int64))
@@ -50,7 +50,7 @@ def read_index(source: Source) -> Index:
             found = f"'{file.path}' has a task_index that '{tasks}' lacks"
             known = f"0 to {texts - 1}" if texts else "a table with the tasks' texts"
             raise AegisError(found, known, layout.AGAIN)
-        steps.append(np.diff(time)[frame[1:] > 0])  # those between frames of one episode
+        steps.append(np.diff(time)[frame[1:] > 0])  # steps within an episode
         _put(index.timestamp, file, time)
         _put(index.task, file, task.astype(np.int64))
     _check_rate(source, np.concatenate(steps))
@@ -58,15 +58,15 @@ def read_index(source: Source) -> Index:
 
 
 def read_vectors(source: Source, feature: str) -> np.ndarray:
-    """One vector feature of all frames, [N, D] float32; 0 for a frame that is not read.
+    """One vector feature of all frames, [N, D] float32; 0 for frames that are not read.
 
     Raises:
-        AegisError: a file that is missing or damaged, vectors of another size, or numbers that are
-            not finite.
+        AegisError: a file is missing or damaged, vectors have another size, or numbers are not
+            finite.
     """
     size, feature = source.dataset.size(feature), source.dataset.own(feature)
     vectors = np.zeros((source.dataset.info.frames, size), np.float32)
-    # All files are read before anything is said, so that the error can name every bad episode.
+    # All files are read first, so that the error can name every bad episode.
     bad = list[tuple[DataFile, np.ndarray]]()
     for file in source.data:
         rows = _matrix(_read(file, feature), size, feature, file.path)
@@ -82,10 +82,10 @@ def read_vectors(source: Source, feature: str) -> np.ndarray:
 def _not_finite(
     source: Source, feature: str, bad: Sequence[tuple[DataFile, np.ndarray]]
 ) -> AegisError:
-    """The error for values that are not finite, with all episodes that have such, not the first.
+    """The error for values that are not finite; it lists all episodes that have any.
 
     Args:
-        bad: files, each with the places of such rows among those that are read of it.
+        bad: files, each with the indices of such rows among those that are read.
     """
     episodes = set[int]()
     for file, places in bad:
@@ -104,8 +104,8 @@ def _not_finite(
 
 
 def _put(target: np.ndarray, file: DataFile, values: np.ndarray) -> None:
-    """Write what was read of a file's rows to the places of their frames."""
-    done = 0  # values that have been written
+    """Write the values of a file's rows to the indices of their frames."""
+    done = 0  # values written so far
     for rows in file.rows:
         places = slice(rows.first_frame, rows.first_frame + rows.count)
         target[places] = values[done : done + rows.count]
@@ -113,14 +113,14 @@ def _put(target: np.ndarray, file: DataFile, values: np.ndarray) -> None:
 
 
 def _rows_of(file: DataFile) -> np.ndarray:
-    """The numbers of the rows that are read [n] int64."""
+    """The numbers [n] int64 of the rows that are read."""
     return np.concatenate([np.arange(rows.first, rows.first + rows.count) for rows in file.rows])
 
 
 def _episodes_at(source: Source, file: DataFile, places: np.ndarray) -> set[int]:
-    """The episodes of a file's rows, by their places [n] among those that are read."""
+    """The episodes of a file's rows, given by their indices [n] among those that are read."""
     ends = np.cumsum([source.dataset.episodes[number].length for number in file.episodes])
-    # "right", since a place that equals the end of one episode is the first of the next.
+    # "right", since the end of one episode is the first index of the next.
     within = np.searchsorted(ends, places, side="right")
     return {file.episodes[i] for i in np.unique(within)}
 
@@ -139,7 +139,7 @@ def _numbers(file: DataFile, name: str) -> np.ndarray:
 
 
 def _check_order(source: Source, file: DataFile, frame: np.ndarray) -> None:
-    """Raise AegisError unless the rows of each episode are its frames 0, 1, 2 and so on."""
+    """Raise AegisError unless the rows of each episode are its frames 0, 1, 2, ... in order."""
     lengths = [source.dataset.episodes[number].length for number in file.episodes]
     wanted = np.concatenate([np.arange(length) for length in lengths])
     wrong = np.flatnonzero(frame != wanted)
@@ -155,13 +155,13 @@ def _check_order(source: Source, file: DataFile, frame: np.ndarray) -> None:
 
 
 def _check_rate(source: Source, steps: np.ndarray) -> None:
-    """Raise AegisError where the usual step between frames, in seconds, is not one of `fps`.
+    """Raise AegisError if the median step between frames, in seconds, does not match `fps`.
 
-    LeRobot refuses each step that is off by 0.1 ms, and so also a recording that has a gap.
+    LeRobot refuses any step that is off by 0.1 ms, and so also a recording with a gap.
     """
     if not len(steps):
         return
-    # The median, because single gaps are no other rate.
+    # The median, because single gaps do not change the rate.
     fps, step = source.dataset.info.fps, float(np.median(steps))
     if abs(step - 1 / fps) > _RATE_TOLERANCE / fps:
         folder = source.dataset.folder
@@ -199,6 +199,6 @@ def _flat(array: Any, size: int, feature: str, path: Path) -> np.ndarray:
             f"{size}, as {layout.INFO} and the files before say",
             "give a dataset of one robot: features keep their size",
         )
-    # Not `.values`, which also has what lies before and behind a slice.
+    # Not `.values`, which also has what lies before and after a slice.
     flat = array.flatten() if pa.types.is_nested(kind) else array
-    return flat.to_numpy(zero_copy_only=False)  # truth values are bits, and have to be copied
+    return flat.to_numpy(zero_copy_only=False)  # booleans are bits, and have to be copied

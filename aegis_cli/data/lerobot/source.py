@@ -1,9 +1,9 @@
-"""What is read of a dataset: which of its episodes, the files that hold them, and their digest.
+"""What is read of a dataset: the episodes, the files that hold them, and their digest.
 
-The meta folder of v3.0 names the file of each episode's rows, too. It is not asked: LeRobot's
-converter from v2.1 named the file before it for the first episode of every file, as long as it was
-older than 0.5.0, and many datasets on the hub were converted by it. A file's own rows say which
-episodes it holds, and LeRobot itself reads all the files there are.
+The meta folder of v3.0 also names the file of each episode's rows. It is not used: before LeRobot
+0.5.0, the converter from v2.1 named the previous file for the first episode of every file, and many
+datasets on the hub were converted with it. A file's own rows show which episodes it holds, and
+LeRobot itself reads all existing files.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ WITHOUT = f"get the dataset again, or leave those episodes out ({CHOOSING})"
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a data file, one after the other, and the dataset's frames that they are.
+    """Consecutive rows of a data file, and the dataset's frames that they hold.
 
     Attributes:
         first: number of the first row in its file.
-        first_frame: number of its frame in the dataset.
-        count: how many rows there are.
+        first_frame: number of that row's frame in the dataset.
+        count: number of rows.
     """
 
     first: int
@@ -47,7 +47,7 @@ class DataFile:
 
     Attributes:
         episodes: their numbers, in the order of its rows.
-        rows: their rows; those of episodes that follow each other are together.
+        rows: their rows; those of consecutive episodes are joined.
     """
 
     path: Path
@@ -57,12 +57,12 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Source:
-    """Some of a dataset's episodes, or all of them, and the data files that they are in.
+    """Some or all of a dataset's episodes, and the data files that hold them.
 
-    Frames and episodes keep the numbers that they have in the whole dataset.
+    Frames and episodes keep their numbers in the whole dataset.
 
     Attributes:
-        episodes: numbers of the episodes that are read, rising.
+        episodes: numbers of the episodes that are read, in ascending order.
         data: the files, in the order of their first episodes.
     """
 
@@ -72,21 +72,20 @@ class Source:
 
     @cached_property
     def frames(self) -> int:
-        """How many frames are read."""
+        """The number of frames that are read."""
         return sum(self.dataset.episodes[number].length for number in self.episodes)
 
 
 def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
-    """Find the rows of these episodes, or of all of them for None.
+    """Find the rows of these episodes, or of all for None.
 
-    Files that hold none of them need not be there.
+    Files that hold none of them may be missing.
 
     Raises:
-        AegisError: a file that is missing or damaged, or rows that are not those of which the meta
-            folder speaks.
+        AegisError: a file is missing or damaged, or its rows contradict the meta folder.
     """
     wanted = range(len(dataset.episodes)) if episodes is None else sorted(episodes)
-    # [E + 1] of the whole dataset: frames keep their numbers, whatever is read.
+    # [E + 1], for the whole dataset: frames keep their numbers, whatever is read.
     starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)])
     asked, seen = set(wanted), dict[int, Path]()
     found = []
@@ -105,13 +104,13 @@ def find(dataset: Dataset, episodes: Sequence[int] | None = None) -> Source:
     for number in wanted:
         if number not in seen:
             raise _missing(dataset, number)
-    # Files that are found need not lie in the order of their episodes.
+    # The files need not be in the order of their episodes.
     found.sort(key=lambda file: file.rows[0].first_frame)
     return Source(dataset, tuple(wanted), tuple(found))
 
 
 def _data_files(dataset: Dataset, episodes: Sequence[int] | None) -> list[Path]:
-    """The files that may hold these episodes; of an episode's own file, its name says it."""
+    """The files that may hold these episodes; files of single episodes are known by name."""
     if episodes is None or not dataset.info.has_episode_files:
         return layout.data_files(dataset.info, dataset.folder)
     own = {dataset.folder / dataset.episodes[number].data for number in episodes}
@@ -119,10 +118,10 @@ def _data_files(dataset: Dataset, episodes: Sequence[int] | None) -> list[Path]:
 
 
 def _file(dataset: Dataset, path: Path, asked: set[int], starts: np.ndarray) -> DataFile:
-    """The episodes that a file holds, as far as they are asked for."""
+    """The episodes in a file that are in `asked`."""
     episode_of = _episode_of_rows(path)
     changes = np.flatnonzero(np.diff(episode_of)) + 1
-    ends = [*changes.tolist(), len(episode_of)]  # of each run of rows that are of one episode
+    ends = [*changes.tolist(), len(episode_of)]  # of each run of rows of one episode
     numbers, rows, first = list[int](), list[Rows](), 0
     for end in ends if len(episode_of) else []:  # a file may be empty
         number = int(episode_of[first])
@@ -152,7 +151,7 @@ def column(file: Any, path: Path, name: str) -> Any:
     """A column of an open parquet file.
 
     Raises:
-        AegisError: the file has none of that name.
+        AegisError: the file has no column of that name.
     """
     if name not in file.schema_arrow.names:
         raise AegisError(
@@ -167,7 +166,7 @@ def numbers(column: Any, name: str, path: Path) -> np.ndarray:
     """A column's numbers [n] float64, which is exact for any index.
 
     Raises:
-        AegisError: a cell is empty, or no finite number.
+        AegisError: a cell is empty, or not a finite number.
     """
     with layout.damaged(path):
         if column.null_count:
@@ -189,13 +188,14 @@ def _check_length(dataset: Dataset, path: Path, number: int, rows: int) -> None:
 
 
 def _together(rows: Sequence[Rows]) -> tuple[Rows, ...]:
-    """The same rows; those that go on where the ones before end, in the file and in the dataset."""
+    """Join consecutive rows: those that continue the previous ones in both file and dataset."""
     joined = list[Rows]()
     for own in rows:
         if joined:
             last = joined[-1]
             goes_on = (last.first + last.count, last.first_frame + last.count)
-            # In both: a file may skip an episode of the dataset, or hold one that is not read.
+            # Both have to hold: a file may skip an episode of the dataset, or hold one that is not
+            # read.
             if goes_on == (own.first, own.first_frame):
                 joined[-1] = Rows(last.first, last.first_frame, last.count + own.count)
                 continue
@@ -216,13 +216,13 @@ def _missing(dataset: Dataset, number: int) -> AegisError:
 
 
 def digests(source: Source, cameras: Sequence[str], on_event: OnEvent = ignore) -> list[str]:
-    """A digest per camera: sha256 over its name and every file that training on it reads."""
+    """A digest per camera: sha256 over its name and every file that is read when training on it."""
     dataset = source.dataset
     read = [dataset.episodes[number] for number in source.episodes]
     shared = {layout.INFO}
     for path in [*dataset.table_files, *(file.path for file in source.data)]:
         shared.add(path.relative_to(dataset.folder))
-    # A camera of embedded images has no clips: its pictures are in the files of rows.
+    # A camera with embedded images has no clips: its pictures are in the row files.
     clips = {
         camera: {episode.clips[camera].file for episode in read if camera in episode.clips}
         for camera in cameras
@@ -237,10 +237,10 @@ def digests(source: Source, cameras: Sequence[str], on_event: OnEvent = ignore) 
 
 
 def joined_digest(digests: Sequence[str], of: str) -> str:
-    """sha256 of several things that are learned from together; a single one's own digest.
+    """sha256 over the digests of several parts; a single part keeps its own digest.
 
     Args:
-        of: what they are, `cameras` or `sets`; so that two of either never have one digest.
+        of: what they are, `cameras` or `sets`, so that the digests of the two never coincide.
     """
     if len(digests) == 1:
         return digests[0]

@@ -1,4 +1,4 @@
-"""What a LeRobot dataset is, and a contact sheet of it."""
+"""A summary of a LeRobot dataset, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from aegis_cli.data.lerobot.dataset import Dataset
 
 @dataclass(frozen=True)
 class FeatureInfo:
-    """One feature, `components` naming its numbers where the dataset does.
+    """One feature; `components` has the names of its numbers, if the dataset has any.
 
-    `statistics` has a number a component, or a camera's channel in [0, 1]; empty where the dataset
-    holds none, and for an array, which has no components.
+    `statistics` has one number per component, or per channel of a camera in [0, 1]; it is empty if
+    the dataset has none, and for an array, which has no components.
     """
 
     name: str
@@ -32,7 +32,7 @@ class FeatureInfo:
 
 
 def dataset_facts(found: Dataset) -> dict[str, Any]:
-    """What `aegis inspect` says first."""
+    """The facts that `aegis inspect` shows first."""
     info, lengths = found.info, [episode.length for episode in found.episodes]
     return {
         "version": info.version,
@@ -54,14 +54,14 @@ def dataset_features(found: Dataset) -> tuple[FeatureInfo, ...]:
     stats = found.stats or {}
     features = []
     for name, own in found.info.features.items():
-        # Of an array LeRobot has statistics of every single number.
+        # For an array LeRobot has statistics of every single number.
         figures = _figures(found, stats.get(name, {})) if own.components else {}
         features.append(FeatureInfo(name, own.dtype, own.shape, own.components, figures))
     return tuple(features)
 
 
 def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
-    """Each statistic's numbers in a row: a camera's have the shape [3, 1, 1]."""
+    """Each statistic's numbers, flattened: a camera's have the shape [3, 1, 1]."""
     figures = {}
     with layout.damaged(found.folder / layout.STATS):
         for name, value in stats.items():
@@ -70,19 +70,19 @@ def _figures(found: Dataset, stats: Mapping[str, Any]) -> dict[str, tuple[float,
 
 
 def on_sheet(found: Dataset) -> list[int]:
-    """The numbers of the episodes that `save_sheet` shows, spread over the dataset."""
+    """The numbers of the episodes that `save_sheet` shows, spread evenly over the dataset."""
     spread = np.linspace(0, len(found.episodes) - 1, media.SHEET_EPISODES)
-    # Of fewer episodes than there is room for, each is found several times.
+    # If there are fewer episodes than places, some are found several times.
     return np.unique(spread.round().astype(int)).tolist()
 
 
 def save_sheet(folder: Path, out: Path) -> None:
     """Write a PNG with the first and last frame of some episodes, from every camera.
 
-    Nothing is read of other episodes.
+    Other episodes are not read.
 
     Raises:
-        AegisError: a dataset that is not sound or has no camera, or a path that cannot be written.
+        AegisError: the dataset is invalid or has no camera, or the path cannot be written.
     """
     media.check_sheet(out)
     found = dataset.load(folder)
@@ -95,7 +95,7 @@ def save_sheet(folder: Path, out: Path) -> None:
     index = rows.read_index(read)
     starts = np.cumsum([0, *(episode.length for episode in found.episodes)])
     spans = [(int(starts[e]), int(starts[e + 1]) - 1) for e in shown]  # first and last frame
-    # A set, because an episode of one frame begins and ends with it; `pick` wants them to rise.
+    # A set, because an episode of one frame starts and ends with it; `pick` needs them sorted.
     ends = sorted({*itertools.chain(*spans)})
     pictures = {}
     for camera in found.info.cameras:

@@ -14,19 +14,19 @@ from aegis_cli.data.lerobot import layout
 
 
 class Sink:
-    """A parquet file that grows by tables.
+    """A parquet file that tables are appended to.
 
-    Each table is a row group of its own, so that an episode can be read alone.
+    Each table is its own row group, so that an episode can be read separately.
     """
 
     def __init__(self, path: Path) -> None:
         import pyarrow as pa
 
-        # The file is opened here and not by the writer, so that `size` can ask where it is.
+        # The file is opened here and not by the writer, so that `size` can query its position.
         self._file, self._writer = pa.OSFile(str(path), "wb"), None
 
     def write(self, table: Any) -> None:
-        """Append a table; the first decides the columns."""
+        """Append a table; the first one determines the columns."""
         from pyarrow import parquet
 
         if self._writer is None:
@@ -36,7 +36,7 @@ class Sink:
         self._writer.write_table(table, row_group_size=len(table))
 
     def size(self) -> int:
-        """Bytes that have been written."""
+        """Bytes written so far."""
         return self._file.tell()
 
     def close(self) -> None:
@@ -50,7 +50,7 @@ def of_frames(vectors: Mapping[str, np.ndarray], pictures: Mapping[str, Sequence
     """An episode's table: vectors [T, D] as lists, [T] and [T, 1] as numbers, pictures as bytes."""
     import pyarrow as pa
 
-    # What every dataset has comes last, as in LeRobot's own files.
+    # The common columns come last, as in LeRobot's own files.
     columns = {
         name: _vector(rows) for name, rows in vectors.items() if name not in layout.INDEX_FEATURES
     }
@@ -61,14 +61,14 @@ def of_frames(vectors: Mapping[str, np.ndarray], pictures: Mapping[str, Sequence
     for name, kind in layout.INDEX_FEATURES.items():
         columns[name] = pa.array(vectors[name].astype(kind))
     table = pa.table(columns)
-    # By this `datasets` knows which columns are images; Arrow's own types do not tell.
+    # This tells `datasets` which columns are images; Arrow's types do not show it.
     features = {field.name: _hf_feature(field.type) for field in table.schema}
     described = json.dumps({"info": {"features": features}})
     return table.replace_schema_metadata({"huggingface": described})
 
 
 def _vector(rows: np.ndarray) -> Any:
-    """Rows [T, D] as lists of D numbers, or as numbers where D is 1, as LeRobot has them."""
+    """Rows [T, D] as lists of D numbers, or as numbers if D is 1, as in LeRobot."""
     import pyarrow as pa
 
     flat, width = pa.array(rows.astype(np.float32).ravel()), rows.shape[1]
@@ -76,7 +76,7 @@ def _vector(rows: np.ndarray) -> Any:
 
 
 def _hf_feature(kind: Any) -> dict[str, Any]:
-    """How `datasets` names an Arrow type."""
+    """The description of an Arrow type for `datasets`."""
     import pyarrow as pa
 
     if pa.types.is_struct(kind):
@@ -87,7 +87,7 @@ def _hf_feature(kind: Any) -> dict[str, Any]:
             "length": kind.list_size,
             "_type": "Sequence",
         }
-    name = "float32" if str(kind) == "float" else str(kind)  # Arrow's own name of that one
+    name = "float32" if str(kind) == "float" else str(kind)  # Arrow calls it float
     return {"dtype": name, "_type": "Value"}
 
 
@@ -113,7 +113,7 @@ def save_tasks(path: Path, tasks: Sequence[str]) -> None:
         _pandas_column("task_index", "int64", "int64"),
         _pandas_column("task", "unicode", "object"),
     ]
-    # What pandas itself puts into the file of such a frame: it reads its index back by it.
+    # The metadata that pandas itself writes for such a frame, and uses to restore the index.
     header = {
         **_pandas_column("", "unicode", "object"),
         "name": None,
@@ -135,7 +135,7 @@ def save_tasks(path: Path, tasks: Sequence[str]) -> None:
 
 
 def _pandas_column(name: str, kind: str, numpy_type: str) -> dict[str, Any]:
-    """How pandas describes a column."""
+    """The description of a column for pandas."""
     return {
         "name": name,
         "field_name": name,

@@ -1,4 +1,4 @@
-"""The meta folder of formats v2.0 and v2.1: JSON lines. Each episode has files of its own."""
+"""The meta folder of formats v2.0 and v2.1: JSON lines. Each episode has its own files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aegis_cli.data.lerobot import layout, statistics
 from aegis_cli.data.lerobot.layout import Clip, EpisodeIndex, Info
 
 TASKS, EPISODES = Path("meta/tasks.jsonl"), Path("meta/episodes.jsonl")
-_STATS = Path("meta/episodes_stats.jsonl")  # of v2.1; v2.0 has the file of v3.0
+_STATS = Path("meta/episodes_stats.jsonl")  # in v2.1; v2.0 has the same file as v3.0
 
 
 def table_files(folder: Path) -> list[Path]:
@@ -25,7 +25,7 @@ def read_tasks(folder: Path) -> tuple[str, ...]:
     """The texts of the tasks, by their numbers.
 
     Raises:
-        AegisError: a file that is missing or damaged.
+        AegisError: a file is missing or damaged.
     """
     with layout.damaged(folder / TASKS):
         rows = ((row["task_index"], row["task"]) for row in _lines(folder / TASKS))
@@ -33,10 +33,10 @@ def read_tasks(folder: Path) -> tuple[str, ...]:
 
 
 def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
-    """Where each episode is, by its number.
+    """The location of each episode, in order of their numbers.
 
     Raises:
-        AegisError: a file that is missing or damaged, or counts that do not agree.
+        AegisError: a file is missing or damaged, or counts do not agree.
     """
     with layout.damaged(folder / EPISODES):
         rows = ((row["episode_index"], _episode(row, info)) for row in _lines(folder / EPISODES))
@@ -46,10 +46,10 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
 
 
 def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
-    """The statistics of each feature, joined from those of the episodes; None where there are none.
+    """The statistics of each feature, merged from those of the episodes; None if there are none.
 
     Raises:
-        AegisError: a file that is damaged.
+        AegisError: a file is damaged.
     """
     if not (folder / _STATS).is_file():
         return layout.read_stats(folder)
@@ -57,9 +57,9 @@ def read_stats(folder: Path) -> dict[str, dict[str, Any]] | None:
     with layout.damaged(folder / _STATS):
         for row in _lines(folder / _STATS):
             for feature, figures in row["stats"].items():
-                # Episode by episode: all of them at once would be held in memory.
+                # Episode by episode, so that they are not all held in memory.
                 own = {name: np.asarray(value, np.float64) for name, value in figures.items()}
-                if not np.all(own["count"] > 0):  # NaN, which `null` becomes, is not either
+                if not np.all(own["count"] > 0):  # also refuses NaN, which `null` becomes
                     where = f"'{feature}' in episode {row.get('episode_index')}"
                     raise ValueError(f"the count of {where} is {figures['count']}, not above 0")
                 known = [joined[feature], own] if feature in joined else [own]
@@ -72,19 +72,19 @@ def _episode(row: Mapping[str, Any], info: Info) -> EpisodeIndex:
     if length < 1:
         raise ValueError(f"episode {row['episode_index']} has {length} frames")
     place = layout.episode_place(info, int(row["episode_index"]))
-    # Each video is of one episode alone, and ends with its file.
+    # Each video holds one episode only, which ends with its file.
     clips = {key: Clip(layout.video_file(info, key, place), 0.0) for key in info.videos}
     return EpisodeIndex(length, layout.data_file(info, place), clips, layout.tasks_of(row))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects of a file that has one a line, one after the other.
+    """The objects of a file with one JSON object per line.
 
     Raises:
-        AegisError: a file that is missing.
-        ValueError: a line is no JSON.
+        AegisError: the file is missing.
+        ValueError: a line is not JSON.
     """
-    # Only what JSON takes for the end of a line ends one: an instruction may hold others.
+    # Split only at \n: an instruction may contain other line separators.
     with files.reading(path, layout.AGAIN), open(path, "rb") as file:
         for line in file:
             if line.strip():

@@ -23,7 +23,7 @@ def table_files(folder: Path) -> list[Path]:
 def read_tasks(folder: Path) -> tuple[str, ...]:
     """The texts of the tasks, by their numbers.
 
-    pandas writes a text as the table's index: under `task`, or unnamed in older files.
+    pandas writes the texts as the table's index: named `task`, or unnamed in older files.
     """
     path = folder / TASKS
     with layout.reading_parquet(path):
@@ -34,11 +34,11 @@ def read_tasks(folder: Path) -> tuple[str, ...]:
 
 
 def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
-    """Where each episode is, by its number.
+    """The location of each episode, in order of their numbers.
 
     Raises:
-        AegisError: a file that is missing or damaged, counts that do not agree, or an episode that
-            does not begin where the one before ends.
+        AegisError: a file is missing or damaged, counts do not agree, or an episode does not begin
+            where the previous one ends.
     """
     where, paths = folder / _EPISODES, _episode_files(folder)
     if not paths:
@@ -51,7 +51,7 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     for path in paths:
         with layout.reading_parquet(path):
             file = layout.open_parquet(path)
-            # Each episode's statistics are most of the file, and nobody asks for them here.
+            # The episodes' statistics are most of the file, and are not needed here.
             names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
             rows += file.read(columns=names).to_pylist()
     with layout.damaged(where):
@@ -89,7 +89,7 @@ def _clip(row: Mapping[str, Any], key: str, info: Info) -> Clip:
     start_s = float(row[f"videos/{key}/from_timestamp"])
     if not math.isfinite(start_s):
         raise ValueError(f"a video of episode {row['episode_index']} begins at {start_s} s")
-    # The end is a help alone (`Clip`): a dataset without one, or with a wrong one, can be read.
+    # The end is optional (`Clip`): a dataset without one, or with a wrong one, can be read.
     end_s = row.get(f"videos/{key}/to_timestamp")
     told = isinstance(end_s, int | float) and math.isfinite(end_s) and end_s > start_s
     return Clip(path, start_s, float(end_s) if told else math.inf)

@@ -1,4 +1,4 @@
-"""Frames out of mp4 files, by their times."""
+"""Frames of mp4 files, by time."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def read(path: Path, times: Sequence[float], tolerance: float) -> Iterator[np.nd
     """The frames [H, W, 3] uint8 of a video that are closest to `times`.
 
     Args:
-        times: seconds, rising.
-        tolerance: seconds that a frame may be off its time.
+        times: in seconds, ascending.
+        tolerance: how many seconds a frame may differ from its time.
 
     Raises:
-        AegisError: no file, a damaged one, or one without a frame at a time.
+        AegisError: the file is missing or damaged, or has no frame at one of the times.
     """
     with _reading(path), _open(path) as container:
         yield from _closest(container, path, times, tolerance)
 
 
 class Reader:
-    """Frames of many videos in any order, of which the last few that were read stay open.
+    """Frames of many videos in any order; the most recently read videos stay open.
 
-    Not for several threads at once.
+    Not thread-safe.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Reader:
         """The frame [H, W, 3] uint8 closest to `time`, in seconds; see `read` for the rest."""
         with _reading(path):
             container = self._containers.pop(path, None) or self._opened(path)
-            self._containers[path] = container  # the last one in the order
+            self._containers[path] = container  # now the most recent
             if len(self._containers) > _KEPT_OPEN:
                 longest_unread = next(iter(self._containers))
                 self._containers.pop(longest_unread).close()
@@ -53,7 +53,7 @@ class Reader:
     def _opened(path: Path) -> Any:
         container = _open(path)
         for stream in container.streams.video:
-            stream.thread_count = 1  # a team for each open video would be more than the cores bear
+            stream.thread_count = 1  # several threads per open video would overload the cores
         return container
 
 
@@ -66,7 +66,7 @@ def _open(path: Path) -> Any:
 
 @contextmanager
 def _reading(path: Path) -> Generator[None]:
-    """Raise AegisError for a video that is missing or damaged."""
+    """Raise AegisError for a missing or damaged video."""
     import av
 
     try:
@@ -85,14 +85,14 @@ def _reading(path: Path) -> Generator[None]:
 def _closest(
     container: Any, path: Path, times: Sequence[float], tolerance: float
 ) -> Iterator[np.ndarray]:
-    """The frames [H, W, 3] uint8 at rising times; see `read`.
+    """The frames [H, W, 3] uint8 at ascending times; see `read`.
 
-    The video is decoded once, from front to back: of all its frames no more than two are held.
+    The video is decoded once, from front to back; at most two of its frames are held.
     """
     if not container.streams.video:
         raise AegisError(f"no video in '{path}'", "a file with a video stream", layout.AGAIN)
     decoded = _decoded(container, times[0], tolerance)
-    before = after = next(decoded, None)  # the frames on both sides of a time, each with its own
+    before = after = next(decoded, None)  # the (time, frame) pairs before and after a time
     for time in times:
         while after is not None and after[0] < time:
             before, after = after, next(decoded, None)
@@ -109,15 +109,15 @@ def _closest(
 
 
 def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[float, Any]]:
-    """Times and frames from one at `first`, or before it, on.
+    """Times and frames, starting at or before `first`.
 
-    A seek leads to a key frame. Of an open group of pictures (HEVC's usual ones) those that are
-    shown before their key frame refer to the group before, and are lost where decoding begins with
-    it: then further back.
+    A seek leads to a key frame. In an open group of pictures (usual in HEVC), frames shown before
+    their key frame refer to the previous group, and are lost if decoding starts at that key frame:
+    then seek further back.
     """
     stream, back = container.streams.video[0], tolerance
     while True:
-        start = max(0, round((first - back) / stream.time_base) - 1)  # a frame's room for rounding
+        start = max(0, round((first - back) / stream.time_base) - 1)  # one tick for rounding
         container.seek(start, stream=stream)
         decoded = _timed(container, stream)
         begun = next(decoded, None)
@@ -130,7 +130,7 @@ def _decoded(container: Any, first: float, tolerance: float) -> Iterator[tuple[f
 
 
 def _timed(container: Any, stream: Any) -> Iterator[tuple[float, Any]]:
-    """The frames from where the container stands, with their times in seconds."""
+    """The frames from the container's current position on, with their times in seconds."""
     for frame in container.decode(stream):
-        if frame.pts is not None:  # one that has none belongs to no time
+        if frame.pts is not None:  # a frame without pts has no time
             yield float(frame.pts * stream.time_base), frame

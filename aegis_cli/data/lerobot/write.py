@@ -1,4 +1,4 @@
-"""Write episodes as a LeRobot dataset v3.0: aside, in one pass, and renamed when it is whole."""
+"""Write episodes as a LeRobot dataset v3.0: aside, in one pass, and renamed once complete."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.data.lerobot.statistics import Statistics
 
 _MB = 1024**2
 _BUFFERED = 100  # episodes whose rows are written together
-# As LeRobot writes them: whoever wants one frame decodes at most two.
+# As in LeRobot: reading one frame decodes at most two.
 _KEYFRAME_EVERY = 2
 
 
@@ -40,7 +40,7 @@ class NewEpisode:
 class Spec:
     """What all episodes have in common.
 
-    `as_video` keeps pictures as H.264, which is smaller and loses something.
+    `as_video` stores pictures as H.264, which is smaller but lossy.
     """
 
     fps: float
@@ -60,10 +60,10 @@ class Limits:
 
 
 def check_new(folder: Path) -> None:
-    """Raise AegisError unless a dataset can be written to `folder`; call it before the work."""
+    """Raise AegisError unless a dataset can be written to `folder`; to be called beforehand."""
     layout.require_pyarrow()
     check_utf8(folder, "choose another --out")
-    if not folder.name:  # it is written beside itself under another name
+    if not folder.name:  # it is first written beside `folder` under another name
         raise AegisError(
             f"'{folder}', which names no folder", "a folder's name", "choose another --out"
         )
@@ -91,10 +91,10 @@ def write(
 ) -> None:
     """Write a dataset of one or more episodes; equal episodes give equal bytes.
 
-    One episode is held in memory at a time. A link is followed, and stays.
+    One episode is held in memory at a time. A symbolic link is followed, and kept.
 
     Raises:
-        AegisError: a folder that is not new, or a disk that cannot be written.
+        AegisError: the folder is not new, or the disk cannot be written.
     """
     check_new(folder)
     folder = followed(folder)
@@ -119,7 +119,7 @@ class _Sink(Protocol):
 class _Files:
     """Files that are filled one after the other.
 
-    The next one begins where the open one would grow past the limit.
+    The next one is started when the open one would exceed the limit.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class _Files:
     def make_room(self, rows: int) -> tuple[int, int]:
         """(chunk, file) of the file that the next `rows` rows go to.
 
-        Their size is estimated by the mean size of the rows before them.
+        Their size is estimated from the mean size of the file's rows so far.
         """
         if self._sink is not None:
             expected = self._sink.size() * (1 + rows / self._rows)
@@ -151,7 +151,7 @@ class _Files:
         return self.place
 
     def write(self, content: Any, rows: int) -> None:
-        """Append what has so many rows; `make_room` is asked before."""
+        """Append content of `rows` rows, after a call of `make_room`."""
         if self._sink is None:
             path = self._path(*self.place)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,14 +160,14 @@ class _Files:
         self._rows += rows
 
     def close(self) -> None:
-        """Close the open file; what is written afterwards begins the next one."""
+        """Close the open file; later writes start the next one."""
         if self._sink is not None:
             self._sink.close()
             self._sink = None
 
 
 class _Writer:
-    """Writes the episodes of one dataset, and the meta folder when all are written."""
+    """Writes the episodes of one dataset, and at the end the meta folder."""
 
     def __init__(self, folder: Path, spec: Spec, limits: Limits) -> None:
         self._folder, self._spec, self._limits = folder, spec, limits
@@ -203,7 +203,7 @@ class _Writer:
                 self._add(episode)
             self._flush()
         finally:
-            # Also after an error, after which `folder_aside` removes what is here.
+            # Also after an error; `folder_aside` then removes the files.
             for files in (self._data, self._episodes, *self._videos.values()):
                 files.close()
         self._save_meta()
@@ -217,7 +217,7 @@ class _Writer:
         vectors = {layout.STATE: episode.state, layout.ACTION: episode.actions, **columns}
         stats = {name: statistics.of_vectors(rows) for name, rows in vectors.items()}
         stats |= {camera: statistics.of_images(frames) for camera, frames in pictured.items()}
-        # A row of the table of episodes: where the parts of this one are, and its statistics.
+        # A row of the table of episodes: the location of this one's parts, and its statistics.
         row: dict[str, Any] = {
             "episode_index": self._count,
             "tasks": [episode.instruction],
@@ -225,7 +225,7 @@ class _Writer:
         }
         row["data/chunk_index"], row["data/file_index"] = self._data.make_room(length)
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + length}
-        embedded: dict[str, list[bytes]] = {}  # pictures in the table, where there is no video
+        embedded: dict[str, list[bytes]] = {}  # pictures in the table, if not stored as video
         for camera, frames in pictured.items():
             if self._spec.as_video:
                 row |= self._append_video(camera, frames)
@@ -235,7 +235,7 @@ class _Writer:
         for name, own in stats.items():
             for figure, value in own.items():
                 row[f"stats/{name}/{figure}"] = value.tolist()
-            # Merged as they come: the whole dataset's statistics hold no episode in memory.
+            # Merged incrementally, so that no episode is kept in memory.
             known = self._stats.get(name)
             self._stats[name] = own if known is None else statistics.merge([known, own])
         self._count, self._frames = self._count + 1, self._frames + length
@@ -255,7 +255,7 @@ class _Writer:
         }
 
     def _append_video(self, camera: str, frames: np.ndarray) -> dict[str, Any]:
-        """Write an episode's frames, and say where they are, in seconds from their file's start."""
+        """Write an episode's frames; return their location, in seconds from the file's start."""
         files = self._videos.setdefault(camera, self._video(camera))
         chunk, file = files.make_room(len(frames))
         first = files.filled
@@ -272,7 +272,7 @@ class _Writer:
         if not self._rows:
             return
         chunk, file = self._episodes.make_room(len(self._rows))
-        # A row says in which table it stands itself, as LeRobot's do.
+        # A row also names the table file that it is in, as in LeRobot.
         own_place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
         rows = [row | own_place for row in self._rows]
         self._episodes.write(tables.of_rows(rows), len(rows))
@@ -290,7 +290,7 @@ class _Writer:
         spec, limits = self._spec, self._limits
         return {
             "codebase_version": layout.VERSION,
-            # LeRobot's own datasets have whole numbers, and are read by others than us.
+            # Other readers may expect whole numbers, as in LeRobot's own datasets.
             "fps": int(spec.fps) if spec.fps == int(spec.fps) else spec.fps,
             "features": self._features(),
             "total_episodes": self._count,
@@ -328,7 +328,7 @@ class _Writer:
 
 
 def _video_info(shape: tuple[int, ...], fps: float) -> dict[str, Any]:
-    """What LeRobot notes of the videos of a camera whose frames have the shape (H, W, 3)."""
+    """LeRobot's description of the videos of a camera whose frames have the shape (H, W, 3)."""
     return {
         "video.height": shape[0],
         "video.width": shape[1],

@@ -17,16 +17,16 @@ if TYPE_CHECKING:  # a recipe may import the names without torch
 def load(
     name: str, image_size: int, cache: Path, on_event: OnEvent = ignore
 ) -> tuple[StreamTask, ...]:
-    """The tasks of a stream in their order; pictures that `cache` lacks are made and kept there.
+    """The tasks of a stream in order; pictures missing in `cache` are made and stored there.
 
     Args:
         name: one of `names.STREAMS`.
-        image_size: side in pixels that the images are given in.
-        cache: a folder, which is made if it is not there.
+        image_size: side in pixels of the returned images.
+        cache: a folder, which is created if missing.
 
     Raises:
-        AegisError: no such stream, what its pictures are made with is missing, or the cache lacks
-            some and cannot be written to.
+        AegisError: there is no such stream, a package for its pictures is missing, or pictures are
+            missing and the cache cannot be written.
     """
     from aegis_cli.data.streams import embedded  # loads torch
 
@@ -37,7 +37,7 @@ def load(
 
 
 def _make_cache(folder: Path) -> None:
-    """Make the folder of pictures, or say that another can be chosen."""
+    """Create the folder of pictures, or raise an error that says how to choose another."""
     try:
         files.make_folder(folder)
         files.check_writable(folder / "pictures")
@@ -47,12 +47,12 @@ def _make_cache(folder: Path) -> None:
 
 
 def edition(name: str) -> list[dict[str, object]]:
-    """The settings that a stream's pictures and words follow from, as plain JSON, per task.
+    """The settings that determine a stream's pictures and words, as plain JSON, per task.
 
-    Nothing is drawn or read for it.
+    Nothing is drawn or read.
 
     Raises:
-        AegisError: no such stream.
+        AegisError: there is no such stream.
     """
     from aegis_cli.data.streams import embedded
 

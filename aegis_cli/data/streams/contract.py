@@ -1,4 +1,4 @@
-"""What every task of a stream is: named classes, templates, and labelled images of three parts."""
+"""The contract of a stream's task: named classes, templates, and labelled images of three parts."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from aegis_cli.common.errors import AegisError
 
 @dataclass(frozen=True)
 class Part:
-    """Labelled images, decoded when they are asked for.
+    """Labelled images, decoded on access.
 
     Attributes:
         labels: [N] int64, indices into the task's classes.
-        images: indices [B] int64 -> images [B, S, S, 3] uint8, S the side that the task was loaded
-            for.
+        images: indices [B] int64 -> images [B, S, S, 3] uint8, S being the image size that the task
+            was loaded with.
     """
 
     labels: Tensor
@@ -32,13 +32,12 @@ class StreamTask:
     """One classification task.
 
     Attributes:
-        name: letters, digits and '-'; it is a file's name in runs.
-        classes: distinct names, as the text tower reads them in a template; an image is told among
-            these alone.
-        templates: sentences, each with one "{}" and no other brace; the first is the one that
-            training uses.
-        train, validation, test: parts that share no image; choices are made on validation, figures
-            are of test.
+        name: letters, digits and '-'; it is used as a file name in runs.
+        classes: distinct names, as inserted into a template for the text tower; an image is
+            classified among these only.
+        templates: sentences, each with one "{}" and no other brace; training uses the first.
+        train, validation, test: parts that share no image; choices are made on validation, and
+            figures are reported on test.
     """
 
     name: str
@@ -49,7 +48,7 @@ class StreamTask:
     test: Part
 
     def __post_init__(self) -> None:
-        # Of two classes with one name, no image could be told to be the other's.
+        # Images of two classes with the same name could not be distinguished.
         if len(set(self.classes)) < max(2, len(self.classes)):
             found = f"task '{self.name}' with classes {list(self.classes)}"
             raise AegisError(found, "two or more, all different", "rename them")
@@ -71,13 +70,13 @@ class StreamTask:
 
 
 def has_one_gap(template: str) -> bool:
-    """Whether `str.format` with one class fills the template: any other brace would break it."""
+    """Whether `str.format` with one class fills the template; any other brace would break it."""
     without_gaps = template.replace("{}", "")
     return template.count("{}") == 1 and not set(without_gaps) & set("{}")
 
 
 def _is_labelled(part: Part, classes: int) -> bool:
-    """Whether there are images, and each label is one of so many classes."""
+    """Whether there are images, and each label is one of `classes` classes."""
     if not len(part):
         return False
     return int(part.labels.min()) >= 0 and int(part.labels.max()) < classes

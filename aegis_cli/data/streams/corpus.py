@@ -1,9 +1,9 @@
 """The pre-training corpus of the embedded dual encoder: plain pictures with captions.
 
-They show the stream's kinds of things, but not its looks: what a stream's task teaches is new.
+They show the stream's kinds of things, but in another style: what a stream's task teaches is new.
 
 Each picture shows one kind of thing with some attributes, and a caption states some of them. It is
-true of every picture of its kind whose attributes are the stated ones: those are its positives,
+true of every picture of its kind that has the stated attributes: all of those are its positives,
 whichever picture it was written for.
 """
 
@@ -32,7 +32,7 @@ from aegis_cli.data.streams.names import (
 
 OPENINGS = ("", "a photo of ", "a picture of ")
 UNSAID = -1
-ATTRIBUTES = 2  # that a picture has at most
+ATTRIBUTES = 2  # the most that a picture has
 SPLITS = {"train": 0, "validation": 1}  # one seed stream each
 REPORT_EVERY = 1000
 Painter = Callable[..., np.ndarray]
@@ -43,9 +43,8 @@ class Kind:
     """One kind of picture.
 
     Attributes:
-        attributes: the words of each of its attributes.
-        phrases: what may be said of it; a phrase and the attributes that fill its gaps, in their
-            order.
+        attributes: the possible words of each attribute.
+        phrases: possible captions: a phrase, and the attributes that fill its gaps, in order.
         weight: its share of the corpus.
     """
 
@@ -71,12 +70,12 @@ KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True)
 class Captions:
-    """Everything that can be said, without an opening.
+    """All possible captions, without an opening.
 
     Attributes:
         texts: N phrases with their gaps filled.
-        says: [N, 1 + ATTRIBUTES] int64, the kind and the stated attributes' values; `UNSAID` where
-            none is stated.
+        says: [N, 1 + ATTRIBUTES] int64, the kind and the values of the stated attributes; `UNSAID`
+            for attributes that are not stated.
     """
 
     texts: tuple[str, ...]
@@ -95,7 +94,7 @@ class Corpus:
 
 
 def captions() -> Captions:
-    """All of them, in a fixed order."""
+    """All captions, in a fixed order."""
     texts, stated = [], []
     for number, kind in enumerate(KINDS.values()):
         for text, says in _of_kind(number, kind):
@@ -105,12 +104,12 @@ def captions() -> Captions:
 
 
 def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
-    """Every caption of one kind, with the row of `Captions.says` that goes with it."""
+    """Every caption of one kind, with its row of `Captions.says`."""
     for phrase, slots in kind.phrases:
         choices = [range(len(kind.attributes[slot])) for slot in slots]
         for values in product(*choices):
             says = [number, *[UNSAID] * ATTRIBUTES]
-            words = []  # of the phrase's gaps, which need not be in the attributes' order
+            words = []  # for the phrase's gaps, which may be in another order than the attributes
             for slot, value in zip(slots, values, strict=True):
                 says[1 + slot] = value
                 words.append(kind.attributes[slot][value])
@@ -120,7 +119,7 @@ def _of_kind(number: int, kind: Kind) -> Iterator[tuple[str, list[int]]]:
 def true_of(says: np.ndarray, facts: np.ndarray) -> np.ndarray:
     """Whether a caption is true of a picture: captions [N, A], pictures [B, A] -> [B, N] bool."""
     agrees = says[None] == facts[:, None]  # [B, N, A]
-    # The kind is always stated, so that no caption is true of another kind's picture.
+    # The kind is always stated, so no caption is true of another kind's picture.
     return (agrees | (says[None] == UNSAID)).all(-1)
 
 
@@ -131,10 +130,10 @@ def vocabulary() -> tuple[str, ...]:
 
 
 def render(seed: int, count: int, split: str = "train", on_event: OnEvent = ignore) -> Corpus:
-    """Draw and render `count` pictures; kinds come in turn by their weights, attributes at random.
+    """Draw and render `count` pictures, with kinds drawn by weight and attributes uniformly.
 
     Raises:
-        AegisError: a Pillow without FreeType, or no OpenGL.
+        AegisError: Pillow lacks FreeType, or there is no OpenGL.
     """
     masks.need_freetype()  # before minutes of drawing
     paint, kinds = _painters(), list(KINDS.values())
@@ -146,7 +145,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
         rng = np.random.default_rng([seed, SPLITS[split], i])
         number = rng.choice(len(kinds), p=shares / shares.sum())
         values = [int(rng.integers(len(words))) for words in kinds[number].attributes]
-        facts[i, : 1 + len(values)] = number, *values  # kinds of one attribute leave the last one
+        facts[i, : 1 + len(values)] = number, *values  # with one attribute the last stays UNSAID
         images[i] = paint[number](*values, rng)
         if (i + 1) % REPORT_EVERY == 0 or i + 1 == count:
             on_event(Progress(f"{split} pictures", i + 1, count, "pictures"))
@@ -154,7 +153,7 @@ def render(seed: int, count: int, split: str = "train", on_event: OnEvent = igno
 
 
 def _painters() -> list[Painter]:
-    """In the order of KINDS; imported here, for they need OpenGL."""
+    """The painters in the order of KINDS; imported here, since they need OpenGL."""
     from aegis_cli.data.streams import drawn, rendered, robots
 
     by_name: dict[str, Painter] = {

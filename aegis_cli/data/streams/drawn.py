@@ -1,4 +1,4 @@
-"""Drawn pictures of each kind: a plain one for pre-training, and the stream's, which differs."""
+"""Drawn pictures of each kind: plain ones for pre-training, and differing ones for the stream."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aegis_cli.data.streams import masks
 from aegis_cli.data.streams.names import DIGITS, DIRECTIONS, LETTERS, SHAPES, SIZE, TEXTURES
 from aegis_cli.data.streams.photo import Photo, blurred, clouds, grey, ink, paint, two_tones
 
-# How pictures of pre-training are taken, and how those of each of the stream's tasks are.
+# The photo settings of pre-training pictures, and of each of the stream's tasks.
 PLAIN = Photo(blur_px=(0.0, 0.9), noise=(0.0, 0.05), contrast=(0.6, 1.0))
 CHALK = Photo(blur_px=(0.2, 0.6), noise=(0.03, 0.08))
 MIXED = Photo(blur_px=(0.0, 0.5), noise=(0.02, 0.07), contrast=(0.6, 1.0))
@@ -18,10 +18,10 @@ DART = Photo(blur_px=(0.3, 1.0), noise=(0.02, 0.06), contrast=(0.6, 1.0), shade=
 SCRATCHED = Photo(blur_px=(0.0, 0.8), noise=(0.02, 0.05), contrast=(0.7, 1.0))
 WORN = Photo(blur_px=(0.0, 0.6), noise=(0.02, 0.05), contrast=(0.7, 1.0), shade=(0.0, 0.6))
 _RAD = math.radians(1)
-_SCRATCH = np.array([(-1, -0.02), (1, -0.02), (1, 0.02), (-1, 0.02)])  # in half its length
+_SCRATCH = np.array([(-1, -0.02), (1, -0.02), (1, 0.02), (-1, 0.02)])  # in units of half its length
 
-# The order of the draws is part of each picture: another order would make other pictures from the
-# same seed, and a cache of another `EDITION`.
+# The order of the random draws determines each picture: another order would make other pictures
+# from the same seed, and require another `EDITION` of the cache.
 
 
 def _center(rng: np.random.Generator, spread_px: float) -> np.ndarray:
@@ -32,7 +32,7 @@ def _center(rng: np.random.Generator, spread_px: float) -> np.ndarray:
 
 
 def plain_shape(shape: int, color: int, rng: np.random.Generator) -> np.ndarray:
-    """Filled or, sometimes, a line; in one of the palette's colours, on a grey ground."""
+    """A filled shape or sometimes an outline, in one of the palette's colours, on a grey ground."""
     line = rng.uniform(0.2, 0.35) if rng.random() < 0.3 else None
     center, radius = _center(rng, 7), rng.uniform(9, 16)
     turned = rng.uniform(-15, 15) * _RAD
@@ -55,12 +55,12 @@ def chalk_shape(shape: int, rng: np.random.Generator) -> np.ndarray:
 def _spots(
     rng: np.random.Generator, count: int, radius_px: tuple[float, float]
 ) -> list[tuple[np.ndarray, float]]:
-    """Centres and radii of discs that keep clear of each other and of the border."""
+    """Centres and radii of discs that keep a distance from each other and from the border."""
     placed: list[tuple[np.ndarray, float]] = []
     while len(placed) < count:
         radius = rng.uniform(*radius_px)
         center = rng.uniform(radius + 1, SIZE - radius - 1, 2)
-        # Touching things could be counted as one.
+        # Touching discs could be counted as one.
         if all(np.hypot(*(center - c)) > 1.2 * (radius + r) for c, r in placed):
             placed.append((center, radius))
     return placed
@@ -82,7 +82,7 @@ def mixed_count(count: int, rng: np.random.Generator) -> np.ndarray:
     picture = np.clip(cloudy + rng.uniform(-0.1, 0.1, 3), 0, 1)
     for center, radius in _spots(rng, count + 1, (4.0, 7.5)):
         line = rng.uniform(0.3, 0.45) if rng.random() < 0.5 else None
-        name = SHAPES[rng.choice([1, 2, 3, 4])]  # no circles, which plain counts are of
+        name = SHAPES[rng.choice([1, 2, 3, 4])]  # no circles, which plain counts use
         mask = masks.shape(name, center, radius, rng.uniform(0, 2 * np.pi), line)
         picture = paint(mask, ink(int(rng.integers(8)), rng), picture)
     return MIXED.take(picture, rng)
@@ -104,7 +104,7 @@ def dart_direction(direction: int, rng: np.random.Generator) -> np.ndarray:
 def _pointer(
     outline: np.ndarray, direction: int, off_deg: float, photo: Photo, rng: np.random.Generator
 ) -> np.ndarray:
-    # Directions are 45 degrees apart: less than half of that off, and each can still be told.
+    # Directions are 45 degrees apart; with less than half of that as jitter they stay distinct.
     angle = (direction * 360 / len(DIRECTIONS) + rng.uniform(-off_deg, off_deg)) * _RAD
     placed = masks.place(outline, _center(rng, 6), rng.uniform(10, 17), angle)
     mask = masks.polygons((placed, True))
@@ -116,12 +116,12 @@ def _pointer(
 
 
 def plain_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
-    """Upright or nearly so, thin or bold, in any two colours."""
+    """A letter, upright or nearly so, thin or bold, in any two colours."""
     return _plain_glyph(LETTERS[letter].upper(), rng)
 
 
 def plain_digit(digit: int, rng: np.random.Generator) -> np.ndarray:
-    """As the letters."""
+    """A digit, drawn like the letters."""
     return _plain_glyph(str(digit % len(DIGITS)), rng)
 
 
@@ -129,14 +129,14 @@ def _plain_glyph(character: str, rng: np.random.Generator) -> np.ndarray:
     turned, slant = rng.uniform(-12, 12) * _RAD, rng.uniform(-0.2, 0.2)
     mask = masks.glyph(character, rng.uniform(20, 36), _center(rng, 5), turned, slant)
     if rng.random() < 0.5:
-        # A blur that is raised and cut off again makes the strokes bold.
+        # Blurring, amplifying and clipping make the strokes bold.
         mask = np.clip(2.5 * blurred(mask, rng.uniform(1, 2)), 0, 1)
     color, paper = two_tones(rng, 0.3)
     return PLAIN.take(paint(mask, color, paper), rng)
 
 
 def scratched_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
-    """Turned, slanted and blurred on a cloudy ground, with a scratch of its own colour."""
+    """A rotated, slanted and blurred letter on a cloudy ground, with a scratch in its colour."""
     turned, slant = rng.uniform(-18, 18) * _RAD, rng.uniform(-0.4, 0.4)
     mask = masks.glyph(LETTERS[letter].upper(), rng.uniform(22, 34), _center(rng, 5), turned, slant)
     color, paper = two_tones(rng, 0.25)
@@ -150,14 +150,14 @@ def scratched_letter(letter: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def plain_texture(texture: int, rng: np.random.Generator) -> np.ndarray:
-    """At any angle, over the whole picture."""
+    """A texture at any angle, over the whole picture."""
     mask = masks.texture(TEXTURES[texture], rng, rng.uniform(8, 14), rng.uniform(0, 2 * np.pi))
     color, paper = two_tones(rng, 0.25)
     return PLAIN.take(paint(mask, color, paper), rng)
 
 
 def worn_texture(texture: int, rng: np.random.Generator) -> np.ndarray:
-    """On a round thing before a grey ground, one side in the shade."""
+    """A texture on a disc before a grey ground, with one side in the shade."""
     mask = masks.texture(TEXTURES[texture], rng, rng.uniform(9, 14), rng.uniform(0, 2 * np.pi))
     color, paper = two_tones(rng, 0.25)
     disc = masks.shape("circle", _center(rng, 2), rng.uniform(19, 23))

@@ -1,4 +1,4 @@
-"""The embedded stream's tasks: pictures made from a seed and kept, one artifact per task."""
+"""The embedded stream's tasks: pictures made from a seed and cached, one artifact per task."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from aegis_cli.data.streams import masks
 from aegis_cli.data.streams.contract import Part, StreamTask
 from aegis_cli.data.streams.names import SIZE, TASKS
 
-EDITION = 1  # a cache of pictures of another edition is made again
+EDITION = 1  # cached pictures of another edition are made again
 PARTS = ("train", "validation", "test")
 COUNTS = {"train": 800, "validation": 200, "test": 500}
-REAL = 1797  # scikit-learn's digits; training gets those that validation and test leave
+REAL = 1797  # scikit-learn's digits; training gets those left by validation and test
 REPORT_EVERY = 250
 Painter = Callable[[int, np.random.Generator], np.ndarray]
 
 
 def file(cache: Path, name: str) -> Path:
-    """Where the pictures of a task are kept."""
+    """The file in which a task's pictures are cached."""
     return Path(cache) / f"{name}.safetensors"
 
 
 def task(name: str, image_size: int, cache: Path, on_event: OnEvent) -> StreamTask:
-    """One of `names.TASKS`, from `cache` or made and kept there."""
+    """One of `names.TASKS`, read from `cache`, or made and stored there."""
     path = file(cache, name)
     if not _current(path, name):
         masks.need_freetype()
@@ -47,7 +47,7 @@ def _current(path: Path, name: str) -> bool:
     if not path.exists():
         return False
     try:
-        # Words belong to it: a task whose classes are called otherwise is made again.
+        # Words are included: a task whose classes have other names is made again.
         return artifacts.load(path, "stream-task").header.meta == meta(name)
     except AegisError as error:
         raise AegisError(
@@ -56,9 +56,9 @@ def _current(path: Path, name: str) -> bool:
 
 
 def meta(name: str) -> dict[str, object]:
-    """Everything that a task's pictures follow from."""
+    """Everything that determines a task's pictures and words."""
     words, counts = TASKS[name], COUNTS
-    # There are no more real digits than those that were scanned.
+    # The number of real digits is limited.
     if name.startswith("digits"):
         counts = COUNTS | {"train": REAL - COUNTS["validation"] - COUNTS["test"]}
     return {
@@ -71,7 +71,7 @@ def meta(name: str) -> dict[str, object]:
 
 
 def save(path: Path, name: str, images: np.ndarray, labels: np.ndarray) -> None:
-    """Write the pictures [N, S, S, 3] and labels [N] of all parts, one part after the other."""
+    """Write the pictures [N, S, S, 3] and labels [N] of all parts, concatenated."""
     tensors = {"images": torch.from_numpy(images), "labels": torch.from_numpy(labels)}
     artifacts.save(
         path,
@@ -84,24 +84,24 @@ def save(path: Path, name: str, images: np.ndarray, labels: np.ndarray) -> None:
 
 
 def read(path: Path, image_size: int) -> StreamTask:
-    """The task in a file; its pictures stay memory-mapped and are resized when asked for.
+    """The task in a file; its pictures stay memory-mapped and are resized on access.
 
     Raises:
-        AegisError: no such file, or a damaged one.
+        AegisError: the file is missing or damaged.
     """
     artifact = artifacts.load(path, "stream-task")
     meta, tensors = artifact.header.meta, artifact.tensors
     parts: dict[str, Part] = {}
     start = 0
     for name in PARTS:
-        rows = slice(start, start + meta["parts"][name])  # as `save` has joined them
+        rows = slice(start, start + meta["parts"][name])  # as concatenated by `save`
         parts[name] = _part(tensors["images"][rows], tensors["labels"][rows], image_size)
         start = rows.stop
     return StreamTask(meta["name"], tuple(meta["classes"]), tuple(meta["templates"]), **parts)
 
 
 def _part(images: Tensor, labels: Tensor, image_size: int) -> Part:
-    # The labels are copied, being few and read often; the images stay in their file.
+    # The labels are copied, since they are small and read often; the images stay in the file.
     return Part(labels.clone(), lambda rows: resized(images[rows], image_size))
 
 
@@ -120,7 +120,7 @@ def resized(images: Tensor, size: int) -> Tensor:
 
 
 def make(name: str, on_event: OnEvent) -> tuple[np.ndarray, np.ndarray]:
-    """All parts' pictures [N, S, S, 3] uint8 and labels [N] int64; the same for every call."""
+    """All parts' pictures [N, S, S, 3] uint8 and labels [N] int64; the same in every call."""
     if name.startswith("digits"):
         return _real(name)
     paint, count = _painter(name), sum(COUNTS.values())
@@ -136,7 +136,7 @@ def make(name: str, on_event: OnEvent) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _balanced(name: str, seed: int) -> np.ndarray:
-    """Labels of all parts: in each, every class as often as any other, or once more."""
+    """Labels of all parts; in each part, class counts differ by at most one."""
     classes = len(TASKS[name].classes)
     rng = np.random.default_rng([EDITION, seed])
     shuffled = [rng.permutation(np.arange(COUNTS[part]) % classes) for part in PARTS]
@@ -144,7 +144,7 @@ def _balanced(name: str, seed: int) -> np.ndarray:
 
 
 def _real(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The real digits in a fixed order of no meaning; the variants' parts hold the same ones."""
+    """The real digits in a fixed shuffled order; the variants' parts hold the same digits."""
     from aegis_cli.data.streams import scanned
 
     images, labels = scanned.digits()
@@ -154,7 +154,7 @@ def _real(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _painter(name: str) -> Painter:
-    """Imported here: only some of them need OpenGL."""
+    """The painter of a task; imported here, since only some need OpenGL."""
     if name in ("colors", "places", "targets"):
         from aegis_cli.data.streams import rendered
 

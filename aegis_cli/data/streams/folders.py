@@ -1,4 +1,4 @@
-"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, as datasets come unpacked."""
+"""Streams of image folders: ROOT/TASK/{train,test}/CLASS/IMAGE, the usual layout of datasets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from aegis_cli.common.files import parse_json, reading, sha256_file
 from aegis_cli.common.pictures import decoded
 from aegis_cli.data.streams.contract import Part, StreamTask, has_one_gap
 
-TEMPLATE = "a photo of a {}"  # without a full stop, which the embedded encoder cannot read
-# A file in a task's folder, with words for the class folders whose names are not said so.
+TEMPLATE = "a photo of a {}"  # without a full stop, which the embedded encoder does not know
+# A file in a task's folder, with the words for class folders that are named otherwise.
 CLASSES = "classes.json"
 TEMPLATES = "templates.txt"
-VALIDATION = 20  # one training image in so many, where a task has no validation folder
+VALIDATION = 20  # every 20th training image, if a task has no validation folder
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".webp", ".tif", ".tiff"}
-_THREADS = 4  # decoders; Pillow lets go of the interpreter while it works
+_THREADS = 4  # decoders; Pillow releases the GIL while it works
 
 
 @dataclass(frozen=True)
@@ -34,27 +34,27 @@ class Listing:
     labels: tuple[int, ...]
 
     def where(self, chosen: Sequence[bool]) -> Listing:
-        """The images for which `chosen` holds."""
+        """The images for which `chosen` is True."""
         rows = [i for i, is_chosen in enumerate(chosen) if is_chosen]
         return Listing(tuple(self.files[i] for i in rows), tuple(self.labels[i] for i in rows))
 
     def part(self, size: int) -> Part:
-        """The images with `size` pixels per side, and their labels."""
+        """The images at `size` pixels per side, with their labels."""
         labels = torch.tensor(self.labels, dtype=torch.int64)
         return Part(labels, lambda rows: decode([self.files[i] for i in rows.tolist()], size))
 
 
 def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,)) -> StreamTask:
-    """The task in `root/name`; its images are decoded when they are asked for.
+    """The task in `root/name`; its images are decoded on access.
 
-    A class that `classes.json` does not name is called as its folder is, with spaces for
-    underscores. A `templates.txt` beside it, one sentence with "{}" per line, takes the place of
-    `templates`. Without a `validation` folder every twentieth training image, by the hash of its
-    path, is for validation.
+    A class that `classes.json` does not name has the name of its folder, with spaces for
+    underscores. A `templates.txt` beside it, one sentence with "{}" per line, replaces `templates`.
+    Without a `validation` folder every twentieth training image, chosen by the hash of its path, is
+    held out for validation.
 
     Raises:
-        AegisError: folders that are missing or empty, classes that differ between parts, or no
-            image that can be held out.
+        AegisError: folders are missing or empty, classes differ between parts, or no image can be
+            held out.
     """
     folder = Path(root) / name
     classes, listed = _parts(folder)
@@ -67,17 +67,17 @@ def load(root: Path, name: str, size: int, templates: Sequence[str] = (TEMPLATE,
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """What a task in a folder is loaded from: its classes, and a digest of each file.
+    """The contents that a task is loaded from: its classes, and a digest of each file.
 
-    Sizes would not do, because another picture may have the same size. The files are read each
-    time, which takes little time beside their decoding, which every run does.
+    File sizes would not be enough, because another picture may have the same size. The files are
+    read each time, which takes little time compared with decoding them, which every run does.
 
     Raises:
-        AegisError: as of `load`, or a file that cannot be read.
+        AegisError: as in `load`, or a file cannot be read.
     """
     classes, parts = _parts(folder)
     used = [file for listed in parts.values() for file in listed.files]
-    # Words are a part of it: other classes or sentences make another task of the same images.
+    # Words are included: other class names or sentences make another task from the same images.
     used += filter(Path.is_file, (folder / CLASSES, folder / TEMPLATES))
     with ThreadPoolExecutor(_THREADS) as pool:
         digests = list(pool.map(sha256_file, used))
@@ -86,16 +86,17 @@ def contents(folder: Path) -> dict[str, object]:
 
 
 def shared(folder: Path, digests: Mapping[str, str]) -> tuple[list[tuple[str, str]], int]:
-    """The held-out images of a task that are, byte for byte, also in a part that comes before.
+    """The held-out images of a task that are also, byte for byte, in an earlier part.
 
     Args:
-        digests: of the files, by their names, as `contents` has them.
+        digests: of the files, by name, as from `contents`.
 
     Returns:
-        Their names, each with that of an earlier part's; and how many images are held out.
+        Their names, each with the equal file's in an earlier part; and the number of held-out
+        images.
     """
     listed = _split(folder, _parts(folder)[1])
-    known: dict[str, str] = {}  # of each digest, the first file
+    known: dict[str, str] = {}  # digest -> the first file
     total, found = 0, list[tuple[str, str]]()
     for part in ("train", "validation", "test"):
         names = [file.relative_to(folder).as_posix() for file in listed[part].files]
@@ -108,12 +109,12 @@ def shared(folder: Path, digests: Mapping[str, str]) -> tuple[list[tuple[str, st
 
 
 def decode(files: Sequence[Path], size: int) -> Tensor:
-    """Images [B, size, size, 3] uint8 as CLIP's processor cuts them.
+    """Images [B, size, size, 3] uint8, resized and cropped as by CLIP's processor.
 
-    The shorter side is scaled (bicubic), and the middle is kept.
+    The shorter side is resized (bicubic), and the centre is cropped.
 
     Raises:
-        AegisError: a file that is no whole image.
+        AegisError: a file is no complete image.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         squares = list(pool.map(lambda file: _square(file, size), files))
@@ -132,8 +133,8 @@ def _square(file: Path, size: int) -> np.ndarray:
             "replace or remove it",
         ) from error
     shorter = min(image.size)
-    # The longer side is truncated to whole pixels, as CLIP's processor does; rounding would differ.
-    # The shorter one is given, for a quotient of floats may fall a pixel short.
+    # The longer side is truncated to whole pixels, as in CLIP's processor; rounding would differ.
+    # The shorter one is set directly, since a float quotient may be a pixel too small.
     width, height = (size if side == shorter else int(size * side / shorter) for side in image.size)
     left, top = (width - size) // 2, (height - size) // 2
     scaled = image.resize((width, height), Image.Resampling.BICUBIC)
@@ -141,7 +142,7 @@ def _square(file: Path, size: int) -> np.ndarray:
 
 
 def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
-    """The class folders of a task, and the images of the parts that it has."""
+    """The class folders of a task, and the images of its existing parts."""
     parts = {part: folder / part for part in ("train", "validation", "test")}
     missing = [str(parts[part]) for part in ("train", "test") if not parts[part].is_dir()]
     if missing:
@@ -156,13 +157,13 @@ def _parts(folder: Path) -> tuple[list[str], dict[str, Listing]]:
 
 
 def _visible_folders(folder: Path) -> list[str]:
-    """Names of the folders in it, without hidden ones, in alphabetical order."""
+    """Names of the visible subfolders, in alphabetical order."""
     names = [path.name for path in folder.iterdir() if path.is_dir()]
     return sorted(name for name in names if not name.startswith("."))
 
 
 def _split(folder: Path, listed: Mapping[str, Listing]) -> dict[str, Listing]:
-    """The same parts; without images for validation, some of training's are held back."""
+    """The same parts; if there is no validation part, some training images are held out."""
     if "validation" in listed:
         return dict(listed)
     train, validation = _held_back(listed["train"], folder)
@@ -170,7 +171,7 @@ def _split(folder: Path, listed: Mapping[str, Listing]) -> dict[str, Listing]:
 
 
 def _class_folders(train: Path) -> list[str]:
-    """Names of the class folders, whose order is that of the labels."""
+    """Names of the class folders, in the order of the labels."""
     found = _visible_folders(train)
     if len(found) < 2:
         expected = "a folder for each of two classes or more"
@@ -181,7 +182,7 @@ def _class_folders(train: Path) -> list[str]:
 
 
 def _list(part: Path, classes: Sequence[str]) -> Listing:
-    """The images of a part by their classes; a part need not have all of them."""
+    """The images of a part, by class; a part may lack some classes."""
     folders = _visible_folders(part)
     if unknown := [name for name in folders if name not in classes]:
         raise AegisError(
@@ -192,7 +193,7 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     files, labels = [], []
     for label, name in enumerate(classes):
         inside = (part / name).rglob("*") if name in folders else ()
-        # Sorted, because a folder's own order differs between file systems.
+        # Sorted, because the order of a folder differs between file systems.
         images = sorted(p for p in inside if _is_image(p.relative_to(part)))
         files += images
         labels += [label] * len(images)
@@ -206,33 +207,33 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
 
 
 def _is_image(path: Path) -> bool:
-    """Whether a path is an image's by its name, and neither it nor a folder in it is hidden.
+    """Whether a path has the suffix of an image, and no part of it is hidden.
 
-    What is hidden is some program's, such as the thumbnails of the images themselves.
+    Hidden files belong to some program, such as thumbnails of the images.
     """
     hidden = any(name.startswith(".") for name in path.parts)
     return path.suffix.lower() in _SUFFIXES and not hidden
 
 
 def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
-    """Training and validation images.
+    """Split training images into training and validation.
 
-    A path's hash decides, so that adding images moves no other image, but for a class of which
-    nothing would be left to learn from: that keeps one.
+    A path's hash decides, so adding images moves no other image. The exception is a class that
+    would have no training image left: it keeps one.
 
     Raises:
-        AegisError: one image of each class, of which none can be spared.
+        AegisError: there is only one image per class, so none can be held out.
     """
     names = [file.relative_to(folder).as_posix() for file in train.files]
     hashed = [hashlib.sha256(name.encode()).digest() for name in names]
     numbers = [int.from_bytes(digest[:8], "big") for digest in hashed]
     rising = sorted(range(len(hashed)), key=hashed.__getitem__)
-    last = {train.labels[i]: i for i in rising}  # of each class the image of the largest hash
+    last = {train.labels[i]: i for i in rising}  # class -> the image with the largest hash
     held = {i for i in rising if numbers[i] % VALIDATION == 0}
-    held.add(rising[0])  # at least one image is held out, also in a small task
+    held.add(rising[0])  # at least one image is held out, even in a small task
     learned = {label for i, label in enumerate(train.labels) if i not in held}
     held -= {i for label, i in last.items() if label not in learned}
-    if not held:  # the only one went back to its class
+    if not held:  # the only one was returned to its class
         spare = [i for i in rising if i not in last.values()]
         if not spare:
             raise AegisError(
@@ -246,7 +247,7 @@ def _held_back(train: Listing, folder: Path) -> tuple[Listing, Listing]:
 
 
 def _sentences(path: Path) -> list[str]:
-    """The lines of a file that are not empty."""
+    """The non-empty lines of a file, each a sentence with one gap."""
     with reading(path, "check the path"):
         text = path.read_bytes()
     try:
@@ -268,10 +269,10 @@ def _sentences(path: Path) -> list[str]:
 
 
 def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
-    """What each class is called in a sentence.
+    """The word for each class in a sentence.
 
     Raises:
-        AegisError: a `classes.json` that is no mapping of class folders to words.
+        AegisError: `classes.json` is no mapping of class folders to words.
     """
     path = folder / CLASSES
     named: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Shapes as masks: how much of each pixel they cover. Drawn three times as large and averaged."""
+"""Shapes as coverage masks per pixel, drawn three times as large and averaged."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from aegis_cli.data.streams.names import SIZE
 if TYPE_CHECKING:
     from PIL import ImageFont
 
-FINER = 3  # times as many pixels per side are drawn as the mask has
+FINER = 3  # supersampling factor per side
 _CANVAS = SIZE * FINER
 Points = np.ndarray  # [n, 2], x to the right and y down, the shape within [-1, 1]
 
 
 def need_freetype() -> None:
-    """Raise AegisError unless Pillow has a scalable font of its own."""
+    """Raise AegisError unless Pillow has FreeType, which its scalable font needs."""
     from PIL import features
 
     if not features.check("freetype2"):
@@ -34,7 +34,7 @@ def need_freetype() -> None:
 def polygons(*layers: tuple[Points, bool]) -> np.ndarray:
     """Polygons in pixels as a mask [S, S] in [0, 1].
 
-    They are painted one over the other (True) or cut out (False).
+    In order, each is painted (True) or cut out (False).
     """
     from PIL import Image, ImageDraw
 
@@ -51,7 +51,7 @@ def shrink(fine: np.ndarray) -> np.ndarray:
 
 
 def place(points: Points, center: np.ndarray, radius: float, angle_rad: float) -> Points:
-    """Turned (anticlockwise as seen), scaled and moved, in pixels."""
+    """Rotate (anticlockwise as seen), scale and move points, in pixels."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return points @ np.array([[c, -s], [s, c]]) * radius + center
 
@@ -59,9 +59,9 @@ def place(points: Points, center: np.ndarray, radius: float, angle_rad: float) -
 def shape(
     name: str, center: np.ndarray, radius: float, angle_rad: float = 0.0, line: float | None = None
 ) -> np.ndarray:
-    """One of `names.SHAPES`, filled, or as a line of that share of its radius."""
+    """One of `names.SHAPES`, filled, or as an outline with a width of `line` times the radius."""
     outer = OUTLINES[name]()
-    # Each layer covers a part of the one before: filled, cut out, filled again.
+    # Each layer covers a part of the previous one: filled, cut out, filled again.
     layers = [(place(outer, center, radius, angle_rad), True)]
     if name == "ring":
         layers.append((place(outer * 0.55, center, radius, angle_rad), False))
@@ -74,7 +74,7 @@ def shape(
 
 
 def inset(points: Points, width: float) -> Points:
-    """The closed line moved inwards by `width`.
+    """Move a closed outline inwards by `width`.
 
     Each corner moves along the mean of its sides' normals.
     """
@@ -82,17 +82,17 @@ def inset(points: Points, width: float) -> Points:
     normal_after = _normals(np.roll(points, -1, 0) - points)
     middle = normal_before + normal_after
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
-    # The bound cuts a sharp corner, which would else be moved far in.
+    # The bound limits sharp corners, which would otherwise move too far.
     cosine = np.maximum((middle * normal_before).sum(1, keepdims=True), 0.4)
-    # The shoelace formula gives twice the area, whose sign says which way the corners run, and so
-    # on which side of the line the inside is.
+    # The shoelace formula gives twice the area, whose sign shows the orientation, and so on which
+    # side of the outline the inside is.
     x, y = points[:, 0], points[:, 1]
     area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     return points + middle * width / cosine * (1 if area > 0 else -1)
 
 
 def _normals(sides: np.ndarray) -> np.ndarray:
-    """Each side [n, 2] turned by 90 degrees, at length 1."""
+    """Each side [n, 2] rotated by 90 degrees, at length 1."""
     lengths = np.linalg.norm(sides, axis=1, keepdims=True)
     return np.stack([-sides[:, 1], sides[:, 0]], 1) / (lengths + 1e-9)
 
@@ -102,7 +102,7 @@ def _circle() -> Points:
 
 
 def _regular(corners: int, first_rad: float) -> Points:
-    """A regular polygon of radius 1, whose first corner is at this angle from the x axis."""
+    """A regular polygon of radius 1, with the first corner at this angle from the x axis."""
     t = first_rad + np.linspace(0, 2 * np.pi, corners, endpoint=False)
     return np.stack([np.cos(t), np.sin(t)], 1)
 
@@ -114,7 +114,7 @@ def _star() -> Points:
 
 
 def _cross() -> Points:
-    a, b = 0.95, 0.32  # half of an arm's reach, and half of its width
+    a, b = 0.95, 0.32  # half of an arm's length, and half of its width
     quarter = np.array([(-b, -a), (b, -a), (b, -b)])
     turns = [
         np.array([[1, 0], [0, 1]]),
@@ -127,15 +127,15 @@ def _cross() -> Points:
 
 def _heart() -> Points:
     t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    # The usual curve of a heart; the last line moves it to the middle and scales it to [-1, 1].
+    # The usual heart curve; the last line centres it and scales it to [-1, 1].
     x = 16 * np.sin(t) ** 3
     y = -(13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))
     return np.stack([x, y - 2], 1) / 16.5
 
 
 def _crescent() -> Points:
-    """A disc without a smaller one that reaches out of it on the right."""
-    tip_rad, middle = 0.75, 0.55  # where a tip is, and the middle of the smaller disc on the x axis
+    """A disc minus a smaller one that protrudes on the right."""
+    tip_rad, middle = 0.75, 0.55  # angle of a tip, and centre of the smaller disc
     outer = np.linspace(tip_rad, 2 * np.pi - tip_rad, 40)
     back = np.stack([np.cos(outer), np.sin(outer)], 1)
     tip = np.array([np.cos(tip_rad), np.sin(tip_rad)])
@@ -143,7 +143,7 @@ def _crescent() -> Points:
     half = math.atan2(tip[1], tip[0] - middle)
     inner = np.linspace(2 * np.pi - half, half, 30)
     bite = np.stack([middle + radius * np.cos(inner), radius * np.sin(inner)], 1)
-    # Both arcs end in the tips, which the outline has once.
+    # Both arcs end in the tips, which the outline contains once.
     return np.concatenate([back, bite[1:-1]]) + [0.15, 0]
 
 
@@ -167,7 +167,7 @@ DART: Points = np.array([(-0.8, -0.62), (1, 0), (-0.8, 0.62), (-0.35, 0)])
 def glyph(
     character: str, height_px: float, center: np.ndarray, angle_rad: float = 0.0, slant: float = 0.0
 ) -> np.ndarray:
-    """A character of Pillow's own font, `height_px` tall, turned anticlockwise, slanted right."""
+    """A character of Pillow's own font, `height_px` tall, rotated anticlockwise, slanted right."""
     from PIL import Image, ImageDraw
 
     letter = Image.new("L", (_CANVAS, _CANVAS))
@@ -180,10 +180,10 @@ def glyph(
     left, top, right, bottom = box
     scale = (bottom - top) / (height_px * FINER)
     c, s = math.cos(angle_rad) * scale, math.sin(angle_rad) * scale
-    # PIL asks where each pixel of the result comes from. So this is the way back: from turned to
-    # straight, and from slanted to upright.
+    # PIL needs the source of each pixel of the result. So this is the inverse: undo the rotation,
+    # then the slant.
     back = np.array([[1, slant], [0, 1]]) @ np.array([[c, -s], [s, c]])
-    # The middle of what was drawn goes to `center`, and not the font's own middle.
+    # The centre of the drawn pixels goes to `center`, not the font's own centre.
     start = np.array([(left + right) / 2, (top + bottom) / 2]) - back @ (center * FINER)
     numbers = (back[0, 0], back[0, 1], start[0], back[1, 0], back[1, 1], start[1])
     turned = letter.transform(
@@ -201,18 +201,18 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def texture(name: str, rng: np.random.Generator, period_px: float, angle_rad: float) -> np.ndarray:
     """One of `names.TEXTURES` over the whole picture, at a random phase -> [S, S] in [0, 1]."""
-    at = (np.arange(_CANVAS) + 0.5) / FINER - SIZE / 2  # pixels from the picture's middle
+    at = (np.arange(_CANVAS) + 0.5) / FINER - SIZE / 2  # pixels from the picture's centre
     x, y = np.meshgrid(at, at)
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = 2 * np.pi / period_px
-    # The phases of a pixel along the pattern's own axes, in radians.
+    # The phases of each pixel along the pattern's own axes, in radians.
     u = turn * (c * x - s * y) + rng.uniform(0, 6.28)
     v = turn * (s * x + c * y) + rng.uniform(0, 6.28)
     return shrink(_PATTERNS[name](u, v, rng).astype(np.float64))
 
 
 def _rings(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """About a point near the picture's middle, whatever the phase."""
+    """Rings about a point near the picture's centre, whatever the phase."""
     at = _CANVAS // 2
     middle = np.array([u[at, at], v[at, at]]) + rng.uniform(-2, 2, 2)
     return np.sin(np.hypot(u - middle[0], v - middle[1])) > 0
@@ -226,9 +226,9 @@ def _bricks(u: np.ndarray, v: np.ndarray, _: np.random.Generator) -> np.ndarray:
 
 
 def _speckles(u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Blots of random places."""
+    """Blots at random places."""
     found = np.zeros(u.shape, bool)
-    reach = u.max() - u.min()  # that of v as well, because the picture is square
+    reach = u.max() - u.min()  # the same for v, because the picture is square
     across, down = rng.uniform(0, 1, (2, 40))
     radii = rng.uniform(0.5, 1.5, 40)
     for a, b, radius in zip(across, down, radii, strict=True):

@@ -1,4 +1,4 @@
-"""The embedded stream's tasks in plain words, so that recipes name them without heavy imports."""
+"""The embedded stream's tasks by name, so that recipes can list them without heavy imports."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ DOMAINS = (
     "swimmer",
 )
 
-# Pair B: the same pictures under names that another digit had; no digit keeps its own, because 2 i
-# is never 9 modulo 10.
+# Pair B: the same pictures under other digits' names; no digit keeps its own name, because 2 i is
+# never 9 modulo 10.
 PERMUTED = tuple(DIGITS[(3 * i + 1) % 10] for i in range(10))
 
 
@@ -94,4 +94,4 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "pair-permuted": ("digits", "digits-permuted"),
 }
 
-SIZE = 48  # pixels per side of the pictures as they are made
+SIZE = 48  # pixels per side of the generated pictures

@@ -1,4 +1,4 @@
-"""What lies between a drawing and its picture: paper, ink, light, blur and noise.
+"""The effects that turn a drawing into a picture: paper, ink, light, blur and noise.
 
 Pictures are [S, S, 3] in [0, 1].
 """
@@ -17,13 +17,13 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class Photo:
-    """How a picture is taken; each number is drawn from its span.
+    """Settings for taking a picture; each value is drawn from its span.
 
     Attributes:
         blur_px: standard deviation of the blur.
         noise: standard deviation of each value's noise.
-        contrast: share of the distance to mid grey that is left.
-        cast: by how much the light's colour may raise or lower a channel.
+        contrast: factor on the distance to mid grey.
+        cast: the most by which the light's colour raises or lowers a channel.
         shade: how much darker one side is than the other.
     """
 
@@ -34,9 +34,9 @@ class Photo:
     shade: Span = (0.0, 0.0)
 
     def take(self, picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """The picture [S, S, 3] uint8 that this makes of one in [0, 1]."""
-        # The noise comes last, so that nothing smooths it. Every effect draws, also where its span
-        # is empty: another span leaves the other effects' draws as they are.
+        """Apply these effects to a picture in [0, 1]; returns [S, S, 3] uint8."""
+        # The noise comes last, so that nothing smooths it. Every effect draws, even if its span is
+        # empty, so that changing a span does not affect the other effects' draws.
         picture = blurred(picture, rng.uniform(*self.blur_px))
         picture = 0.5 + (picture - 0.5) * rng.uniform(*self.contrast)
         picture = picture * (1 + rng.uniform(-self.cast, self.cast, 3))
@@ -46,12 +46,12 @@ class Photo:
 
 
 def to_bytes(picture: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] in [0, 1] as uint8; what is outside that range is cut off."""
+    """Colours [..., 3] in [0, 1] as uint8, clipped to that range."""
     return np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8)
 
 
 def slope(rng: np.random.Generator) -> np.ndarray:
-    """From 0 to 1 across the picture in a random direction, [S, S]."""
+    """A ramp from 0 to 1 across the picture in a random direction, [S, S]."""
     angle = rng.uniform(0, 2 * np.pi)
     at = np.linspace(-1, 1, SIZE)
     plane = np.cos(angle) * at[None, :] + np.sin(angle) * at[:, None]
@@ -62,10 +62,10 @@ def blurred(picture: np.ndarray, deviation_px: float) -> np.ndarray:
     """A Gaussian blur of the first two axes; the border is repeated."""
     if deviation_px < 0.2:
         return picture
-    reach = int(3 * deviation_px + 1)  # three deviations hold 99.7 % of the weight
+    reach = int(3 * deviation_px + 1)  # three deviations cover 99.7 % of the weight
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation_px) ** 2)
     weights /= weights.sum()
-    # A Gaussian in two dimensions is the product of two in one: two passes do for it.
+    # A two-dimensional Gaussian is separable: two one-dimensional passes.
     for axis in (0, 1):
         border = [(0, 0)] * picture.ndim
         border[axis] = (reach, reach)
@@ -76,7 +76,7 @@ def blurred(picture: np.ndarray, deviation_px: float) -> np.ndarray:
 
 
 def ink(color: int, rng: np.random.Generator) -> np.ndarray:
-    """One of the palette's colours [3], a little darker or lighter."""
+    """One of the palette's colours [3], slightly darker or lighter."""
     return np.clip(np.array(RGB[COLORS[color]]) * rng.uniform(0.85, 1.1), 0, 1)
 
 
@@ -104,6 +104,6 @@ def clouds(rng: np.random.Generator, cells: int) -> np.ndarray:
     at = np.linspace(0, cells, SIZE, endpoint=False)
     low = at.astype(int)
     part = at - low
-    # Bilinear between the cells' corners: down the rows first, then along them.
+    # Bilinear between the cells' corners: first over rows, then over columns.
     rows = coarse[low] * (1 - part)[:, None] + coarse[low + 1] * part[:, None]
     return rows[:, low] * (1 - part) + rows[:, low + 1] * part

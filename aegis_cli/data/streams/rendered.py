@@ -1,6 +1,6 @@
 """Rendered pictures: solids on a floor, and targets beside a robot.
 
-The scenes are those that the VLM's questions and the robot tasks already have.
+The scenes are those of the VLM's questions and of the robot tasks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, renderer_of_thread
 from aegis_cli.sim import point, reach
 from aegis_cli.sim.scene import Look, lay_out
 
-_CROP_PX = 26  # side of what is cut from a scene of 64 pixels
+_CROP_PX = 26  # side of the crop from a scene of 64 pixels
 PLAIN = Photo(noise=(0.0, 0.03))
 LAMPLIGHT = Photo(
     blur_px=(0.0, 0.7), noise=(0.02, 0.06), contrast=(0.4, 0.7), cast=0.34, shade=(0.2, 0.6)
@@ -27,28 +27,28 @@ NIGHT = Photo(
 
 
 def _solid(rng: np.random.Generator, color: str, solid: str) -> np.ndarray:
-    """The part of a scene around its one thing, enlarged: [S, S, 3] in [0, 1]."""
+    """The part of a scene around its single thing, enlarged: [S, S, 3] in [0, 1]."""
     scene = renderer_of_thread().render(rng, only=(color, solid))
     at = np.array([scene.things[0].x_px, scene.things[0].y_px])
-    # Nearly in the middle, and never beyond the border.
+    # Nearly centred, and never beyond the border.
     corner = np.clip(at - _CROP_PX / 2 + rng.uniform(-3, 3, 2), 0, IMAGE_SIZE - _CROP_PX)
     left, top = np.rint(corner).astype(int)
     return enlarged(scene.image[top : top + _CROP_PX, left : left + _CROP_PX] / 255)
 
 
 def plain_solid(color: int, solid: int, rng: np.random.Generator) -> np.ndarray:
-    """A thing of that colour and solid on a floor."""
+    """A solid of this kind and colour on a floor."""
     return PLAIN.take(_solid(rng, COLORS[color], SHAPES[solid]), rng)
 
 
 def lamplit_solid(color: int, rng: np.random.Generator) -> np.ndarray:
-    """A thing of that colour under a faint, coloured lamp."""
+    """A solid of this colour under a faint, coloured lamp."""
     solid = SHAPES[rng.integers(len(SHAPES))]
     return LAMPLIGHT.take(_solid(rng, COLORS[color], solid), rng)
 
 
 def plain_target(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
-    """The reacher and one coloured disc, `direction` of the middle."""
+    """The reacher and one coloured disc in `direction` from the middle."""
     return PLAIN.take(_reacher(color, direction, rng), rng)
 
 
@@ -58,9 +58,9 @@ def night_target(color: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
-    """The point mass and a pad that is `direction` of the middle."""
+    """The point mass and a pad in `direction` from the middle."""
     stage = point.stage()
-    stage.physics.reset()  # the stage is shared: nothing of the picture before may stay
+    stage.physics.reset()  # the stage is shared: nothing of the previous picture may remain
     stage.physics.data.qpos[:] = rng.uniform(-0.25, 0.25, 2)
     distance = rng.uniform(0.09, 0.22)
     pad = _off_middle(direction, 16, distance, rng)
@@ -72,7 +72,7 @@ def pad_place(direction: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray:
-    """The arm in any pose, and a disc `direction` of the middle: [S, S, 3] in [0, 1]."""
+    """The arm in any pose, and a disc in `direction` from the middle: [S, S, 3] in [0, 1]."""
     stage = reach.stage()
     stage.physics.reset()
     stage.physics.data.qpos[:] = rng.uniform(-math.pi, math.pi), rng.uniform(-2.5, 2.5)
@@ -86,8 +86,8 @@ def _reacher(color: int, direction: int, rng: np.random.Generator) -> np.ndarray
 def _off_middle(
     direction: int, off_deg: float, distance_m: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """The point [2] in metres that lies in a direction of the middle, up to `off_deg` off it."""
-    # Directions are 45 degrees apart: less than half of that off, and each can still be told.
+    """A point [2] in metres in a direction from the middle, with a jitter of up to `off_deg`."""
+    # Directions are 45 degrees apart; with less than half of that as jitter they stay distinct.
     angle = math.radians(direction * 45 + rng.uniform(-off_deg, off_deg))
     return distance_m * np.array([math.cos(angle), math.sin(angle)])
 

@@ -43,16 +43,16 @@ class Robot:
         model = self._physics.model.ptr
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
-        with interrupts.deferred():  # half of a context cannot be closed
+        with interrupts.deferred():  # a half-created context cannot be closed
             self._renderer = mujoco.Renderer(model, SIZE, SIZE)
         for flag in SLOW_FLAGS:
             self._renderer.scene.flags[flag] = False
-        atexit.register(self._renderer.close)  # while EGL is still there
+        atexit.register(self._renderer.close)  # while EGL still exists
 
     def frame(self, rng: np.random.Generator) -> np.ndarray:
-        """Its first camera's picture of a random pose, [S, S, 3] uint8."""
+        """The first camera's picture of a random pose, [S, S, 3] uint8."""
         self._physics.reset()
-        # dm_control draws with methods that only NumPy's old generators have.
+        # dm_control uses methods that only NumPy's legacy generators have.
         old = np.random.RandomState(rng.integers(2**31))
         randomizers.randomize_limited_and_rotational_joints(self._physics, old)
         self._physics.forward()
@@ -66,16 +66,16 @@ def _robot(domain: str) -> Robot:
 
 
 def plain_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
-    """As dm-control shows it, its colours more or less faded."""
+    """The robot as dm-control renders it, with its colours more or less faded."""
     frame = _robot(DOMAINS[domain]).frame(rng) / 255
     grey = frame.mean(-1, keepdims=True)
     return _PLAIN.take(grey + rng.uniform(0, 1) * (frame - grey), rng)
 
 
 def thermal_domain(domain: int, rng: np.random.Generator) -> np.ndarray:
-    """The picture as a thermal camera would show it.
+    """The robot as a thermal camera would show it.
 
-    It has one false colour, may be bright for dark and mirrored, and shows an enlarged part.
+    The picture has a ramp between two false colours, and may be inverted and mirrored.
     """
     heat = (_robot(DOMAINS[domain]).frame(rng) / 255).mean(-1)
     heat = (heat - heat.min()) / (heat.max() - heat.min())

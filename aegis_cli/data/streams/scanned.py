@@ -1,4 +1,4 @@
-"""scikit-learn's digits: 1,797 real handwritten ones of 8 x 8 pixels, from UCI's data."""
+"""scikit-learn's digits: 1,797 real handwritten digits of 8 x 8 pixels, from UCI's data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.streams.names import SIZE
 
-_LEVELS = 16  # a pixel's value in the data goes from 0 to this
+_LEVELS = 16  # the largest pixel value in the data
 
 
 @cache
@@ -17,7 +17,7 @@ def digits() -> tuple[np.ndarray, np.ndarray]:
     """Pictures [1797, S, S, 3] uint8, light on dark, and their digits [1797] int64.
 
     Raises:
-        AegisError: no scikit-learn.
+        AegisError: scikit-learn is not installed.
     """
     try:
         from sklearn.datasets import load_digits

@@ -1,1 +1,1 @@
-"""Questions about images: rendered scenes, and the files and data sets that others have."""
+"""Questions about images: rendered scenes, and other people's files and data sets."""

@@ -1,8 +1,8 @@
-"""How people's answers are compared, by the rules of VQA's official evaluation (arXiv 1505.00468).
+"""Compare people's answers by the rules of VQA's official evaluation (arXiv 1505.00468).
 
-Two differences to its code, and none to its text: an answer is always normalised, also where all
-people said the same; and one of which nothing would be left, such as the letter A or a plus sign,
-stays as it is, or to say nothing would be right.
+There are two differences from its code, and none from its text: an answer is always normalised,
+even if all people gave the same; and an answer that would become empty, such as the letter A or a
+plus sign, stays as it is, since otherwise an empty answer would count as correct.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _APOSTROPHES = (
 
 
 def _contractions() -> dict[str, str]:
-    """The contraction for each way to write it with an apostrophe forgotten."""
-    # This entry is a slip of the official table; scores stay comparable only with it.
+    """Each contraction by the spellings that lack an apostrophe."""
+    # This entry is an error in the official table; it is kept for comparable scores.
     table = {"somebody'd": "somebodyd"}
     for word in _APOSTROPHES.split():
         for i, letter in enumerate(word):
@@ -45,15 +45,15 @@ def _contractions() -> dict[str, str]:
 _CONTRACTIONS = _contractions()
 
 
-@lru_cache(maxsize=1 << 16)  # people give few different answers to many questions
+@lru_cache(maxsize=1 << 16)  # many questions have few different answers
 def normalise(answer: str) -> str:
-    """An answer in the form in which answers are compared.
+    """An answer in its normal form, for comparison.
 
-    It has lower case, no punctuation, digits for number words, no articles, and its apostrophes
-    restored. An answer of articles and punctuation alone keeps them.
+    That is lower case, without punctuation and articles, with digits for number words and
+    apostrophes restored. An answer of only articles and punctuation keeps them.
     """
     spaced = " ".join(answer.split())
-    # The official order: marks, number words, articles, and apostrophes at last.
+    # The official order: punctuation, number words, articles, and last the apostrophes.
     words = [_NUMBERS.get(word, word) for word in _strip_marks(spaced).lower().split()]
     kept = [word for word in words if word not in _ARTICLES]
     said = " ".join(_CONTRACTIONS.get(word, word) for word in kept)
@@ -63,8 +63,8 @@ def normalise(answer: str) -> str:
 def _strip_marks(text: str) -> str:
     """The words without punctuation.
 
-    Marks at a word's edge vanish, and those inside a word split it. If a comma stands between
-    digits anywhere, every mark vanishes, so that the digits join.
+    Marks at the edge of a word are removed, and those inside a word split it. If a comma stands
+    between digits anywhere, every mark is removed, so that the digits join.
     """
     number, bare = re.search(r"\d,\d", text), text
     for mark in _MARKS:
@@ -74,7 +74,7 @@ def _strip_marks(text: str) -> str:
 
 
 def reference(answers: Sequence[str]) -> str:
-    """The answer that most people gave, as the first of them wrote it.
+    """The most common answer, as the first person wrote it.
 
     Among equally common answers it is the first.
     """
@@ -88,14 +88,14 @@ def reference(answers: Sequence[str]) -> str:
 def soft_accuracy(said: str, answers: Sequence[str]) -> float:
     """min(people who said it / 3, 1), averaged over the subsets that leave one person out.
 
-    With one person it is whether the two are equal.
+    With one person it is 1 if the two are equal, else 0.
 
-    With the official ten answers 1, 2, 3 and 4 people who said it make 0.3, 0.6, 0.9 and 1. With
-    two or three answers none reaches 1, as few people cannot agree more.
+    With the official ten answers, 1, 2, 3 and 4 people who said it give 0.3, 0.6, 0.9 and 1. With
+    two or three answers the score never reaches 1, since so few people cannot agree more.
     """
     matches = [normalise(answer) == normalise(said) for answer in answers]
     if len(matches) == 1:
         return float(matches[0])
-    # Without one person, those who said it are one fewer if that person did.
+    # Leaving one person out removes one match if that person said it.
     without_each = [min(1.0, (sum(matches) - match) / 3) for match in matches]
     return sum(without_each) / len(matches)

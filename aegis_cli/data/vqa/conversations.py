@@ -1,7 +1,7 @@
-"""Conversations about a picture, as VLMs are instructed with: each turn of them is a question.
+"""Conversations about a picture, as in instruction data of VLMs: each turn is a question.
 
-Three forms are read, by what a turn has: `user` and `assistant` (The Cauldron, FineVision), `from`
-and `value` (LLaVA), or `role` and `content` (chat messages, as TRL takes them).
+Three forms are read, by the keys of a turn: `user` and `assistant` (The Cauldron, FineVision),
+`from` and `value` (LLaVA), or `role` and `content` (chat messages, as in TRL).
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 from aegis_cli.data.vqa.entries import ANSWERS, bad, make_question
 from aegis_cli.data.vqa.questions import Question
 
-# What a conversation is called, the first that is there.
+# The possible keys of a conversation; the first one present is used.
 KEYS = ("texts", "conversations", "messages")
-_PLACE = re.compile(r"\s*<image>\s*")  # where the picture stands in a text
+_PLACE = re.compile(r"\s*<image>\s*")  # the picture's place in a text
 _ASKS, _ANSWERS = ("human", "user"), ("gpt", "assistant")
 _EXPECTED = (
     "turns such as {user, assistant}, {from: human, value} or {role: user, content}, each question "
@@ -24,22 +24,22 @@ _EXPECTED = (
 
 
 def key_of(names: Sequence[str] | Mapping[str, Any]) -> str | None:
-    """What a row or a line calls its conversation; None of one that asks a question itself."""
+    """The key of a row's or line's conversation; None if it asks a single question."""
     if any(answers in names for answers in ANSWERS):
         return None
     return next((key for key in KEYS if key in names), None)
 
 
 def questions(where: str, turns: Any, name: str | int, source: Any) -> list[Question]:
-    """A question for each turn, asked alone: what was said before is not repeated.
+    """A question for each turn, asked separately: earlier turns are not repeated.
 
     Args:
         turns: the conversation.
-        name: of its row; of several questions each has a number behind it.
-        source: what the row says it was taken from, by which families are told; None without.
+        name: of its row; several questions each get a number appended.
+        source: the row's source, which determines the family; None without one.
 
     Raises:
-        AegisError: no conversation, or a turn without its answer.
+        AegisError: this is no conversation, or a turn has no answer.
     """
     pairs = _pairs(where, turns)
     several = len(pairs) > 1
@@ -56,7 +56,7 @@ def one_picture(where: str, pictures: Any) -> Any:
     """The picture of a row that lists its pictures.
 
     Raises:
-        AegisError: none, or several.
+        AegisError: it has none, or several.
     """
     if not isinstance(pictures, list):
         return pictures
@@ -73,7 +73,7 @@ def one_picture(where: str, pictures: Any) -> Any:
 def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
     """Question, answer and source of each turn."""
     if isinstance(turns, dict) and all(isinstance(column, list) for column in turns.values()):
-        # So a column of lists of objects comes that an older version of `datasets` has declared.
+        # Older versions of `datasets` store lists of objects as columns.
         rows = zip(*turns.values(), strict=False)
         turns = [dict(zip(turns, row, strict=True)) for row in rows]
     if not isinstance(turns, list) or not turns or not all(isinstance(t, dict) for t in turns):
@@ -93,7 +93,7 @@ def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
 
 
 def _said(where: str, turn: dict[str, Any]) -> tuple[str, Any]:
-    """Who speaks in a turn, and what is said."""
+    """The speaker of a turn, and the text."""
     speaker, content = turn.get("from", turn.get("role")), turn.get("value", turn.get("content"))
     if not isinstance(speaker, str):
         raise bad(
@@ -107,14 +107,14 @@ def _said(where: str, turn: dict[str, Any]) -> tuple[str, Any]:
 
 
 def _kind(turns: Any) -> str:
-    """What stands in a conversation's place."""
+    """What is there instead of a conversation."""
     if isinstance(turns, list):
         return f"a list of {type(turns[0]).__name__}"
     return "nothing" if turns is None else f"a {type(turns).__name__}"
 
 
 def _text(said: Any) -> Any:
-    """A text without the places of pictures in it."""
+    """A text without its image markers."""
     return _PLACE.sub(" ", said).strip() if isinstance(said, str) else said
 
 

@@ -20,7 +20,7 @@ from aegis_cli.data.vqa.questions import FAMILIES, Balancer, Question, cell_labe
 if TYPE_CHECKING:  # a process that renders scenes needs neither torch nor Pillow
     from aegis_cli.data.vqa.images import Pictures
 
-# Questions of each family asked of one training scene, as far as the scene admits them.
+# Questions of each family per training scene, if the scene admits as many.
 TRAINING_MIX: dict[str, int] = {
     "color": 2,
     "shape": 2,
@@ -34,9 +34,9 @@ _CHUNK = 250  # scenes a worker renders at a time
 
 
 def digest_of(text: str) -> str:
-    """sha256 of a text such as an image's name, which need not be UTF-8.
+    """sha256 of a text such as an image's name, which need not be valid UTF-8.
 
-    Python holds what is not with halves of characters (surrogates).
+    Python represents invalid bytes by surrogates.
     """
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
@@ -60,7 +60,7 @@ class VQASet:
 
     @property
     def names(self) -> list[str] | None:
-        """A digest of each image's name; None of scenes, which every seed has drawn for itself."""
+        """A digest of each image's name; None for scenes, which each seed draws anew."""
         if isinstance(self.images, np.ndarray):
             return None
         return [digest_of(picture.key)[:10] for picture in self.images.pictures]
@@ -75,7 +75,7 @@ class VQASet:
         return replace(self, images=self.images.sized(size))
 
     def asked(self, ask: str) -> VQASet:
-        """The same set with each question in the place of the {} in `ask`."""
+        """The same set with each question inserted at the {} in `ask`."""
         if ask == "{}":
             return self
         questions = (replace(q, text=ask.replace("{}", q.text)) for q in self.questions)
@@ -92,7 +92,7 @@ class VQASet:
     def batches(self, size: int) -> Iterator[tuple[np.ndarray | list[np.ndarray], list[Question]]]:
         """Images [B, H, W, 3] and their questions, `size` pairs at a time.
 
-        Images that keep their own sizes come as a list.
+        Images that keep their own sizes are returned as a list.
         """
         for start in range(0, len(self.questions), size):
             rows = slice(start, start + size)
@@ -102,7 +102,7 @@ class VQASet:
 class Rendered(NamedTuple):
     """Scenes as arrays, and their questions.
 
-    `images` is [N, 64, 64, 3] uint8, and `cells` [N, 64] uint8 tells what stands where.
+    `images` is [N, 64, 64, 3] uint8, and `cells` [N, 64] uint8 has what is in each grid cell.
     """
 
     images: np.ndarray
@@ -116,11 +116,11 @@ def render_training(
     """`scenes` training scenes with up to `sum(TRAINING_MIX.values())` questions each.
 
     Raises:
-        AegisError: more of them than are drawn.
+        AegisError: more are requested than can be drawn.
     """
     _check_count(scenes, "scenes")
     gl.check()
-    # Chunks of one size, whatever the workers: the balance of answers is kept within a chunk.
+    # Chunks of equal size, whatever the number of workers: answers are balanced within a chunk.
     jobs = [
         (seed, "train", start, min(_CHUNK, scenes - start), TRAINING_MIX)
         for start in range(0, scenes, _CHUNK)
@@ -141,17 +141,17 @@ def load_scenes(
     """A set of `questions` questions of one split, with the seven families in equal shares.
 
     A scene is asked at most one question of each family. The first scenes that fill the quotas are
-    used: a shorter set's scenes are among a longer one's, in their order.
+    used: a shorter set's scenes are among a longer one's, in the same order.
 
     Raises:
-        AegisError: more of them than are drawn.
+        AegisError: more are requested than can be drawn.
     """
     _check_count(questions, "questions about scenes")
     gl.check()
     quota = {family: questions // len(FAMILIES) for family in FAMILIES}
     for family in FAMILIES[: questions % len(FAMILIES)]:
         quota[family] += 1
-    missing = Counter(quota)  # questions of each family that are still to be found
+    missing = Counter(quota)  # remaining questions of each family
     images: list[np.ndarray] = []
     image_of: list[int] = []
     kept: list[Question] = []
@@ -165,7 +165,7 @@ def load_scenes(
         for part in _map(jobs, workers):
             for image, scene_questions in zip(part.images, part.questions, strict=True):
                 wanted = [q for q in scene_questions if missing[q.family] > 0]
-                if wanted:  # at most one of each family, so that no quota is exceeded
+                if wanted:  # at most one of each family, so no quota is exceeded
                     missing.subtract(q.family for q in wanted)
                     image_of += [len(images)] * len(wanted)
                     images.append(image)
@@ -175,7 +175,7 @@ def load_scenes(
 
 
 def _check_count(count: int, what: str) -> None:
-    """Raise AegisError for so many that they would be drawn without an end."""
+    """Raise AegisError for a number that would take forever to draw."""
     if count > MOST_MADE:
         raise AegisError(f"{count:,} {what}", f"at most {MOST_MADE:,}", "ask for fewer")
 
@@ -197,7 +197,7 @@ def _map(jobs: Sequence[_Job], workers: int) -> Iterator[Rendered]:
 def _render_chunk(job: _Job) -> Rendered:
     """Scenes start .. start + count of a split.
 
-    Answers are balanced inside the chunk, so workers need no common state.
+    Answers are balanced within the chunk, so workers need no shared state.
     """
     from aegis_cli.data.vqa.scenes import renderer_of_thread, scene_rng  # loads OpenGL
 

@@ -1,4 +1,4 @@
-"""Questions of a data set on the hub, downloaded into the hub's own cache."""
+"""Download the questions of a data set from the hub into the hub's own cache."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from aegis_cli.data.vqa import saved
 
 @cache
 def fetch(name: str, split: str | None) -> Path:
-    """The local folder of a data set on the hub; the same one as long as the process lives.
+    """The local folder of a data set on the hub; it stays the same for the lifetime of the process.
 
     Only the parquet files of one split are downloaded.
 
     Raises:
-        AegisError: neither in the cache nor to be had, several splits to choose among, or no
-            parquet file.
+        AegisError: it is neither in the cache nor can be downloaded, there are several splits to
+            choose from, or it has no parquet file.
     """
     if not hub.is_installed():
         raise AegisError(
@@ -27,7 +27,7 @@ def fetch(name: str, split: str | None) -> Path:
             "a local set, or the package that downloads one",
             "check the path, or pip install 'aegis-vla[hf]'",
         )
-    # What there is has to be asked for first: the names of the files say which are of the split.
+    # The files have to be listed first: their names show which belong to the split.
     try:
         there = hub.list_files(name, "dataset")
     except (OSError, ValueError) as error:
@@ -40,10 +40,10 @@ def fetch(name: str, split: str | None) -> Path:
 
 
 def _cached(name: str, split: str | None, why: Exception) -> Path:
-    """The folder of a split that was downloaded before, where the hub cannot be asked."""
-    names = ["*.parquet"]  # in any folder, as the hub's client matches
+    """The folder of a split that was downloaded before, if the hub cannot be reached."""
+    names = ["*.parquet"]  # the hub's client matches in any folder
     if split is not None:
-        # The names that `saved.of_split` takes for the split's.
+        # The names that `saved.of_split` assigns to the split.
         names = [f"{split}.parquet", f"{split}-[0-9]*.parquet", f"{split}_[0-9]*.parquet"]
         names += [f"data/{own}" for own in names]
     try:
@@ -65,7 +65,7 @@ def _missing(name: str, error: Exception) -> AegisError:
 def _of_split(name: str, there: Sequence[str], split: str | None) -> list[PurePosixPath]:
     """The parquet files of a split, or of the only one."""
     parquet = [PurePosixPath(path) for path in there if path.endswith(".parquet")]
-    # Where the reader looks too: other folders would be downloaded for nothing.
+    # The folders in which the reader looks; downloading others would be useless.
     for folder in (PurePosixPath("."), PurePosixPath("data")):
         files = [path for path in parquet if path.parent == folder]
         if files:

@@ -1,6 +1,6 @@
-"""easy-VQA: 48,248 questions about drawn shapes that somebody else made, out of its PyPI package.
+"""easy-VQA: 48,248 questions about drawn shapes by another author, from its PyPI package.
 
-The package holds 4,000 images for training and 1,000 for tests, of 64 x 64 pixels with one shape
+The package has 4,000 images for training and 1,000 for tests, of 64 x 64 pixels with one shape
 each. See https://github.com/vzhou842/easy-VQA (MIT).
 """
 
@@ -16,7 +16,7 @@ from aegis_cli.data.vqa.entries import Entry, Reader, make_question
 from aegis_cli.data.vqa.images import Picture
 
 NAME = "easy-vqa"
-# Another version may ask other questions, and no file would say so.
+# Another version may have other questions, and no file would show it.
 VERSION = "1.0"
 FAMILIES: tuple[str, ...] = ("shape", "color", "exists", "exists-not")
 
@@ -25,7 +25,7 @@ def reader() -> Reader:
     """The package's questions.
 
     Raises:
-        AegisError: the package is missing, or of another version.
+        AegisError: the package is missing, or has another version.
     """
     fix = f"pip install 'aegis-vla[{NAME}]' (or {NAME}=={VERSION})"
     try:
@@ -41,7 +41,7 @@ def reader() -> Reader:
     return Reader(lambda: iter(_entries()), files)
 
 
-@cache  # reading them takes seconds, and a training is probed several times
+@cache  # reading them takes seconds, and a run is probed several times
 def _entries() -> tuple[Entry, ...]:
     return tuple(_read())
 
@@ -55,7 +55,7 @@ def _read() -> Iterator[Entry]:
     }
     for split, (questions, image_paths) in sources.items():
         paths = {image: Path(path) for image, path in image_paths().items()}
-        # Both splits number their images from 0: a key needs the split.
+        # Both splits number their images from 0, so a key needs the split.
         for number, (text, answer, image) in enumerate(zip(*questions(), strict=True)):
             where = f"{NAME} {split}, question {number}"
             question = make_question(where, text, [answer], f"{split}-{number}", family(text))
@@ -63,13 +63,13 @@ def _read() -> Iterator[Entry]:
 
 
 def is_test(key: str) -> bool:
-    """Whether an image is one of those that easy-VQA itself keeps for tests."""
+    """Whether an image belongs to easy-VQA's own test split."""
     return key.startswith("test/")
 
 
 @cache  # 48,248 questions have 107 texts
 def family(text: str) -> str:
-    """What a question asks for: a shape, a color, or whether something is there, or is not."""
+    """What a question asks for: a shape, a color, or whether something is there or is not."""
     words = text.lower().rstrip("?").split()
     if words[0] != "what":
         return "exists-not" if {"not", "no"} & set(words) else "exists"

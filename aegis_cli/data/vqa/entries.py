@@ -1,4 +1,4 @@
-"""Questions as the readers of files yield them: each is checked, and knows its place."""
+"""Questions as readers of files yield them: checked, and with their place in the file."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from aegis_cli.data.vqa.answers import reference
 from aegis_cli.data.vqa.images import Picture
 from aegis_cli.data.vqa.questions import Question
 
-# Halves of characters (surrogates): JSON can hold them, but no tokenizer takes them.
+# Surrogates: JSON can contain them, but no tokenizer accepts them.
 _HALVES = re.compile("[\ud800-\udfff]")
-# What the answers of a question are called, the first that is there.
+# The possible keys of a question's answers; the first one present is used.
 ANSWERS = ("answers", "answer", "multiple_choice_answer")
 OR_SKIP = ", or leave such questions out with --skip-bad (skip_bad: true in a recipe)"
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A question, its image, and where both stand in their file."""
+    """A question, its image, and their place in the file."""
 
     where: str
     question: Question
     picture: Picture
 
 
-# A reader goes on after a bad question, because others decide whether that ends the work.
+# A reader continues after a bad question: its caller decides whether to stop.
 Read = Entry | AegisError
 
 
@@ -40,9 +40,8 @@ class Reader:
     """A set of one format.
 
     Attributes:
-        read: yields every question, or what is wrong with it; raises where the whole set is
-            unusable.
-        files: those that hold the questions.
+        read: yields every question, or the error in it; raises if the whole set is unusable.
+        files: the files that hold the questions.
     """
 
     read: Callable[[], Iterator[Read]]
@@ -50,7 +49,7 @@ class Reader:
 
 
 def bad(where: str, found: str, expected: str, fix: str) -> AegisError:
-    """What is wrong with one question."""
+    """The error for one bad question."""
     return AegisError(f"{where}: {found}", expected, fix + OR_SKIP)
 
 
@@ -58,12 +57,12 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
     """A question that people answered.
 
     Args:
-        answers: a list of what each person said, or one person's answer alone; each a text, a whole
-            number, or an object whose `answer` is one.
+        answers: a list of each person's answer, or a single answer; each is a text, a whole number,
+            or an object whose `answer` is one of these.
 
     Raises:
-        AegisError: a text that is none, no answers, or a name that is neither text nor a whole
-            number.
+        AegisError: the question is no text, there are no answers, or the name is neither a text nor
+            a whole number.
     """
     if not _is_text(text):
         raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
@@ -74,39 +73,39 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
         raise bad(where, found, expected, 'write e.g. ["red"]')
     if isinstance(name, bool) or not isinstance(name, (str, int)):
         raise bad(where, f"id {_show(name)}", "a text or a whole number", "correct the id")
-    said = tuple(map(sys.intern, answers))  # the same few words, a million times
+    said = tuple(map(sys.intern, answers))  # the same few words occur a million times
     return Question(family, text.strip(), reference(said).strip(), said, name)
 
 
 def _texts(answers: Any) -> list[Any]:
-    """The answers one by one, whole numbers as texts."""
-    if isinstance(answers, dict):  # a column of lists, as older versions store lists of objects
+    """The answers as a list, with whole numbers as texts."""
+    if isinstance(answers, dict):  # older versions store lists of objects as columns
         answers = answers.get("answer")
     if answers is None:
         return []
     listed = answers if isinstance(answers, list) else [answers]
     said = [a.get("answer") if isinstance(a, dict) else a for a in listed]
-    # Python takes True for a number, but no person answers with it.
+    # In Python True is a number, but it is no person's answer.
     return [str(a) if isinstance(a, int) and not isinstance(a, bool) else a for a in said]
 
 
 class Inside:
-    """Image paths below a folder, with links followed; no path may lead out of it."""
+    """Image paths below a folder, with symbolic links followed; no path may lead out of it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        # It ends with a separator: `a/bc` is not below `a/b`.
+        # With a final separator: `a/bc` is not below `a/b`.
         self._root = os.path.join(os.path.realpath(folder), "")
-        self._found: dict[str, Path | None] = {}  # a name -> its file; None leads out of the folder
+        self._found: dict[str, Path | None] = {}  # name -> file; None: outside of the folder
 
     def name(self, path: Path) -> str:
-        """What a file that was found is called below the folder: one name, however it was spelt."""
+        """A found file's path relative to the folder: one name for all its spellings."""
         return os.path.relpath(path, self._root)
 
     def _inside(self, name: str) -> Path | None:
         try:
             real = os.path.realpath(self.folder / name)
-        except ValueError:  # characters that no path can have
+        except ValueError:  # characters that are invalid in paths
             return None
         return Path(real) if real.startswith(self._root) else None
 
@@ -116,7 +115,7 @@ class Inside:
         Raises:
             AegisError: it leads out of the folder, or there is no such file.
         """
-        if name not in self._found:  # many questions are about one image
+        if name not in self._found:  # many questions share an image
             self._found[name] = self._inside(name)
         path = self._found[name]
         if path is None:
@@ -139,11 +138,11 @@ class Inside:
 
 
 def unique(read: Iterable[Read]) -> Iterator[Read]:
-    """The same, but a name given a second time is a problem."""
+    """The same entries, but with an error for each repeated id."""
     first: dict[str, str] = {}
     for entry in read:
         if isinstance(entry, Entry):
-            name = str(entry.question.id)  # in predictions, 7 and "7" would be one
+            name = str(entry.question.id)  # in predictions, 7 and "7" would be the same
             if name in first:
                 entry = bad(
                     entry.where,

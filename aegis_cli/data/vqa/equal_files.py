@@ -1,4 +1,4 @@
-"""Pictures that are one and the same under two names, which a split by names tells apart."""
+"""Find equal pictures under two names, which a split by name would treat as different."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.common.files import sha256_file
 from aegis_cli.data.vqa.images import Picture
 
-# Two files of one size that are not equal nearly always differ here: their beginnings are headers,
-# which are alike in pictures of one camera.
+# Different files of equal size nearly always differ in their last bytes; their first bytes are
+# headers, which are alike in pictures of one camera.
 _END = 4096  # bytes
 _EVERY = 256  # files between two reports of progress
 
@@ -21,10 +21,10 @@ Told = Callable[[Path], int | bytes | str]
 def shared(
     held_out: Sequence[Picture], others: Sequence[Picture], on_event: OnEvent
 ) -> list[tuple[Picture, Picture]]:
-    """The held-out pictures whose file is one of the others', byte for byte, each with that one.
+    """The held-out pictures whose file equals one of the others, byte for byte, each with that one.
 
-    The ends are read of files of equal sizes alone, and all of it where the ends are equal, too.
-    Pictures that lie in no file of their own are left out.
+    Only files of equal size have their ends compared, and only those with equal ends are read
+    whole. Pictures that are not files of their own are left out.
     """
     tells: tuple[Told, ...] = (_size, _end, sha256_file)
     pairs: list[tuple[Picture, Picture]] = []
@@ -32,7 +32,7 @@ def shared(
         total = len(held_out) + len(others)
         mine = dict(_told(held_out, told, on_event, 0, total))
         theirs = dict(_told(others, told, on_event, len(held_out), total))
-        if total >= _EVERY:  # what has been begun is ended
+        if total >= _EVERY:  # complete the progress
             on_event(Progress("compare pictures", total, total, "files"))
         first = {value: picture for picture, value in reversed(theirs.items())}
         pairs = [(picture, first[value]) for picture, value in mine.items() if value in first]
@@ -45,10 +45,10 @@ def shared(
 def _told(
     pictures: Sequence[Picture], told: Told, on_event: OnEvent, before: int, total: int
 ) -> Iterator[tuple[Picture, int | bytes | str]]:
-    """What is told of each picture's file; nothing of one that cannot be read.
+    """The result of `told` for each picture's file; unreadable files are skipped.
 
     Args:
-        before: how many of `total` files have been looked at before these.
+        before: how many of the `total` files were processed before these.
     """
     for number, picture in enumerate(pictures, before + 1):
         if number % _EVERY == 0:
@@ -56,7 +56,7 @@ def _told(
         if isinstance(picture.source, Path):
             try:
                 yield picture, told(picture.source)
-            except (OSError, AegisError):  # whoever looks at the picture says what is wrong
+            except (OSError, AegisError):  # reported when the picture is used
                 continue
 
 

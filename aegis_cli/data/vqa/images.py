@@ -1,4 +1,4 @@
-"""Images that are decoded when they are looked at."""
+"""Images that are decoded when they are accessed."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Picture:
     """One image of a set.
 
     Attributes:
-        key: what identifies it; all questions about an image have the same.
-        where: for errors: the file and line that name it.
-        source: its file, or what reads its bytes.
+        key: identifies the image; the same for all questions about it.
+        where: the file and line that name it, for errors.
+        source: its file, or a function that reads its bytes.
     """
 
     key: str
@@ -31,10 +31,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Images of files by number, like the array of a rendered set; each look decodes what is new.
+    """Images of files by number, like the array of a rendered set; decoded on access.
 
     Attributes:
-        size: side in pixels that every image is brought to; None leaves them as they are.
+        size: side in pixels that every image is fitted to; None: they keep their size.
     """
 
     pictures: Sequence[Picture]
@@ -45,14 +45,14 @@ class Pictures:
         return len(self.pictures)
 
     def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray | list[np.ndarray]:
-        """Images of some rows, uint8: [B, size, size, 3], or a list of [H, W, 3] as they are.
+        """Images of some rows, uint8: [B, size, size, 3], or a list of unscaled [H, W, 3].
 
         Raises:
-            AegisError: an image that cannot be decoded.
+            AegisError: an image cannot be decoded.
         """
         numbers = np.arange(len(self))[rows].tolist()
-        # Only the last look's images are kept: questions about one image lie side by side.
-        # A copy, because another thread may look at the same time.
+        # Only the images of the last access are kept: questions about one image are adjacent. A
+        # copy, because another thread may access them at the same time.
         held = dict(self._last)
         fresh = {}
         for row in dict.fromkeys(numbers):
@@ -63,26 +63,25 @@ class Pictures:
         return images if self.size is None else np.stack(images)
 
     def sized(self, size: int | None) -> Pictures:
-        """The same images, each brought to another size."""
+        """The same images, fitted to another size."""
         return replace(self, size=size, _last={})
 
 
 def decode(picture: Picture, size: int | None) -> np.ndarray:
     """RGB pixels [H, W, 3] uint8, upright as a viewer shows them.
 
-    With a size the image is scaled to fit a square of that side (bilinear, over all the pixels it
-    shrinks) and padded with grey: nothing is cut off or distorted. An image of that very size stays
-    as it is.
+    With a size the image is scaled to fit a square of that side (bilinear, with antialiasing) and
+    padded with grey: nothing is cropped or distorted. An image of exactly that size stays as it is.
 
     Raises:
-        AegisError: what is there is no image, or only a part of one.
+        AegisError: this is no image, or an incomplete one.
     """
     source = picture.source
     try:
         pixels = decoded(source.read_bytes() if isinstance(source, Path) else source())
-    except AegisError:  # the reader knows better what is wrong
+    except AegisError:  # the reader's own error is more precise
         raise
-    except Exception as error:  # a damaged data set makes pyarrow raise nearly anything
+    except Exception as error:  # for a damaged data set, pyarrow may raise almost anything
         raise AegisError(
             f"{picture.where}: {_name(picture)} cannot be read as an image "
             f"({error or type(error).__name__})",
@@ -93,7 +92,7 @@ def decode(picture: Picture, size: int | None) -> np.ndarray:
 
 
 def tensors(images: np.ndarray | Sequence[np.ndarray]) -> Tensor | list[Tensor]:
-    """Images as a backbone takes them: [B, H, W, 3] uint8, or a list of [H, W, 3] as they are."""
+    """Images for a backbone: [B, H, W, 3] uint8, or a list of [H, W, 3] in their own sizes."""
     if isinstance(images, np.ndarray):
         return torch.from_numpy(images)
     return [torch.from_numpy(image) for image in images]

@@ -1,7 +1,7 @@
-"""`--vqa FILE.jsonl`, a question or a conversation per line; `FILE.json`, a list of such.
+"""`--vqa FILE.jsonl`: a question or a conversation per line; `FILE.json`: a list of these.
 
 A line is `{"image": "a/b.jpg", "question": "...", "answers": ["..."]}`, with an optional `"id"`.
-The answers may be called `answer` or `multiple_choice_answer`, too. Of a conversation each turn is
+The answers may also be called `answer` or `multiple_choice_answer`. In a conversation each turn is
 a question (`conversations.py`).
 """
 
@@ -31,7 +31,7 @@ def reader(path: Path) -> Reader:
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file of JSON begins as a list does."""
+    """Whether a JSON file begins with a list."""
     with files.reading(path, "check the path"), open(path, "rb") as file:
         return file.read(1024).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"["
 
@@ -44,7 +44,7 @@ def _lines(path: Path) -> Iterator[Read]:
                 continue
             where = f"line {number} of '{path}'"
             try:
-                # Some editors put a mark at the start.
+                # Some editors write a byte-order mark at the start.
                 raw = files.parse_json(line.decode("utf-8-sig"))
             except ValueError as error:
                 yield bad(where, f"not JSON ({error})", _LINE, "correct that line")
@@ -62,10 +62,10 @@ def _items(path: Path) -> Iterator[Read]:
 
 
 def _asked(where: str, place: str, raw: Any, images: Inside) -> Iterator[Read]:
-    """The questions of a line, or what is wrong with it.
+    """The questions of a line, or the error in it.
 
     Args:
-        place: by which predictions tell a question without an id.
+        place: the id in predictions for a question without one.
     """
     try:
         if not isinstance(raw, dict):
@@ -85,7 +85,7 @@ def _asked(where: str, place: str, raw: Any, images: Inside) -> Iterator[Read]:
 
 
 def _questions(where: str, raw: dict[str, Any], name: Any) -> list[Question]:
-    """The one that it asks, or those of its conversation."""
+    """The line's single question, or those of its conversation."""
     if (key := conversations.key_of(raw)) is not None:
         return conversations.questions(where, raw[key], name, raw.get("source"))
     answers = next(key for key in ANSWERS if key in raw)
@@ -93,7 +93,7 @@ def _questions(where: str, raw: dict[str, Any], name: Any) -> list[Question]:
 
 
 def _check_keys(where: str, raw: dict[str, Any]) -> None:
-    """Raise AegisError unless it has an image, and a question with answers or a conversation."""
+    """Raise AegisError unless there are an image and a question with answers or a conversation."""
     needed = ["image"]
     if conversations.key_of(raw) is None:
         needed += ["question", next((key for key in ANSWERS if key in raw), ANSWERS[0])]
@@ -109,12 +109,12 @@ def _check_keys(where: str, raw: dict[str, Any]) -> None:
 
 
 def _picture(where: str, raw: dict[str, Any], images: Inside) -> Picture:
-    """The one image that it asks about."""
+    """The one image that a line asks about."""
     shown = conversations.one_picture(where, raw.get("image", raw.get("images")))
     if not isinstance(shown, str):
         raise bad(
             where, f"image {shown!r}", "a path relative to the file's folder", "correct the path"
         )
     path = images.find(where, shown)
-    # Not as it is spelt: two spellings of one image would put it into two parts.
+    # By its resolved name: two spellings of one image must not put it into two parts.
     return Picture(images.name(path), where, path)

@@ -1,4 +1,4 @@
-"""Whether a model knows enough of some questions for a drop in accuracy to mean anything."""
+"""Whether a model knows enough about some questions for a drop in accuracy to be meaningful."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from aegis_cli.data.vqa import sets
 def warn_if_little(
     accuracy: float, majority: float, model: str, ask: str, stage: str, on_event: OnEvent
 ) -> None:
-    """Warn where a drop says nothing, since the questions were not answered before either.
+    """Warn if a drop means nothing, because the questions were not answered before training either.
 
     Args:
-        accuracy: of the model before its training, in [0, 1].
-        majority: what always giving a family's commonest answer would have, in [0, 1].
+        accuracy: of the model before training, in [0, 1].
+        majority: accuracy of always giving a family's most common answer, in [0, 1].
         model: its name.
         ask: how the questions were asked.
     """

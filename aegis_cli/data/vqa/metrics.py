@@ -27,10 +27,10 @@ class Graded:
     """One answered question.
 
     Attributes:
-        correct: whether it is the reference answer.
+        correct: whether the answer is the reference.
         cross_entropy: -log p(reference answer), nats.
         image: the image's number in the set.
-        soft: VQA's soft accuracy; None where the answer is computed and not what people said.
+        soft: VQA's soft accuracy; None if the reference is computed and not given by people.
     """
 
     question: Question
@@ -58,24 +58,24 @@ class Score:
 
 
 def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927): sound near 0 and 1 too.
+    """95 % score interval of a proportion (Wilson 1927): valid near 0 and 1 too.
 
-    Trials that are not independent count as fewer, so that neither number has to be whole.
+    Dependent trials count as fewer, so neither number has to be an integer.
     """
     share = successes / trials
     scale = 1 + Z_95**2 / trials
     middle = (share + Z_95**2 / (2 * trials)) / scale
     half = Z_95 * math.sqrt(share * (1 - share) / trials + Z_95**2 / (4 * trials**2)) / scale
     low, high = max(0.0, middle - half), min(1.0, middle + half)
-    # Both sums end there but for rounding.
+    # Without rounding errors, both would be exactly these.
     return 0.0 if successes == 0 else low, 1.0 if successes == trials else high
 
 
 def alike_interval(value: float, samples: int) -> Interval:
-    """95 % interval of a mean in [0, 1] whose samples all have one value.
+    """95 % interval of a mean in [0, 1] whose samples all have the same value.
 
-    Their spread is then 0 and says nothing. The share of samples with another value is at most
-    Wilson's bound for a share that was never seen, and these lie as far away as there is room.
+    Their spread of 0 is not informative. The share of other values is at most Wilson's bound for a
+    share that was never observed, and those values are taken to be as far away as possible.
     """
     _, share = wilson_interval(0, samples)
     return value - share * value, value + share * (1 - value)
@@ -84,12 +84,12 @@ def alike_interval(value: float, samples: int) -> Interval:
 def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: int = 0) -> Interval:
     """95 % percentile interval of a mean over questions (bootstrap, Efron 1979).
 
-    Whole images are drawn with replacement. Questions about one image share its difficulty, so that
-    drawing questions would make the interval too narrow. Where all images have one mean, no draw
-    has another: then it is the `alike_interval` of values in [0, 1].
+    Whole images are drawn with replacement. Questions about one image share its difficulty, so
+    drawing questions would make the interval too narrow. If all images have the same mean, so do
+    all draws: then the `alike_interval` of values in [0, 1] is used.
     """
     _, image = np.unique(np.asarray(image_of), return_inverse=True)
-    # A draw of images needs no more of them than their sums and numbers of questions.
+    # A draw of images only needs their sums and numbers of questions.
     sums, counts = np.bincount(image, np.asarray(values, np.float64)), np.bincount(image)
     if np.ptp(sums / counts) == 0:
         return alike_interval(float(sums[0] / counts[0]), len(sums))
@@ -105,9 +105,9 @@ def bootstrap_interval(values: Sequence[float], image_of: Sequence[int], seed: i
 def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[float, int]:
     """Standard error of a mean whose samples come in clusters, and the number of clusters.
 
-    It is that of a ratio of cluster totals (Cochran 1977, Sampling Techniques, section 6.3): how
-    far each cluster's sum is from what its size lets expect. One cluster has no error that could be
-    told: infinity.
+    It is that of a ratio of cluster totals (Cochran 1977, Sampling Techniques, section 6.3), from
+    the difference of each cluster's sum to what its size predicts. For one cluster the error cannot
+    be estimated: it is infinity.
     """
     _, cluster = np.unique(np.asarray(cluster_of), return_inverse=True)
     sums, sizes = np.bincount(cluster, values), np.bincount(cluster)  # of each cluster
@@ -120,10 +120,10 @@ def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[floa
 
 
 def score(graded: Sequence[Graded]) -> Score:
-    """Figures over some answered questions.
+    """The figures of some answered questions.
 
-    The accuracy has Wilson's interval of as many questions as would tell as much if they were
-    independent: those about one image share its difficulty.
+    The accuracy has Wilson's interval for the effective number of independent questions: those
+    about one image share its difficulty.
     """
     hits, images = np.array([float(g.correct) for g in graded]), [g.image for g in graded]
     soft = [g.soft for g in graded if g.soft is not None]
@@ -143,10 +143,10 @@ def score(graded: Sequence[Graded]) -> Score:
 def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval:
     """95 % interval of the accuracy lost, from the differences of the same questions.
 
-    Questions about one image share its difficulty, so they count as fewer: as many as would tell as
-    much if they were independent.
+    Questions about one image share its difficulty, so they count as fewer: as the effective number
+    of independent questions.
     """
-    # Differences of pairs: how hard a question is cancels, which two accuracies apart would not.
+    # Paired differences: a question's difficulty cancels, unlike in two separate accuracies.
     pairs = zip(before, after, strict=True)
     lost = np.array([float(b.correct) - float(a.correct) for b, a in pairs])
     return mean_loss_interval(lost, [g.image for g in after])
@@ -155,11 +155,11 @@ def drop_interval(before: Sequence[Graded], after: Sequence[Graded]) -> Interval
 def mean_loss_interval(losses: np.ndarray, cluster_of: Sequence[int]) -> Interval:
     """95 % interval of a mean of losses, each in [-1, 1].
 
-    The mean is what was lost less what was won. Each has Wilson's interval, and the ends of both
-    are put together by squares (MOVER: Zou & Donner 2008, Statistics in Medicine 27(10),
-    1693-1702), with the correlation of two shares of the same questions. So no change at all is no
-    certainty. Losses of less than 1 vary less than the share that Wilson's interval takes their
-    mean for, so that it is rather too wide for them.
+    The mean is the share lost minus the share won. Each has Wilson's interval, and their distances
+    are combined as squares (MOVER: Zou & Donner 2008, Statistics in Medicine 27(10), 1693-1702),
+    with the correlation of two shares of the same questions. So the interval has a width even if
+    nothing changed. Losses between 0 and 1 vary less than the share that Wilson's interval assumes,
+    so for them it is rather too wide.
 
     Args:
         losses: [N].
@@ -168,32 +168,31 @@ def mean_loss_interval(losses: np.ndarray, cluster_of: Sequence[int]) -> Interva
     count = len(losses) / _design_effect(losses, cluster_of)
     lost = float(losses.clip(min=0).mean())
     won = float((-losses).clip(min=0).mean())
-    # Shares of as many questions as would tell as much if they were independent.
+    # Shares of the effective number of independent questions.
     least_lost, most_lost = wilson_interval(lost * count, count)
     least_won, most_won = wilson_interval(won * count, count)
-    # A question that was lost cannot have been won: of two shares, one is small where the other is
-    # large.
+    # A question that was lost cannot have been won, so the two shares are negatively correlated.
     alike = math.sqrt(lost * won / ((1 - lost) * (1 - won))) if lost < 1 and won < 1 else 0.0
-    # The mean is least where little was lost and much was won, and the other way round.
+    # The mean is lowest if little was lost and much was won, and vice versa.
     below = _together(lost - least_lost, most_won - won, alike)
     above = _together(most_lost - lost, won - least_won, alike)
     return lost - won - below, lost - won + above
 
 
 def _together(a: float, b: float, alike: float) -> float:
-    """How far the difference of two shares reaches that reach a and b, correlated by -`alike`."""
+    """The reach of the difference of two shares that reach a and b, with correlation -`alike`."""
     return math.sqrt(a * a + b * b + 2 * alike * a * b)
 
 
 def _design_effect(values: np.ndarray, cluster_of: Sequence[int]) -> float:
-    """How many times larger clusters make the variance of a mean, at least 1 (Kish 1965).
+    """The factor by which clusters increase the variance of a mean, at least 1 (Kish 1965).
 
-    Where all values are the same, they do not tell, and it is 1.
+    If all values are equal, it cannot be estimated, and is 1.
     """
     if np.ptp(values) == 0:
         return 1.0
     error, clusters = clustered_error(values, cluster_of)
-    if clusters == 1:  # all that is known is of one image: it counts as one question
+    if clusters == 1:  # all questions are about one image: they count as one question
         return float(len(values))
     return max(1.0, error**2 * len(values) / float(values.var(ddof=1)))
 
@@ -215,18 +214,18 @@ def grade(
 ) -> list[Graded]:
     """Ask every question of a set, and grade the answers.
 
-    For scenes an answer counts if it equals the reference word for word.
+    For scenes an answer is correct if it equals the reference word for word.
 
     Args:
-        answers: what is said to batches of images with questions, and log p(reference answer) of
-            each in nats, as a backbone's own `answers` tells.
-        on_graded: is given each batch's graded answers when they have come.
+        answers: a function from batches of images with questions to the given answers and log
+            p(reference answer) of each in nats, such as a backbone's own `answers`.
+        on_graded: called with each batch's graded answers.
     """
     graded: list[Graded] = []
     on_event(Progress("probe", 0, len(questions.questions), "questions"))
     for said, likelihood in answers(_asked(questions, batch_size)):
         rows = slice(len(graded), len(graded) + len(said))
-        # Answers come in the questions' order, and a batch of them at a time.
+        # Answers arrive in the order of the questions, one batch at a time.
         surprise, numbers = (-likelihood).tolist(), questions.image_of[rows].tolist()
         for row in zip(questions.questions[rows], said, surprise, numbers, strict=True):
             graded.append(graded_answer(*row))
@@ -242,13 +241,13 @@ def _asked(questions: VQASet, batch_size: int) -> Iterator[Asked]:
 
 
 def graded_answer(question: Question, said: str, cross_entropy: float, image: int) -> Graded:
-    """What was said to a question about an image of this number, graded."""
+    """Grade the answer to a question about the image of this number."""
     soft = soft_accuracy(said, question.answers) if question.answers else None
     return Graded(question, said, question.is_answered_by(said), cross_entropy, image, soft)
 
 
 def prediction(graded: Graded, number: int) -> dict[str, Any]:
-    """One line of `--predictions`; a question without a name goes by its number in the set."""
+    """One line of `--predictions`; a question without an id is named by its number in the set."""
     asked = graded.question
     return {
         "id": number if asked.id is None else asked.id,

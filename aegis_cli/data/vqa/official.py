@@ -1,7 +1,8 @@
 """`--vqa …_questions.json`: VQAv2 and OK-VQA as their sites distribute them.
 
-Beside the questions file lie its annotations file, under its official name, and the images, as
-COCO's archive unpacks them (`val2014/COCO_val2014_000000262148.jpg`) or without that folder.
+The annotations file, under its official name, has to be beside the questions file, and so do the
+images, as COCO's archive unpacks them (`val2014/COCO_val2014_000000262148.jpg`) or without that
+folder.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ def reader(path: Path) -> Reader:
     """The questions of one questions file and its annotations.
 
     Raises:
-        AegisError: no annotations file of its name beside it.
+        AegisError: there is no annotations file of the matching name beside it.
     """
     common = path.name.replace("OpenEnded_", "").removesuffix(SUFFIX)
     annotations = path.with_name(common + "annotations.json")
     if not annotations.is_file():
-        # If the file holds no questions, that is the error, not the missing annotations.
+        # If the file holds no questions, report that instead of the missing annotations.
         _rows(path, _load(path), "questions")
         raise AegisError(
             f"no file '{annotations}'",
@@ -39,7 +40,7 @@ def reader(path: Path) -> Reader:
 
 
 def misnamed(path: Path) -> AegisError:
-    """What is wrong with a .json file that is not called a questions file: content or name."""
+    """The error for a .json file not named like a questions file: wrong content or name."""
     _rows(path, _load(path), "questions")
     return AegisError(
         f"'{path}' has questions, and a name that does not end in '{SUFFIX}'",
@@ -49,11 +50,11 @@ def misnamed(path: Path) -> AegisError:
 
 
 def _read(path: Path, annotations: Path) -> Iterator[Read]:
-    """Each question with its annotation, then the annotations that no question is left for."""
+    """Each question with its annotation, then an error for each annotation without a question."""
     whole = _load(path)
     questions = _rows(path, whole, "questions")
     images = _Images(path, whole.get("data_subtype"))
-    told: dict[Any, Any] = {}  # annotations by their question; `_entry` takes out what it uses
+    told: dict[Any, Any] = {}  # annotations by question; `_entry` removes those it uses
     for number, row in enumerate(_rows(annotations, _load(annotations), "annotations"), start=1):
         name = _id(row)
         if name is not None and name not in told:
@@ -81,7 +82,7 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
 
 
 def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images: _Images) -> Entry:
-    """One question; its annotation is taken out of `told`."""
+    """One question; its annotation is removed from `told`."""
     name = _id(row)
     if name is None:
         raise bad(
@@ -90,7 +91,7 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
             "an object with question_id, image_id and question",
             "correct the file",
         )
-    # From here on the id says which question is meant: both files have it.
+    # From here on errors name the id, which both files have.
     where = f"question_id {name} of {where.partition(' of ')[2]}"
     annotation = told.pop(name, None)
     if annotation is None:
@@ -115,13 +116,13 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
 
 
 def _id(row: Any) -> str | int | None:
-    """The question that a row of either file is of; None where it does not say so."""
+    """The question id of a row of either file; None if it has none."""
     name = row.get("question_id") if isinstance(row, dict) else None
     return name if isinstance(name, (str, int)) else None
 
 
 def _no_id(row: Any) -> str:
-    """What a row has in place of a question's id."""
+    """What a row has instead of a question id."""
     name = row.get("question_id") if isinstance(row, dict) else None
     return "no question_id" if name is None else f"question_id {name!r}"
 
@@ -143,12 +144,12 @@ class _Images:
         """The image of this number.
 
         Raises:
-            AegisError: no whole number, or no file of it.
+            AegisError: it is no whole number, or has no file.
         """
         if type(number) is not int or number < 0:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"
-        if number not in self._found:  # several questions are about one image
+        if number not in self._found:  # several questions share an image
             places = [folder / name for folder in self._folders]
             path = next((place for place in places if os.path.isfile(place)), None)
             if path is None:

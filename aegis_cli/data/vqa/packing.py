@@ -1,4 +1,4 @@
-"""An image's questions as blocks of tokens that share one image pass."""
+"""Pack an image's questions as blocks of tokens that share one image pass."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Packed:
     prompt_length: np.ndarray
 
     def blocks(self, rows: np.ndarray, share: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks `share` of some images, cut to their longest.
+        """The blocks `share` of some images, cut to the longest of them.
 
         These are ids [B, Q', S'] and prompt_length [B, Q'].
         """
@@ -42,16 +42,16 @@ def pack(
     """Tokenise up to `blocks` questions per image.
 
     Args:
-        encode: gives the tokens of a text. Token 0 is padding, 1 the answer marker and 2 the end.
+        encode: a text -> its tokens. Token 0 is padding, 1 the answer marker and 2 the end.
         blocks, length: Q and S.
     """
     ids = np.zeros((len(questions), blocks, length), np.uint16)
     prompt_length = np.zeros((len(questions), blocks), np.uint8)
     for n, asked in enumerate(questions):
         rows = [(encode(q.text), encode(q.answer)) for q in asked]
-        # By length: a share of the blocks, cut to its longest, then has little padding.
+        # By length, so that a share of the blocks, cut to its longest, has little padding.
         rows.sort(key=lambda row: len(row[0]) + len(row[1]))
-        # Empty blocks come first, as the shortest.
+        # Empty blocks come first, being the shortest.
         for b, (question, answer) in enumerate(rows, start=blocks - len(rows)):
             tokens = [*question, 1, *answer, 2]
             ids[n, b, : len(tokens)] = tokens
@@ -60,7 +60,7 @@ def pack(
 
 
 def mirror_words(vocabulary: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Token maps of a mirrored image: for every position, and for the answer left and right too."""
+    """Token maps for a mirrored image: for all positions, and for answers (left and right too)."""
     everywhere = np.arange(len(vocabulary))
     for i, name in enumerate(X_WORDS):
         everywhere[vocabulary.index(name)] = vocabulary.index(X_WORDS[GRID - 1 - i])
@@ -77,18 +77,18 @@ def mirror(
     flip: np.ndarray,
     words: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror the images [B, H, W, 3] where `flip` [B] holds, with the words of location."""
+    """Mirror the images [B, H, W, 3] where `flip` [B] is True, and swap the location words."""
     images, blocks = images.copy(), blocks.copy()
     images[flip] = images[flip][:, :, ::-1]  # the third axis is the width
     turned = blocks[flip]
-    # "left or right" in a question lists what may be answered; in an answer the words change place.
+    # In a question, "left or right" lists the possible answers; in an answer the words are swapped.
     answer = np.arange(blocks.shape[-1]) >= prompt_length[flip][..., None]
     blocks[flip] = np.where(answer, words[1][turned], words[0][turned])
     return images, blocks
 
 
 def mirror_cells(cells: np.ndarray, flip: np.ndarray) -> np.ndarray:
-    """Cell labels [B, 64] of images mirrored where `flip` [B] holds."""
+    """Cell labels [B, 64] of images, mirrored where `flip` [B] is True."""
     grid = cells.reshape(-1, GRID, GRID)  # rows from top to bottom
     mirrored = np.where(flip[:, None, None], grid[:, :, ::-1], grid)
     return mirrored.reshape(len(cells), -1)

@@ -1,4 +1,4 @@
-"""Seven families of questions about a scene, with answers balanced inside each family."""
+"""Seven families of questions about a scene, with answers balanced within each family."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ X_WORDS: tuple[str, ...] = tuple(f"x{i}" for i in range(GRID))
 Y_WORDS: tuple[str, ...] = tuple(f"y{i}" for i in range(GRID))
 _MIN_SIDE_GAP_PX = 6.0
 
-# "target" and "pad" name any thing, "point to" asks where it is: what an instruction to a robot
-# needs.
+# As in instructions to a robot, "target" and "pad" name any thing, and "point to" asks where it is.
 _NOUNS = ("object", "thing", "target", "pad")
 _WHERE = (
     "where is the {}",
@@ -32,7 +31,7 @@ _WHERE = (
     "touch the {}",
     "reach the {}",
 )
-# Words an instruction to a robot may hold beyond those of the questions.
+# Words of robot instructions that do not occur in the questions.
 INSTRUCTION_WORDS: tuple[str, ...] = tuple(
     (
         "move go push drive bring put slide steer guide touch reach point finger ball mass arm tip "
@@ -43,12 +42,12 @@ INSTRUCTION_WORDS: tuple[str, ...] = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question, its reference answer, and who says so.
+    """A question, its reference answer, and people's answers.
 
     Attributes:
         text, answer: for a scene, lower-case words separated by single spaces.
-        answers: what people said, `answer` being the commonest; () where it is computed and holds
-            word for word.
+        answers: people's answers, of which `answer` is the most common; () if the answer is
+            computed and has to match word for word.
         id: the set's own name for the question.
     """
 
@@ -59,7 +58,7 @@ class Question:
     id: str | int | None = None
 
     def compared(self, answer: str) -> str:
-        """An answer as it is compared with others; people's spelling does not count."""
+        """An answer in the form that is compared; people's answers are normalised."""
         return normalise(answer) if self.answers else answer
 
     def is_answered_by(self, said: str) -> bool:
@@ -74,9 +73,9 @@ def location_words(x_px: float, y_px: float) -> str:
 
 
 def cell_labels(scene: Scene) -> np.ndarray:
-    """What stands in each cell of the grid, [64] uint8 row by row.
+    """What is in each cell of the grid, [64] uint8 row by row.
 
-    0 is nothing, else it is 1 + 3 color + shape.
+    0 is nothing; a thing is 1 + 3 color + shape.
     """
     labels = np.zeros((GRID, GRID), np.uint8)
     cell = IMAGE_SIZE / GRID
@@ -88,7 +87,7 @@ def cell_labels(scene: Scene) -> np.ndarray:
 
 def vocabulary() -> tuple[str, ...]:
     """Every word that a question, an answer or an instruction may use, in a fixed order."""
-    # The places in this list are the tokens of a pre-trained model: another order is another model.
+    # The indices in this list are the tokens of pre-trained models: the order must not change.
     templates = " ".join((*_WHERE, *_COLOR, *_SHAPE, *_COUNT, *_EXISTS, *_SIDE)).replace("{}", "")
     plural = [f"{shape}s" for shape in SHAPES]
     words = (
@@ -118,7 +117,7 @@ _SIDE = ("is the {} left or right of the {}",)
 
 
 def _names(thing: Thing, things: tuple[Thing, ...], hide: str = "") -> list[str]:
-    """Noun phrases that fit this thing alone, without the attribute that the question asks for."""
+    """Noun phrases that fit only this thing, without the attribute that the question asks for."""
     same_color = sum(t.color == thing.color for t in things) == 1
     same_shape = sum(t.shape == thing.shape for t in things) == 1
     same_both = sum((t.color, t.shape) == (thing.color, thing.shape) for t in things) == 1
@@ -155,7 +154,7 @@ def _ask_shape(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 
 def _ask_count(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     plural = _pick(rng, ("objects", "things"))
-    # NUMBERS ends with the most things that a scene has.
+    # NUMBERS ends with the maximum number of things in a scene.
     yield Question("count", _pick(rng, _COUNT).format(plural), NUMBERS[len(scene.things)])
 
 
@@ -170,11 +169,11 @@ def _ask_count_kind(scene: Scene, rng: np.random.Generator) -> Iterator[Question
 
 
 def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
-    # A dict, not a set, whose order would change with the process.
+    # A dict, since the order of a set differs between processes.
     kinds = list(dict.fromkeys((t.color, t.shape) for t in scene.things))
     for color, shape in kinds:
         yield Question("exists", _pick(rng, _EXISTS).format(f"{color} {shape}"), "yes")
-    # The hard "no": one of colour and shape is there, the other may be, their combination is not.
+    # The hard "no": the colour or the shape occurs in the scene, but not their combination.
     with_its_color = _pick(rng, [t.color for t in scene.things]), _pick(rng, SHAPES)
     with_its_shape = _pick(rng, COLORS), _pick(rng, [t.shape for t in scene.things])
     for pair in (with_its_color, with_its_shape):
@@ -189,7 +188,7 @@ def _ask_exists(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
 def _ask_side(scene: Scene, rng: np.random.Generator) -> Iterator[Question]:
     for one in scene.things:
         for other in scene.things:
-            gap = one.x_px - other.x_px  # below 0 where `one` is on the left
+            gap = one.x_px - other.x_px  # negative if `one` is on the left
             names, others = _names(one, scene.things), _names(other, scene.things)
             if one is not other and abs(gap) >= _MIN_SIDE_GAP_PX and names and others:
                 text = _SIDE[0].format(_pick(rng, names), _pick(rng, others))
@@ -219,7 +218,7 @@ _ASK = {
 class Balancer:
     """Chooses, among the questions that a scene admits, those whose answers are rare so far.
 
-    A family's answers are counted apart from the others'.
+    Each family's answers are counted separately.
     """
 
     asked: dict[str, Counter[str]] = field(
@@ -229,9 +228,9 @@ class Balancer:
     def choose(
         self, scene: Scene, family: str, count: int, rng: np.random.Generator
     ) -> list[Question]:
-        """Up to `count` questions of one family; fewer where the scene admits fewer."""
+        """Up to `count` questions of one family; fewer if the scene admits fewer."""
         candidates = list(dict.fromkeys(_ASK[family](scene, rng)))  # equal questions once
-        # `min` below takes the first of equally rare answers, which would be the scene's first.
+        # `min` below takes the first of equally rare answers, which would favour the scene's order.
         rng.shuffle(candidates)  # type: ignore[arg-type]
         chosen = []
         while candidates and len(chosen) < count:
@@ -243,7 +242,7 @@ class Balancer:
 
 
 def majority_share(questions: Iterable[Question]) -> float:
-    """The accuracy of always giving a family's commonest answer: the weak baseline."""
+    """The accuracy of always giving a family's most common answer: the weak baseline."""
     answers: dict[str, Counter[str]] = {}
     for question in questions:
         answers.setdefault(question.family, Counter())[question.compared(question.answer)] += 1

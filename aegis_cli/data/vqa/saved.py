@@ -1,9 +1,9 @@
 """`--vqa FOLDER[#SPLIT]`: a Hugging Face dataset as `save_to_disk` wrote it, or as parquet.
 
 Columns: `image` or `images`, `question`, and `answers` (texts, or objects with the key `answer`),
-else `answer` or `multiple_choice_answer`; or a conversation in place of questions and answers
-(`conversations.py`). Where they exist, `question_id` or `id`, `image_id`, `answer_type` and
-`source` are read too.
+else `answer` or `multiple_choice_answer`; or a conversation instead of questions and answers
+(`conversations.py`). If present, `question_id` or `id`, `image_id`, `answer_type` and `source` are
+read too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NAMES = ("question_id", "id")
 _SAVED, _SPLITS = "state.json", "dataset_dict.json"
 Stem = TypeVar("Stem", bound=PurePath)
 
-# What follows a split's name in the names of its parquet files; older ones have a hash.
+# The suffix after a split's name in the names of its parquet files; older ones have a hash.
 _PART = re.compile(r"(^|[-_])\d+(-of-\d+(-[0-9a-f]+)?)?$")
 
 
@@ -41,30 +41,30 @@ def reader(path: Path, split: str | None = None) -> Reader:
     """The questions of one split.
 
     Args:
-        split: its name; None: there is only one.
+        split: its name; None if there is only one.
 
     Raises:
-        AegisError: several splits, none of that name, a pipe in place of a file, or no package that
-            reads them.
+        AegisError: there are several splits or none of that name, a file is a pipe, or the package
+            is missing.
     """
     _check_package()
     if (path / _SPLITS).is_file():
         path = _folder_of_split(path, split)
-        split = None  # that folder is one split
+        split = None  # that folder holds one split
     if (path / _SAVED).is_file():
         files = sorted(path.glob("*.arrow"))
         if split is not None:
             raise _no_split(path, split, [])
     else:
         files = list(of_split(str(path), _parquet(path), split))
-    # `datasets` would wait for a pipe for ever.
+    # `datasets` would wait forever for a pipe.
     for file in (*files, *path.glob("*.json")):
         refuse_special(file)
     return Reader(lambda: _read(path, tuple(files)), tuple(files))
 
 
 def _folder_of_split(path: Path, split: str | None) -> Path:
-    """The folder that save_to_disk wrote of a split, or of the only one for None."""
+    """The folder that save_to_disk wrote for a split, or for the only one if None."""
     folders = {saved.parent.name: saved.parent for saved in path.glob(f"*/{_SAVED}")}
     if not folders:
         raise AegisError(
@@ -76,13 +76,13 @@ def _folder_of_split(path: Path, split: str | None) -> Path:
 
 
 def of_split(where: str, files: Sequence[Stem], split: str | None) -> list[Stem]:
-    """The parquet files of a split, or of the only one for None.
+    """The parquet files of a split, or of the only one if None.
 
     Args:
         where: the set's path or name.
 
     Raises:
-        AegisError: several splits, or none of that name.
+        AegisError: there are several splits, or none of that name.
     """
     splits = [_split(file) for file in files]
     chosen = _chosen(where, splits, split)
@@ -90,7 +90,7 @@ def of_split(where: str, files: Sequence[Stem], split: str | None) -> list[Stem]
 
 
 def _split(file: PurePath) -> str:
-    """The split of a parquet file, by its name; files that are only numbered are of one split."""
+    """The split of a parquet file, by its name; files that are only numbered form one split."""
     return _PART.sub("", file.stem) or "numbered files"
 
 
@@ -112,7 +112,7 @@ def _check_package() -> None:
 
 
 def _chosen(where: str, names: Sequence[str], split: str | None) -> str:
-    """The split that was asked for, or the only one for None."""
+    """The requested split, or the only one if None."""
     splits = sorted(set(names))
     if split is not None:
         if split not in splits:
@@ -150,8 +150,8 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
             file = folder.find(where, apart) if isinstance(apart, str) and apart else None
             source = file or _InRow(stored, number, where)
             image_id = row.get("image_id")
-            # Rows repeat their images: equal bytes are one image, which belongs to one part. Where
-            # it has a name, no image has to be read to tell that.
+            # Rows repeat images: equal bytes are one image, which belongs to one part. If it has an
+            # id, no image has to be read to know that.
             key = _digest(source) if image_id is None else f"image {image_id}"
             for question in _questions(where, row, number if name is None else row[name]):
                 yield Entry(where, question, Picture(key, where, source))
@@ -160,7 +160,7 @@ def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
 
 
 def _pictures(columns: Sequence[str]) -> str:
-    """The column of images, or of lists of them."""
+    """The column of images, or of lists of images."""
     return "images" if "image" not in columns and "images" in columns else "image"
 
 
@@ -178,7 +178,7 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
 
 
 def _questions(where: str, row: dict[str, Any], name: Any) -> list[Question]:
-    """The one that a row asks, or those of its conversation."""
+    """A row's single question, or those of its conversation."""
     if (key := conversations.key_of(row)) is not None:
         return conversations.questions(where, row[key], name, row.get("source"))
     answers = next(c for c in ANSWERS if c in row)
@@ -188,13 +188,13 @@ def _questions(where: str, row: dict[str, Any], name: Any) -> list[Question]:
 
 
 def _open(path: Path, files: tuple[Path, ...]) -> Any:
-    """The rows, their images as stored."""
+    """The rows, with images as stored bytes."""
     import datasets
 
     datasets.disable_progress_bars()  # ours are enough
     log = logging.getLogger("datasets")
     before = log.level
-    log.setLevel(logging.CRITICAL)  # what it would log of a damaged file, the error says
+    log.setLevel(logging.CRITICAL)  # the error already says what is wrong with a damaged file
     try:
         if files and files[0].suffix == ".parquet":
             rows = datasets.Dataset.from_parquet([str(f) for f in files])
@@ -202,11 +202,11 @@ def _open(path: Path, files: tuple[Path, ...]) -> Any:
             rows = datasets.load_from_disk(str(path))
         columns = list(rows.column_names)
         column = _pictures(columns)
-        # As bytes: to decode every image would take hours before the first question. A column of
-        # lists would be written anew for that, beside the set; it is read by pyarrow instead.
+        # As bytes: decoding every image would take hours before the first question. A column of
+        # lists would be rewritten beside the set by the cast, so it is read by pyarrow instead.
         if column in columns and not _is_listed(rows, column):
             rows = rows.cast_column(column, datasets.Image(decode=False))
-    except Exception as error:  # a damaged file makes pyarrow raise nearly anything
+    except Exception as error:  # for a damaged file, pyarrow may raise almost anything
         raise _unreadable(path, error) from error
     finally:
         log.setLevel(before)
@@ -225,7 +225,7 @@ def _is_listed(rows: Any, column: str) -> bool:
 
 
 def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
-    """The rows one by one; a damaged file may hold fewer than it says."""
+    """The rows one by one; a damaged file may have fewer than it claims."""
     remaining = iter(rows)
     while True:
         try:
@@ -238,16 +238,16 @@ def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _unreadable(path: Path, error: Exception) -> AegisError:
-    # `datasets` says that a file could not be read, and its cause says why.
+    # `datasets` only says that a file could not be read; its cause says why.
     why = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
     expected = "questions in a folder that datasets saved, or in whole parquet files"
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
 
 
 def _outside(rows: Any) -> list[str | int | None]:
-    """The path of each row's image that the row does not hold itself; no image is read for that.
+    """The path of each row's image if it is not stored in the row; no image is read for this.
 
-    A number says how many images a row has that has not one.
+    A number is the count of images in a row that does not have exactly one.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -260,7 +260,7 @@ def _outside(rows: Any) -> list[str | int | None]:
         images = pa.chunked_array([pc.list_flatten(images)])
     stored, paths = pc.struct_field(images, "bytes"), pc.struct_field(images, "path")
     size = pc.fill_null(pc.binary_length(stored), 0)
-    # Where a row has both, its path is the one that the image had on somebody's disk.
+    # If a row has both, the path is only where the image was on its author's disk.
     missing = pc.equal(size, 0)
     apart = pc.if_else(missing, paths, None).to_pylist()
     if counts is None:
@@ -272,7 +272,7 @@ def _outside(rows: Any) -> list[str | int | None]:
 
 @dataclass
 class _Stored:
-    """The rows of a set. A copy that travels to another process opens its files there."""
+    """The rows of a set. A copy sent to another process opens its files there."""
 
     path: Path
     files: tuple[Path, ...]
@@ -288,7 +288,7 @@ class _Stored:
 
 @dataclass(frozen=True)
 class _InRow:
-    """What reads the bytes of an image that lies in its row."""
+    """Reads the bytes of an image that is stored in its row."""
 
     stored: _Stored
     number: int
@@ -305,5 +305,5 @@ class _InRow:
 
 
 def _digest(source: Path | Callable[[], bytes]) -> str:
-    """sha256 of an image's bytes, wherever they lie."""
+    """sha256 of an image's bytes, from a file or a function."""
     return sha256_file(source) if isinstance(source, Path) else hashlib.sha256(source()).hexdigest()

@@ -1,9 +1,9 @@
-"""Rendered scenes of coloured primitives: what the embedded VLM sees.
+"""Rendered scenes of coloured primitives, on which the embedded VLM is trained.
 
 A scene is one to four cubes, balls and cylinders on a floor, seen by a camera anywhere between
 oblique and straight down. Floor, light, object size and grey clutter vary, so that a robot's view
-is not alien to a VLM that grew up on scenes. Objects are placed by their position in the *image*,
-which makes every answer to "where is it" equally likely.
+is not too different for a VLM trained on scenes. Objects are placed by their position in the
+*image*, which makes every answer to "where is it" equally likely.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from aegis_cli.common import gl, interrupts, palette
 
 gl.choose_backend()
-# dm_control ends the display that all contexts share when the interpreter ends. What is registered
-# last runs first: it has to be imported before a context of ours is registered to be closed.
+# At exit dm_control terminates the display that all contexts share. Exit handlers run last in,
+# first out: it has to be imported before we register the closing of our contexts.
 import dm_control.mujoco  # noqa: E402, F401
 import mujoco  # noqa: E402  (the OpenGL backend has to be chosen before the first import)
 
@@ -46,7 +46,7 @@ _SEPARATION = 1.25  # centres are at least this many summed radii apart in the i
 
 @dataclass(frozen=True)
 class Thing:
-    """One object: its colour, its shape and its centre in the image (pixels, origin top left)."""
+    """One object: its colour, its shape, and its centre in the image (pixels, origin top left)."""
 
     color: str
     shape: str
@@ -78,7 +78,7 @@ class _Camera:
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The unit vectors [3] to its right, upwards and forward."""
+        """The unit vectors [3] to its right, up and forward."""
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         forward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         up = np.array([-math.sin(e) * math.cos(a), -math.sin(e) * math.sin(a), math.cos(e)])
@@ -86,26 +86,26 @@ class _Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """Where it stands [3], in metres."""
+        """Its position [3], in metres."""
         return self.lookat - self.distance * self.axes[2]
 
     def depth(self, point: np.ndarray) -> float:
-        """Metres along the optical axis to a world point [3]."""
+        """The depth of a world point [3] along the optical axis, in metres."""
         return float((point - self.position) @ self.axes[2])
 
     def floor_point(self, x_px: float, y_px: float) -> np.ndarray:
         """The point of the floor (z = 0) seen at a pixel."""
         right, up, forward = self.axes
         half = IMAGE_SIZE / 2
-        # Pixels count downwards, and `up` is upwards.
+        # Pixel rows count downwards, but `up` points upwards.
         ray = forward + right * (x_px - half) / _FOCAL_PX + up * (half - y_px) / _FOCAL_PX
-        # As far along the ray as takes the camera's height to 0; the ray points downwards.
+        # Follow the ray, which points downwards, until the height is 0.
         return self.position - ray * self.position[2] / ray[2]
 
 
 def _model_xml() -> str:
-    # Mocap bodies, because a geom that is fixed to the world keeps its compiled pose, whatever is
-    # written to `geom_pos`. They wait below the floor, where no camera sees them.
+    # Mocap bodies, because a geom fixed to the world keeps its compiled pose, whatever is written
+    # to `geom_pos`. Unused bodies are placed below the floor, where no camera sees them.
     bodies = ""
     for kind, geom, count in (("thing", "box", MAX_OBJECTS), ("clutter", "capsule", MAX_CLUTTER)):
         for i in range(count):
@@ -139,13 +139,13 @@ def _model_xml() -> str:
 class SceneRenderer:
     """One compiled model and one OpenGL context, reused for every scene.
 
-    Each scene sets all that it shows, so that none depends on those before it.
+    Each scene sets everything it shows, so none depends on earlier ones.
     """
 
     def __init__(self) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml())
         self._data = mujoco.MjData(self._model)
-        with interrupts.deferred():  # half of a context cannot be closed
+        with interrupts.deferred():  # a half-created context cannot be closed
             self._renderer = mujoco.Renderer(self._model, IMAGE_SIZE, IMAGE_SIZE)
         for flag in (
             mujoco.mjtRndFlag.mjRND_SHADOW,
@@ -160,7 +160,7 @@ class SceneRenderer:
         """Draw one scene from `rng` and render it.
 
         Args:
-            only: a colour and a shape; then the scene has a single thing of these.
+            only: a colour and a shape; the scene then has a single thing with these.
         """
         camera = _draw_camera(rng)
         self._set_light(rng)
@@ -173,13 +173,13 @@ class SceneRenderer:
         return Scene(self._renderer.render(), things)
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self._renderer.close()
 
     def _set_light(self, rng: np.random.Generator) -> None:
         head = self._model.vis.headlight
         head.ambient[:] = rng.uniform(0.2, 0.4)
-        head.diffuse[:] = rng.uniform(0.3, 0.5)  # light from the eye shades a ball, not a flat top
+        head.diffuse[:] = rng.uniform(0.3, 0.5)  # headlight shades a ball, not a flat top
         head.specular[:] = 0
         sun = self._model.light("sun")
         sun.dir[:] = [*rng.uniform(-0.8, 0.8, 2), -1.0]
@@ -194,13 +194,13 @@ class SceneRenderer:
     def _place(
         self, name: str, position: np.ndarray, rng: np.random.Generator, flat: bool = True
     ) -> None:
-        """Put a body's centre at a position [3], turned at random about the vertical axis."""
+        """Put a body's centre at a position [3], with a random rotation about the vertical axis."""
         body = self._model.body(name).mocapid[0]
         self._data.mocap_pos[body] = position
-        # Half the angle, as a quaternion of a turn has it; half a circle does for such shapes.
+        # A quaternion uses half the rotation angle; half a circle is enough for these shapes.
         half_turn = rng.uniform(0, math.pi) / 2
         quat = np.array([math.cos(half_turn), 0, 0, math.sin(half_turn)])
-        if not flat:  # lie down: turn the capsule's axis from z into the floor first
+        if not flat:  # lying: first rotate the capsule's axis from z into the floor plane
             lying = np.array([math.sqrt(0.5), math.sqrt(0.5), 0, 0])
             mujoco.mju_mulQuat(quat, quat.copy(), lying)
         self._data.mocap_quat[body] = quat
@@ -213,7 +213,7 @@ class SceneRenderer:
                 self._place(name, np.array([0.0, 0.0, -9.0]), rng)
                 continue
             x_px, y_px = rng.uniform(0, IMAGE_SIZE, 2)
-            metres_per_px = camera.distance / _FOCAL_PX  # in the middle of the picture
+            metres_per_px = camera.distance / _FOCAL_PX  # at the centre of the picture
             geom = self._model.geom(name).id
             radius = metres_per_px * rng.uniform(0.7, 1.8)
             self._model.geom_size[geom, :2] = radius, metres_per_px * rng.uniform(4, 16)
@@ -230,7 +230,7 @@ class SceneRenderer:
         placed: list[tuple[float, float, float]] = []
         things = []
         for i in range(MAX_OBJECTS):
-            if i >= count:  # of a scene before, it would still be where it was
+            if i >= count:  # otherwise it would stay where the previous scene put it
                 self._place(f"thing{i}", np.array([0.0, 0.0, -9.0]), rng)
                 continue
             x_px, y_px, radius_px = _draw_free_place(rng, placed)
@@ -251,20 +251,20 @@ class SceneRenderer:
         camera: _Camera,
         rng: np.random.Generator,
     ) -> Thing:
-        """Give body `i` its shape, size and colour, so that its centre is seen at a pixel."""
+        """Give body `i` its shape, size and colour, and let its centre project to a pixel."""
         floor = camera.floor_point(x_px, y_px)
-        radius = radius_px * camera.depth(floor) / _FOCAL_PX  # in metres, as large as it is to look
+        radius = radius_px * camera.depth(floor) / _FOCAL_PX  # in metres
         half_height = radius * (rng.uniform(0.5, 1.2) if shape == "cylinder" else 1.0)
-        # So a cube's face covers about the area of a ball.
+        # A cube's face then covers about the same area as a ball.
         side = radius * 0.85 if shape == "cube" else radius
         geom = self._model.geom(f"thing{i}").id
         self._model.geom_type[geom] = _GEOM_TYPE[shape]
         self._model.geom_size[geom] = side, half_height if shape == "cylinder" else side, side
-        self._model.geom_rbound[geom] = 2 * radius  # the compiled one is of another size
+        self._model.geom_rbound[geom] = 2 * radius  # the compiled bound is for another size
         tone = np.array(palette.RGB[color]) * rng.uniform(0.85, 1.1)
         self._model.geom_rgba[geom, :3] = np.clip(tone, 0, 1)
         height = half_height if shape == "cylinder" else side
-        # The body's *centre* is what projects to the drawn pixel, whatever its height.
+        # The body's *centre* projects to the drawn pixel, whatever its height.
         centre = _lift(camera, x_px, y_px, height)
         self._place(f"thing{i}", centre, rng)
         return Thing(color, shape, x_px, y_px)
@@ -276,12 +276,12 @@ _of_thread = threading.local()
 def renderer_of_thread() -> SceneRenderer:
     """The calling thread's renderer.
 
-    To make an OpenGL context takes a tenth of a second, and none can be current in two threads, or
-    be used by a process that was forked since.
+    Creating an OpenGL context takes a tenth of a second. A context cannot be current in two
+    threads, nor be used in a process forked after its creation.
     """
     if getattr(_of_thread, "process", None) != os.getpid():
         renderer = SceneRenderer()
-        atexit.register(renderer.close)  # while EGL is still there
+        atexit.register(renderer.close)  # while EGL still exists
         _of_thread.renderer, _of_thread.process = renderer, os.getpid()
     return _of_thread.renderer
 
@@ -293,7 +293,7 @@ def _lift(camera: _Camera, x_px: float, y_px: float, height: float) -> np.ndarra
 
 
 def _draw_camera(rng: np.random.Generator) -> _Camera:
-    """A camera that looks about the scene's middle; a third of them from nearly above."""
+    """A camera looking near the centre of the scene; about a third of them from nearly above."""
     overhead = rng.random() < 0.35
     return _Camera(
         lookat=np.array([*rng.uniform(-0.3, 0.3, 2), 0.0]),
@@ -313,7 +313,7 @@ def _mujoco_camera(camera: _Camera) -> mujoco.MjvCamera:
 
 
 def _draw_kinds(rng: np.random.Generator, kinds: tuple[str, ...], count: int) -> list[str]:
-    """`count` kinds, some of them repeats: counting a kind then has every answer."""
+    """`count` kinds, some of them repeated, so that counts of a kind take every value."""
     drawn: list[str] = []
     for _ in range(count):
         repeat = drawn and rng.random() < 0.3
@@ -324,7 +324,7 @@ def _draw_kinds(rng: np.random.Generator, kinds: tuple[str, ...], count: int) ->
 def _draw_free_place(
     rng: np.random.Generator, placed: list[tuple[float, float, float]]
 ) -> tuple[float, float, float]:
-    """A centre and radius in pixels that keeps clear of the things already placed."""
+    """A centre and radius in pixels that keep clear of the things already placed."""
     while True:
         radius = rng.uniform(4.2, 7.2)
         x, y = rng.uniform(_MARGIN_PX, IMAGE_SIZE - _MARGIN_PX, 2)

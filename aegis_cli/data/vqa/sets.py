@@ -1,6 +1,6 @@
-"""What `--vqa` names: rendered scenes, easy-VQA, or questions of files.
+"""The sets that `--vqa` names: rendered scenes, easy-VQA, or questions in files.
 
-They are split by image into parts that no two purposes share.
+They are split by image into disjoint parts for different purposes.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
 
 SCENES = "scenes"
-PLAIN = "{}"  # a question is asked as it is
-# Out of ten images of files, four are for anchors and co-training, one is for tuning studies, and
-# five are for probes.
+PLAIN = "{}"  # the question is asked as it is
+# Of ten images in files, four are for anchors and co-training, one is for tuning studies, and five
+# are for probes.
 PARTS: dict[str, range] = {
     "anchor": range(4),
     "train": range(4),
@@ -38,7 +38,7 @@ PARTS: dict[str, range] = {
 }
 
 
-# What a part must not share an image with: the parts that are used before it.
+# The parts that a part must not share images with: those used before it.
 _EARLIER: dict[str, tuple[str, ...]] = {
     "anchor": (),
     "train": (),
@@ -55,9 +55,9 @@ class TextCheck(Protocol):
 
 @dataclass(frozen=True)
 class Scenes:
-    """Rendered scenes: each part has seeds of its own.
+    """Rendered scenes: each part has its own seeds.
 
-    `ask` is what a question becomes before a model reads it, with {} for it.
+    `ask` is the template of a question's prompt, with {} for the question.
     """
 
     name: str = SCENES
@@ -77,26 +77,26 @@ class Scenes:
 
     @property
     def sha256(self) -> dict[str, str]:
-        """No digests, because rendered scenes come from no file."""
+        """No digests, because rendered scenes have no files."""
         return {}
 
     @property
     def state(self) -> dict[str, Any]:
-        """Nothing that could change."""
+        """Empty, since nothing can change."""
         return {}
 
 
 @dataclass(frozen=True)
 class Listed:
-    """Questions of files, read and checked; images are decoded when they are looked at.
+    """Questions in files, read and checked; images are decoded on access.
 
     Attributes:
         name: the file's or folder's name.
         files: the files that hold the questions.
-        entries: the sound questions.
-        skip_bad: whether bad questions are left out; else they are an error.
-        problems: what is wrong with those that have been left out.
-        ask: what a question becomes before a model reads it, with {} for it.
+        entries: the valid questions.
+        skip_bad: whether bad questions are left out instead of raising an error.
+        problems: the errors of the questions left out.
+        ask: the template of a question's prompt, with {} for the question.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Listed:
 
     @property
     def skipped(self) -> int:
-        """How many questions have been left out."""
+        """The number of questions left out."""
         return len(self.problems)
 
     def choose(
@@ -119,15 +119,14 @@ class Listed:
         checks: Sequence[TextCheck] = (),
         on_event: OnEvent = ignore,
     ) -> VQASet:
-        """Up to `questions` questions of one part, all those of an image side by side.
+        """Up to `questions` questions of one part, with those of an image adjacent.
 
-        A hash of the image's name decides which part an image belongs to, whatever the seed, so
-        that nothing is probed that an anchor was measured on. A hash of seed and name decides in
-        which order the part's images are taken, so a shorter set's images are among a longer one's.
+        A hash of the image's name determines its part, whatever the seed, so a probe never uses
+        what an anchor was measured on. A hash of seed and name determines the order of the part's
+        images, so a shorter set's images are among a longer one's.
 
         Raises:
-            AegisError: no question that can be used, or, without `skip_bad`, one that a check
-                refuses.
+            AegisError: no question is usable, or, without `skip_bad`, a check refuses one.
         """
         by_image: dict[str, list[Entry]] = {}
         for entry in self.entries:
@@ -139,7 +138,7 @@ class Listed:
         count, skipped = 0, self.skipped
         for key in mine:
             wanted = by_image[key][: questions - count]
-            # Checked as far as they are needed: to look at every image would take hours.
+            # Only the needed ones are checked: decoding every image would take hours.
             sound = self._sound(wanted, checks)
             skipped += len(wanted) - len(sound)
             if sound:
@@ -150,7 +149,7 @@ class Listed:
                 break
         if not kept:
             raise self._nothing(part, len(by_image), skipped)
-        if count < questions:  # some were left out, and the progress has not reached its end
+        if count < questions:  # some were left out, so the progress has not reached 100 %
             on_event(Progress("questions", count, count, "questions"))
         self._warn_of_shared(part, [own[0].picture for own in kept], on_event)
         return _assemble(kept, skipped).asked(self.ask)
@@ -160,7 +159,7 @@ class Listed:
         return share(key) in PARTS[part]
 
     def _warn_of_shared(self, part: str, chosen: Sequence[Picture], on_event: OnEvent) -> None:
-        """Warn of held-out images that lie under another name in a part that is learned from."""
+        """Warn of held-out images that are in an earlier part under another name."""
         earlier = _EARLIER[part]
         others = {e.picture.key: e.picture for e in self.entries} if earlier else {}
         learned = [p for key, p in others.items() if any(self.holds(of, key) for of in earlier)]
@@ -177,14 +176,14 @@ class Listed:
     def _sound(self, entries: Sequence[Entry], checks: Sequence[TextCheck]) -> list[Entry]:
         """The questions about one image that can be asked.
 
-        Where bad questions are left out, the image's pixels are tried too, with each question.
+        If bad questions are left out, the image's pixels are tried too, with each question.
         """
         image = None
         if self.skip_bad:
             try:
-                # All of them are about this image.
+                # All entries are about this image.
                 image = torch.from_numpy(decode(entries[0].picture, None))
-            except AegisError:  # the caller counts those that are left out
+            except AegisError:  # the caller counts the questions left out
                 return []
         sound = []
         for entry in entries:
@@ -218,30 +217,30 @@ class Listed:
 
     @cached_property
     def sha256(self) -> dict[str, str]:
-        """Digests of the files that hold the questions, by their names."""
+        """Digests of the files that hold the questions, by name."""
         return {f"vqa/{path.name}": sha256_file(path) for path in self.files}
 
     @cached_property
     def state(self) -> dict[str, Any]:
-        """What changes when a question or an image does.
+        """A value that changes if a question or an image does.
 
-        It holds digests of the question files and of the image files. Their times would change
-        where somebody copies a folder, and everything would be trained anew.
+        It holds digests of the question files and of the image files. File times would change when
+        a folder is copied, and everything would be trained again.
         """
         images = {entry.picture.key: entry.picture.source for entry in self.entries}
-        # Images that lie in rows are in the question files, whose digests are here anyway.
+        # Images stored in rows are part of the question files, whose digests are included anyway.
         digests: dict[str, str | None] = {}
         for key, source in images.items():
             if isinstance(source, Path):
                 try:
                     digests[key] = sha256_file(source)
-                except AegisError:  # whoever looks at the image says so, or leaves it out
+                except AegisError:  # reported or left out when the image is used
                     digests[key] = None
         return {"question_files": self.sha256, "image_files": sha256_value(digests)}
 
 
 class EasyVqa(Listed):
-    """easy-VQA, with its own split: probes alone get the images that it keeps for tests.
+    """easy-VQA, with its own split: only probes get its test images.
 
     A hash of the image's name assigns a tenth of the others to tuning studies, and the rest to
     anchors and training.
@@ -255,26 +254,26 @@ class EasyVqa(Listed):
 
     @cached_property
     def sha256(self) -> dict[str, str]:
-        """Digests of the question files of both splits, which have one name."""
+        """Digests of the question files of both splits, which have the same name."""
         return {f"vqa/{easy.NAME}/{path.parent.name}": sha256_file(path) for path in self.files}
 
     @cached_property
     def state(self) -> dict[str, Any]:
-        """The questions' digests; one version of a package always has the same images."""
+        """The questions' digests; a given package version always has the same images."""
         return {"question_files": self.sha256}
 
 
 def read(
     vqa: str, skip_bad: bool = False, on_event: OnEvent = ignore, ask: str = PLAIN
 ) -> Scenes | Listed:
-    """What a name stands for, every question of its files checked; no image is decoded yet.
+    """Read the set that a name stands for, checking every question; no image is decoded yet.
 
     Args:
-        ask: what a question becomes before a model reads it, with {} for it.
+        ask: the template of a question's prompt, with {} for the question.
 
     Raises:
-        AegisError: nothing of that name, a file that cannot be read, or, without `skip_bad`, a bad
-            question.
+        AegisError: there is nothing of that name, a file cannot be read, or, without `skip_bad`, a
+            question is bad.
     """
     if vqa == SCENES:
         return Scenes(ask=ask)
@@ -297,14 +296,14 @@ def read(
             "correct the file, or name another set",
         )
     kind = EasyVqa if vqa == easy.NAME else Listed
-    # The set has one name wherever it is named from: `.` is its folder.
+    # The set's name does not depend on the working directory: `.` becomes the folder's name.
     name = os.path.basename(os.path.abspath(vqa)).replace("#", "-")
     return kind(name, source.files, tuple(entries), skip_bad, tuple(problems), ask)
 
 
 def _located(vqa: str) -> tuple[Path, str | None]:
-    """The path of a set, for one on the hub that of its copy here, and the split after a #."""
-    # A file's own name may have a # in it, and is meant where it is there.
+    """The path of a set (for one on the hub, of its local copy), and the split after a #."""
+    # A file's name may itself contain a #; if the file exists, it is meant.
     if os.path.exists(vqa):
         return Path(vqa), None
     name, _, split = vqa.rpartition("#") if "#" in vqa else (vqa, "", None)
@@ -319,7 +318,7 @@ def _located(vqa: str) -> tuple[Path, str | None]:
 
 
 def _reader(path: Path, split: str | None) -> Reader:
-    """The reader of the path's format."""
+    """The reader for the path's format."""
     if split is not None and not saved.is_dataset(path):
         raise AegisError(
             f"the split '{split}' of '{path}', which is no Hugging Face data set",
@@ -334,7 +333,7 @@ def _reader(path: Path, split: str | None) -> Reader:
         )
     if path.is_file() and path.suffix == ".jsonl":
         return jsonl.reader(path)
-    # Before any other .json, and before a folder whose parquet files lie beside the pair.
+    # Before other .json files, and before folders with parquet files beside the pair.
     if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
         return official.reader(pairs[0] if pairs else path)
     if saved.is_dataset(path):
@@ -347,7 +346,7 @@ def _reader(path: Path, split: str | None) -> Reader:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is named as one of questions is, or is a list in JSON."""
+    """Whether a file has the name of a questions file, or is a list in JSON."""
     if not path.is_file():
         return False
     if path.suffix in (".jsonl", ".parquet") or path.name.endswith(official.SUFFIX):
@@ -356,7 +355,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder looks like one of questions."""
+    """Whether a folder looks like a set of questions."""
     return any(path.glob(f"*{official.SUFFIX}")) or saved.is_dataset(path)
 
 
@@ -369,12 +368,12 @@ def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> Ae
 
 
 def share(key: str) -> int:
-    """The tenth, 0 to 9, that an image belongs to."""
+    """The tenth, from 0 to 9, that an image belongs to."""
     return int(digest_of(key)[:12], 16) % 10
 
 
 def _assemble(kept: Iterable[Sequence[Entry]], skipped: int) -> VQASet:
-    """The set of these questions, which are listed by their images."""
+    """The set of these questions, which are grouped by image."""
     groups = list(kept)
     image_of = np.repeat(np.arange(len(groups)), [len(group) for group in groups])  # [M]
     questions = tuple(entry.question for entry in chain.from_iterable(groups))

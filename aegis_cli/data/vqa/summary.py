@@ -1,4 +1,4 @@
-"""What a set of questions holds, and a contact sheet of it."""
+"""A summary of a set of questions, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from aegis_cli.data.vqa.answers import normalise
 from aegis_cli.data.vqa.entries import Entry
 from aegis_cli.data.vqa.images import decode
 
-ANSWERS = 10  # of the commonest
-PROBLEMS = 5  # of bad questions, by their places
+ANSWERS = 10  # the most common ones listed
+PROBLEMS = 5  # the bad questions listed, with their places
 SHOWN = 6  # images on a sheet
-_PARTS = ("anchor", "validation", "probe")  # co-training has the images of anchors
+_PARTS = ("anchor", "validation", "probe")  # co-training uses the anchors' images
 _TILE, _TEXT = 384, 13  # pixels
 
 
 @dataclass(frozen=True)
 class Part:
-    """The questions that one purpose gets, which are those of its images."""
+    """The questions of one part, which are those about its images."""
 
     name: str
     questions: int
@@ -46,7 +46,7 @@ class Family:
 
 @dataclass(frozen=True)
 class CommonAnswer:
-    """An answer, as answers are compared, and of how many questions it is the reference."""
+    """A normalised answer, and the number of questions whose reference it is."""
 
     answer: str
     questions: int
@@ -55,16 +55,17 @@ class CommonAnswer:
 
 @dataclass(frozen=True)
 class QuestionsReport:
-    """What is known of a set of questions.
+    """The report on a set of questions.
 
     Attributes:
-        questions, images: that can be used, as far as their files tell, or the images too.
-        bad: how many questions cannot; `problems` are the first `PROBLEMS` that they have.
-        repeated: how many are asked of their image a second time.
-        words, answer_words: of a question and of an answer, in the median and at most.
-        answers_a_question: the fewest and the most that people gave to one.
-        parts: what anchors, tuning studies and probes get of them.
-        answers: the `ANSWERS` commonest of `distinct_answers`.
+        questions, images: usable ones, judged by the files, or by the images too if they were
+            decoded.
+        bad: how many questions are unusable; `problems` are the first `PROBLEMS` errors.
+        repeated: how many questions repeat an earlier one about the same image.
+        words, answer_words: median and maximum per question and per answer.
+        answers_a_question: the fewest and the most answers per question.
+        parts: the shares for anchors, tuning studies and probes.
+        answers: the `ANSWERS` most common of `distinct_answers`.
     """
 
     kind: str
@@ -87,10 +88,10 @@ class QuestionsReport:
 
 
 def is_set(name: str) -> bool:
-    """Whether a name is that of easy-VQA, or of a file or folder of questions.
+    """Whether a name stands for easy-VQA, or for a file or folder of questions.
 
-    A split may follow it after a #, and so it may a name that has the form of one on the hub.
-    Others on the hub are not looked for.
+    A split may follow after a #; with one, any name in the form of a hub id counts too. The hub
+    itself is not queried.
     """
     if name == easy.NAME:
         return True
@@ -107,10 +108,10 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     """Read every question of a set.
 
     Args:
-        images: whether to decode every image, too; questions about one that cannot be are bad.
+        images: whether to decode every image too; questions about undecodable images are bad.
 
     Raises:
-        AegisError: a file that cannot be read, or no question that can be used.
+        AegisError: a file cannot be read, or no question is usable.
     """
     found = _read(name)
     if images:
@@ -146,14 +147,14 @@ def save_sheet(name: str, out: Path) -> None:
     """Write a PNG with some images of a set, each with a question and its answer.
 
     Raises:
-        AegisError: a set or an image that cannot be read, or a path that cannot be written.
+        AegisError: a set or an image cannot be read, or the path cannot be written.
     """
     media.check_sheet(out)
     first: dict[str, Entry] = {}
     for entry in _read(name).entries:
         first.setdefault(entry.picture.key, entry)
     spread = np.linspace(0, len(first) - 1, SHOWN).round().astype(int)
-    # Of fewer images than there is room for, each is found several times.
+    # If there are fewer images than places, some are found several times.
     shown = [list(first.values())[number] for number in np.unique(spread)]
     cells = [(_caption(entry), [decode(entry.picture, None)]) for entry in shown]
     sheet = media.tiled(cells, columns=3, tile=_TILE, text=_TEXT)
@@ -165,24 +166,24 @@ def _caption(entry: Entry) -> str:
 
 
 def _words(texts: Sequence[str]) -> dict[str, float]:
-    """How many words texts have."""
+    """Median and maximum number of words per text."""
     counts = [len(text.split()) for text in texts]
     return {"median": statistics.median(counts), "most": max(counts)}
 
 
 def _first(problems: Sequence[AegisError]) -> tuple[str, ...]:
-    """What is wrong with the first; several questions may be about one image that is."""
+    """The first distinct problems; several questions may share a broken image."""
     return tuple(dict.fromkeys(problem.found for problem in problems))[:PROBLEMS]
 
 
 def _with_whole_images(found: sets.Listed, on_event: OnEvent) -> sets.Listed:
-    """The set without the questions about images that cannot be decoded, which are problems."""
+    """The set without questions about undecodable images, which become problems."""
     pictures = {entry.picture.key: entry.picture for entry in found.entries}
     broken: dict[str, AegisError] = {}
     for number, (key, picture) in enumerate(pictures.items(), start=1):
         try:
             decode(picture, None)
-        except AegisError as error:  # told with the other problems
+        except AegisError as error:  # reported with the other problems
             broken[key] = error
         on_event(Progress("images", number, len(pictures), "images"))
     sound = tuple(entry for entry in found.entries if entry.picture.key not in broken)

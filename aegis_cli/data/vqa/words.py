@@ -1,14 +1,14 @@
 """The wide vocabulary: scenes, easy-VQA and robot instructions in one closed list of words.
 
-A model that starts with these words can be asked both kinds of questions, and be trained on tasks
-whose instructions it has never been asked as questions.
+A model with this vocabulary can be asked both kinds of questions, and be trained on tasks whose
+instructions never occurred in its questions.
 """
 
 from __future__ import annotations
 
 from aegis_cli.data.vqa.questions import vocabulary
 
-# easy-VQA's words that scenes do not have; its question mark is a word of its own.
+# easy-VQA's words that scenes lack; its question mark is a separate word.
 _EASY_VQA = "? circle rectangle triangle teal black brown gray image contain not present in".split()
 
 # Instructions of dm_control's suite: names of its domains and tasks, as `make the DOMAIN TASK`.
@@ -19,7 +19,7 @@ _SUITE = (
     "swimmer15 walker dog"
 ).split()
 
-# What MetaWorld's fifty tasks ask for, with the words by which such tasks are usually described.
+# Words of MetaWorld's fifty tasks, and others commonly used to describe such tasks.
 _METAWORLD = (
     "press push pull pick place open close lock unlock grasp grab take get lift lower hold release "
     "drop throw dunk kick slide sweep rotate turn twist insert unplug plug assemble assembly "
@@ -41,5 +41,5 @@ _METAWORLD = (
 
 
 def wide_vocabulary() -> tuple[str, ...]:
-    """The words of scenes first, in their order, then all further ones."""
+    """The words of scenes first, in their own order, then all others."""
     return tuple(dict.fromkeys((*vocabulary(), *_EASY_VQA, *_SUITE, *_METAWORLD)))

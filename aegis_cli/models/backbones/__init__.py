@@ -19,24 +19,25 @@ from aegis_cli.models.backbones.dual import DualEncoder
 EMBEDDED, EMBEDDED_EASY = shipped.EMBEDDED, shipped.EMBEDDED_EASY
 EMBEDDED_DUAL = shipped.EMBEDDED_DUAL
 SHIPPED = shipped.FILES
-_LOCAL = ("runs/", "models/")  # folders of ours in recipes and docs, whose names are like ids
+_LOCAL = ("runs/", "models/")  # our folders in recipes and docs, whose names look like hub ids
 
 
 def locate(name: str) -> Path:
-    """The model that `name` stands for: a file of ours, or a folder in the layout of the hub.
+    """The path of the model called `name`: a file of Aegis, or a folder in the hub's layout.
 
     Args:
         name: one of `SHIPPED`, a model file, a backbone folder, the folder of a run, of one of its
             checkpoints or of a policy in LeRobot's layout, or the id of a model or a policy on the
-            hub, which is downloaded if it is not there; what follows a '#' is left out.
+            hub, which is downloaded if needed; what follows a '#' is ignored.
 
     Raises:
-        AegisError: no such model, or one whose path is no text, which no reader of it takes.
+        AegisError: there is no such model, or its path is not valid UTF-8, which its readers do not
+            accept.
     """
     name = divided(name)[0]
     model_folder.refuse_gguf(Path(name))
     model_folder.refuse_part(Path(name))
-    # The disk goes before the hub: a folder `models/x` is no id.
+    # The disk takes precedence over the hub: a folder `models/x` is no id.
     if (here := _on_disk(name)) is not None:
         files.check_utf8(here, files.RENAME)
         return here
@@ -46,9 +47,9 @@ def locate(name: str) -> Path:
 
 
 def divided(name: str) -> tuple[str, str | None]:
-    """A backbone's name, and what it says of its layers behind a '#'; None: nothing.
+    """A backbone's name without the part after '#', and that part, which names its layers, or None.
 
-    A path that is there may have a '#' of its own.
+    An existing path may itself contain a '#'.
     """
     if "#" not in name or os.path.exists(name):
         return name, None
@@ -57,14 +58,14 @@ def divided(name: str) -> tuple[str, str | None]:
 
 
 def _of_repository(folder: Path) -> Path:
-    """The model in the copy of a repository, which is its folder unless it is a policy's."""
+    """The model in a downloaded repository: its folder, unless it is a policy's repository."""
     if model_folder.is_policy(folder) or (folder / "expert.safetensors").is_file():
         return _on_disk(str(folder)) or folder
     return folder
 
 
 def _on_disk(name: str) -> Path | None:
-    """The model of ours or of this disk that `name` stands for; None: only the hub may have it."""
+    """The shipped or local model that `name` stands for; None: only the hub may have it."""
     if name in SHIPPED:
         return shipped.locate(name)
     path = Path(name)
@@ -82,22 +83,23 @@ def load(name: str) -> Backbone:
     """Load a backbone in float32, ready to be asked or adapted.
 
     Args:
-        name: as for `locate`; for a Hugging Face model of a family that is not known,
-            `NAME#path.of.its.layers`; `random:SHAPE` is a model of a true shape with random
+        name: as for `locate`; for a Hugging Face model of an unknown family,
+            `NAME#path.of.its.layers`; `random:SHAPE` is a model of a real shape with random
             weights.
 
     Raises:
-        AegisError: as for `locate`, a model that does not load, or layers of an embedded one.
+        AegisError: as for `locate`; or the model does not load, or layers of an embedded one are
+            named.
     """
     if (shape := shapes.of_backbone(name)) is not None:
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import of_shape
 
         return of_shape.build(shape)
     own, layers = divided(name)
     path = locate(name)
     if path.is_dir():
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import hf
 
         backbone = hf.load(path, layers)
@@ -115,16 +117,22 @@ def load(name: str) -> Backbone:
         from aegis_cli.models import lerobot_folder
 
         return lerobot_folder.load(path.parent)[0].backbone
+    if not artifacts.is_artifact(path):
+        raise AegisError(
+            f"'{path}' is a safetensors file without an 'aegis' header: another program wrote it",
+            "a backbone that Aegis wrote, or the folder of a Hugging Face model",
+            f"check the path; of a robot policy, {model_folder.take_out(name)}",
+        )
     from aegis_cli.models.backbones.embedded import load_file
 
     return load_file(path)[0]
 
 
 def _before(path: Path) -> Mapping[str, Any]:
-    """What a checkpoint tells of its backbone before it was trained; nothing of another folder.
+    """What a checkpoint says of its backbone before training; empty for any other folder.
 
-    `stored` is the type that its weights came in, since a checkpoint holds them in float32;
-    `base_model` its id on the hub. Either may be missing.
+    `stored` is the dtype in which its weights were stored, since a checkpoint holds them in
+    float32; `base_model` is its id on the hub. Either may be missing.
     """
     expert = path.parent / "expert.safetensors"
     return artifacts.read_header(expert).meta if expert.is_file() else {}
@@ -139,7 +147,7 @@ def load_dual(name: str) -> DualEncoder:
     """
     path = locate(name)
     if path.is_dir():
-        _need_transformers(name)
+        need_transformers(name)
         from aegis_cli.models.backbones import clip
 
         return clip.load(path)
@@ -149,7 +157,7 @@ def load_dual(name: str) -> DualEncoder:
 
 
 def model_files(name: str) -> list[Path]:
-    """Those that make up the model, none of random weights; `name` is as for `load`."""
+    """The files that make up the model, none for random weights; `name` is as for `load`."""
     if shapes.of_backbone(name) is not None:
         return []
     path = locate(name)
@@ -163,7 +171,7 @@ def model_files(name: str) -> list[Path]:
 
 
 def sha256(name: str) -> str:
-    """sha256 over the model's file, or all files of its folder that make a model or processor."""
+    """sha256 of the model's file, or over all files of the model and processor in its folder."""
     path = locate(name)
     if path.is_file():
         return kept_digests.of_files([path], path.parent)[path]
@@ -193,7 +201,8 @@ def _no_backbone(name: str) -> AegisError:
     return AegisError(found, expected, fix)
 
 
-def _need_transformers(name: str) -> None:
+def need_transformers(name: str) -> None:
+    """Raise AegisError unless transformers is there to load the model of that name."""
     if not _has_transformers():
         found = f"a Hugging Face model at '{name}', and no transformers to load it"
         raise AegisError(found, "the extra 'hf'", "pip install 'aegis-vla[hf]'")

@@ -25,8 +25,8 @@ _SITES = ("self_attn.out_proj", "mlp.fc1", "mlp.fc2")  # maps in each layer of b
 class CLIPEncoder(DualEncoder):
     """A `CLIPModel` with its tokenizer.
 
-    Images come as squares of `image_size`: the caller has scaled the shorter side and cut out the
-    middle, as CLIP's own processor does, so that what is left of it is to scale and normalise.
+    Images come as squares of `image_size`: the caller has resized the shorter side and cropped the
+    centre, as CLIP's own processor does, so only rescaling and normalisation are left.
     """
 
     _mean: Tensor
@@ -42,8 +42,8 @@ class CLIPEncoder(DualEncoder):
     ) -> None:
         """A CLIP model with its processor.
 
-        `mean` and `std` are those of the three channels in [0, 1]; `files` are the processor's,
-        which `save` writes.
+        `mean` and `std` are those of the three channels in [0, 1]; `files` are the processor's
+        files, which `save` writes.
         """
         super().__init__()
         self.clip, self._tokenizer, self._files = model.eval(), tokenizer, dict(files)
@@ -100,18 +100,18 @@ class CLIPEncoder(DualEncoder):
         folder.mkdir(parents=True, exist_ok=True)
         with quiet():
             self.clip.save_pretrained(folder, max_shard_size="1000TB")
-        # safetensors lets nobody but the owner read the file.
+        # safetensors makes the file readable by its owner only.
         shutil.copymode(folder / "config.json", folder / "model.safetensors")
         for name, content in self._files.items():
             (folder / name).write_bytes(content)
 
 
 def load(folder: Path) -> CLIPEncoder:
-    """The model in a folder, in float32 whatever it is stored in.
+    """Load the model in a folder, in float32 whatever dtype it is stored in.
 
     Raises:
-        AegisError: another kind of model, missing or unexpected weights, or a processor that is not
-            there.
+        AegisError: it is another kind of model, has missing or unexpected weights, or has no
+            processor.
     """
     with quiet(), loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)

@@ -1,8 +1,8 @@
-"""What torch.compile makes of a backbone: its whole pass, or transformer layers each by itself.
+"""Compiling a backbone with torch.compile: its whole pass, or each transformer layer by itself.
 
-Where layers are compiled, what stands between them depends on the data, and stays as it is: which
-rows are padded, where the images' tokens go, what hooks see. Layers of a kind share what was
-compiled for one of them.
+If layers are compiled, the code between them, which depends on the data, is not compiled: which
+rows are padded, where the images' tokens go, what hooks see. Layers of one kind share their
+compiled code.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from aegis_cli.core.attention import KeyValue
 from aegis_cli.models.backbones.caches import cache_argument
 
-MULTIPLE = 32  # tokens; lengths are padded to multiples, since every other shape is compiled anew
-# How often a function is compiled for another shape, kind of layer or method. PyTorch's own limit
-# of 8 is soon reached in a run of several methods; past it, nothing more is compiled.
+MULTIPLE = 32  # tokens; lengths are padded to multiples, since each new shape is compiled again
+# The most times that a function is compiled for another shape, kind of layer or method. PyTorch's
+# own limit of 8 is soon reached in a run of several methods; beyond it nothing is compiled.
 _RECOMPILED = 64
 
 
 class _Kept:
-    """Stands where an attention module expects its cache, and keeps what that is given."""
+    """Stands in for an attention module's cache, and keeps the keys and values that it is given."""
 
     key: Tensor
     value: Tensor
@@ -35,22 +35,22 @@ class _Kept:
 
 
 def _passed(layer: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> Any:
-    """What the layer makes of its arguments."""
-    # By its class: the layer's own `forward` is the `CompiledForward` that calls this.
+    """The layer's output."""
+    # Through the class: the layer's own `forward` is the `CompiledForward` that calls this.
     return type(layer).forward(layer, *arguments, **named)
 
 
 def _passed_with_keys(
     layer: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
 ) -> tuple[Any, Tensor, Tensor]:
-    """What the layer makes of its arguments, and the keys and values that it attends to."""
+    """The layer's output, and the keys and values that it attends to."""
     kept = _Kept()
     output = type(layer).forward(layer, *arguments, **named | {cache_argument(layer): kept})
     return output, kept.key, kept.value
 
 
 class CompiledForward:
-    """Takes the place of a layer's `forward`."""
+    """Replaces a layer's `forward`."""
 
     def __init__(self, layer: nn.Module, run: Callable[..., Any], keeps_keys: bool) -> None:
         self._layer, self._run, self._keeps_keys = layer, run, keeps_keys
@@ -59,7 +59,7 @@ class CompiledForward:
 
     @contextmanager
     def telling(self, tell: Callable[[KeyValue], None]) -> Generator[None]:
-        """Tell the keys and values of each pass inside the block."""
+        """Call `tell` with the keys and values of each pass inside the block."""
         self._tell = tell
         try:
             yield
@@ -70,7 +70,7 @@ class CompiledForward:
         if not self._keeps_keys:
             return self._run(self._layer, arguments, named)
         if named.get(self._cache) is not None:
-            # An answer is being generated, by a cache of the model's own.
+            # An answer is being generated with the model's own cache.
             return _passed(self._layer, arguments, named)
         output, key, value = self._run(self._layer, arguments, named)
         if self._tell is not None:
@@ -81,12 +81,12 @@ class CompiledForward:
 def compiled(
     function: Callable[..., Any], backend: str, dynamic: bool | None = None
 ) -> Callable[..., Any]:
-    """The function under torch.compile, with graphs that bear two backward passes.
+    """The function under torch.compile, with graphs that allow two backward passes.
 
     Args:
-        dynamic: as torch.compile takes it; False compiles every other shape anew.
+        dynamic: as in torch.compile; False compiles each new shape again.
     """
-    # `import torch` does not load them; it takes a second, which others need not wait.
+    # `import torch` does not load these, which takes a second: only who compiles waits for it.
     from torch._dynamo import config as dynamo
     from torch._functorch import config as functorch
 
@@ -96,9 +96,9 @@ def compiled(
 
 
 def uncompiled(holds: bool = True) -> AbstractContextManager[object]:
-    """Let no pass inside the block compile anything, unless this does not hold.
+    """Compile nothing inside the block, if `holds`.
 
-    Frames and episodes of which some are left over make shapes that are soon of no more use.
+    Left-over frames and episodes make shapes that are hardly used again.
     """
     return torch.compiler.set_stance("force_eager") if holds else nullcontext()
 
@@ -108,7 +108,7 @@ def compile_layers(layers: Iterable[nn.Module], backend: str, keeps_keys: bool) 
 
     Args:
         backend: of torch.compile.
-        keeps_keys: whether these are language layers, which hand keys and values to a cache.
+        keeps_keys: whether these are language layers, which pass keys and values to a cache.
     """
     run = compiled(_passed_with_keys if keeps_keys else _passed, backend, dynamic=False)
     for layer in layers:

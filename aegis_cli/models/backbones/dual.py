@@ -1,6 +1,6 @@
 """The interface of every dual encoder: an image and a text tower, as in CLIP.
 
-Streams of classification tasks learn on these.
+Streams of classification tasks are learned with these.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from aegis_cli.models.structure import digest
 
 
 class DualEncoder(nn.Module, ABC):
-    """An image and a text tower whose features lie on one unit sphere (CLIP, arXiv 2103.00020).
+    """An image and a text tower whose features share a unit sphere (CLIP, arXiv 2103.00020).
 
     Attributes:
         image_size: side in pixels of the square images it reads.
@@ -28,7 +28,7 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def pixels(self, images: Tensor) -> Tensor:
-        """Images [B, S, S, 3] uint8, S = `image_size` -> what the image tower reads, float32."""
+        """Images [B, S, S, 3] uint8, S = `image_size` -> the image tower's input, float32."""
 
     @abstractmethod
     def image_features(self, pixels: Tensor) -> Tensor:
@@ -38,8 +38,8 @@ class DualEncoder(nn.Module, ABC):
     def looks(self, pixels: Tensor) -> Tensor:
         """Mean over positions of the output of the image tower's layer at two thirds of its depth.
 
-        It tells tasks apart by what their images look like; the last layers make of them what a
-        text could say.
+        It distinguishes tasks by the look of their images; the last layers represent what a text
+        could say about them.
 
         Returns:
             [B, W] float32.
@@ -50,12 +50,12 @@ class DualEncoder(nn.Module, ABC):
         """[N, D] float32, each row of length 1.
 
         Raises:
-            AegisError: a text that it cannot read.
+            AegisError: it cannot read one of the texts.
         """
 
     @abstractmethod
     def scale(self) -> Tensor:
-        """What cosines are multiplied by to become logits: a positive number []."""
+        """The factor from cosines to logits: a positive number []."""
 
     @abstractmethod
     def sites(self) -> dict[str, nn.Linear]:
@@ -63,7 +63,7 @@ class DualEncoder(nn.Module, ABC):
 
     @abstractmethod
     def in_text(self, site: str) -> bool:
-        """Whether a map of `sites` is one of the text tower's."""
+        """Whether a map of `sites` belongs to the text tower."""
 
     @abstractmethod
     def save(self, folder: Path) -> None:
@@ -79,16 +79,16 @@ class DualEncoder(nn.Module, ABC):
 
 
 def early_layer(depth: int) -> int:
-    """Number, from 1, of the layer whose output `looks` reads: at two thirds of the depth."""
+    """The number, from 1, of the layer whose output `looks` reads: at two thirds of the depth."""
     return max(1, 2 * depth // 3)
 
 
 def class_weights(encoder: DualEncoder, classes: Sequence[str], templates: Sequence[str]) -> Tensor:
     """The zero-shot classifier [C, D]: each class's mean feature over templates, at length 1.
 
-    Each template holds one "{}", which the class's name takes the place of.
+    Each template contains one "{}" for the class's name.
     """
     texts = [template.format(name) for name in classes for template in templates]
     features = encoder.text_features(texts).view(len(classes), len(templates), -1)
-    means = features.mean(1)  # [C, D], shorter than 1 where templates differ
+    means = features.mean(1)  # [C, D], shorter than 1 if templates differ
     return nn.functional.normalize(means, dim=-1)

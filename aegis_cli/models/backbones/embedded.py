@@ -1,9 +1,9 @@
 """The embedded VLM: a convolutional stem and a prefix language model.
 
 It has about three million parameters. Image tokens attend among themselves. Each block of text
-attends to the image and to itself, both ways within a question and causally within its answer. So
-the image's part of a pass never depends on the text: it is computed once for all questions about an
-image, and for all steps of decoding an answer.
+attends to the image and to itself, bidirectionally within a question and causally within its
+answer. So the image's part of a pass never depends on the text: it is computed once for all
+questions about an image, and for all steps of decoding an answer.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from aegis_cli.models.backbones import embedded_file
 from aegis_cli.models.backbones.base import AnswerScores, Backbone, Batch, Encoding
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
-MAX_TEXT = 20  # tokens of a question with its answer
-MAX_ANSWER = 4  # tokens of an answer with its end
-# Tokens; a compiled model's prompts are padded to multiples, of which MAX_TEXT is one.
+MAX_TEXT = 20  # the most tokens of a question with its answer
+MAX_ANSWER = 4  # the most tokens of an answer with its end
+# Tokens; a compiled model's prompts are padded to multiples of this. MAX_TEXT is one.
 MULTIPLE = 4
-# The location words of data/vqa/questions.py, which itself would load MuJoCo.
+# The location words of data/vqa/questions.py, which would itself load MuJoCo.
 X_WORDS, Y_WORDS = (tuple(f"{axis}{i}" for i in range(8)) for axis in "xy")
 
 
@@ -53,7 +53,7 @@ class Shape:
 
 
 class Stem(nn.Module):
-    """Strided convolutions with a residual one after each.
+    """Strided convolutions, each followed by a residual one.
 
     Pixels [B, 3, H, W] become tokens [B, (H/8)(W/8), D].
     """
@@ -117,10 +117,10 @@ class EmbeddedVLM(Backbone):
     kind: ClassVar[str] = "backbone"
     tied_heads: Mapping[str, str] = {"words": "final_norm"}
     numbers: int = len(X_WORDS) * len(Y_WORDS)
-    _multiple = 1  # tokens; of it the lengths of prompts are multiples
+    _multiple = 1  # tokens; prompt lengths are multiples of it
 
     def __init__(self, shape: Shape, vocabulary: Sequence[str]) -> None:
-        """Draw the weights, in float32 whatever `torch.set_default_dtype` says."""
+        """Initialize the weights in float32, whatever the default dtype is."""
         super().__init__()
         self.shape, self.tokenizer = shape, Tokenizer(vocabulary)
         self.depth, self.width = shape.depth, shape.width
@@ -143,7 +143,7 @@ class EmbeddedVLM(Backbone):
     # --- forward -------------------------------------------------------------------------------
 
     def image_pass(self, pixels: Tensor) -> tuple[list[Tensor], list[KeyValue]]:
-        """Each layer's hidden states [B, T, D] and keys and values, for pixels [B, 3, H, W]."""
+        """Each layer's hidden states [B, T, D], keys and values, for pixels [B, 3, H, W]."""
         x = self.stem(pixels).unsqueeze(1)  # [B, 1, T, D]: an image is one block
         hidden, keys_values = [], []
         for layer in self.layers:
@@ -172,7 +172,7 @@ class EmbeddedVLM(Backbone):
     def logits(self, hidden: Tensor) -> Tensor:
         """Scores [..., V] float32 of the next word, from the last layer's hidden states [..., D].
 
-        The embedding table is tied: it gives the scores.
+        The embedding table is tied: it serves as the output head.
         """
         return F.linear(self.final_norm(hidden), self.words.weight).float()
 
@@ -184,7 +184,7 @@ class EmbeddedVLM(Backbone):
 
     def encode(self, batch: Batch) -> Encoding:
         image_hidden, image = self.image_pass(batch.pixels)
-        length = batch.mask.sum(-1, keepdim=True)  # [B, 1]: all of the text is prompt
+        length = batch.mask.sum(-1, keepdim=True)  # [B, 1]: the whole text is prompt
         text_hidden, text = self.text_pass(batch.ids.unsqueeze(1), length, image)
         hidden = []
         for of_image, of_text in zip(image_hidden, text_hidden, strict=True):
@@ -201,10 +201,10 @@ class EmbeddedVLM(Backbone):
         return Encoding(tuple(hidden), tuple(joined), mask, is_image)
 
     def compile_passes(self, backend: str = "inductor") -> None:
-        """Compile the whole pass, and pad prompts to multiples of some tokens.
+        """Compile the whole pass, and pad prompts to multiples of `MULTIPLE` tokens.
 
-        The expert's layers, which read this pass, are compiled anew for every other length, of
-        which five are left.
+        The expert's layers, which read this pass, are compiled again for each length; padding
+        leaves five.
         """
         super().compile_passes(backend)
         self._multiple = MULTIPLE
@@ -228,8 +228,8 @@ class EmbeddedVLM(Backbone):
         rows = [self.tokenizer.prompt(text) for text in questions]
         prompt_length = torch.tensor([[len(row)] for row in rows], device=self.device)
         answers: list[list[int]] = [[] for _ in rows]
-        # Each round passes the whole text anew, of 20 tokens at most; the image is passed once. All
-        # rows go on to the last round, and `decode` cuts each at its first end.
+        # Each round passes the whole text again, at most 20 tokens; the image is passed once. All
+        # rows continue to the last round, and `decode` cuts each at its first end token.
         for _ in range(MAX_ANSWER if most is None else min(most, MAX_ANSWER)):
             ids, mask = self._pad([row + said for row, said in zip(rows, answers, strict=True)])
             hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, image)
@@ -252,7 +252,7 @@ class EmbeddedVLM(Backbone):
         prompt_length = send(torch.tensor([[len(p)] for p in prompts]), self.device)
         hidden, _ = self.text_pass(ids.unsqueeze(1), prompt_length, self._shared_image_pass(images))
         scores = self.logits(hidden[-1]).squeeze(1).log_softmax(-1)
-        # The scores at a position are those of the token after it.
+        # The scores at a position predict the next token.
         chosen = scores[:, :-1].gather(-1, ids[:, 1:, None]).squeeze(-1)  # [B, S - 1]
         position = torch.arange(ids.shape[1] - 1, device=self.device)
         # The prompt's last token predicts the answer's first.
@@ -272,7 +272,7 @@ class EmbeddedVLM(Backbone):
         said = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in answers]
         rows = [prompt + answer for prompt, answer in zip(prompts, said, strict=True)]
         found, question = [], []
-        # Texts of one length make a batch without padding.
+        # Texts of equal length make a batch without padding.
         for length in sorted({len(row) for row in rows}):
             chosen = [i for i, row in enumerate(rows) if len(row) == length]
             ids, _ = self._pad([rows[i] for i in chosen])
@@ -284,22 +284,22 @@ class EmbeddedVLM(Backbone):
             scores = self.logits(hidden[-1]).squeeze(1)  # [rows, length, V]
             position = torch.arange(length, device=self.device)
             # From the prompt's last token, which predicts the first word, to the last word, which
-            # predicts the end. Selected row by row, in the order of `question` below.
+            # predicts the end. Entries are selected row by row, in the order of `question` below.
             found.append(scores[(position >= prompt_length - 1) & (position < length - 1)])
             for i in chosen:
                 question += [i] * len(said[i])
-        # In one part, since all go back through the same images.
+        # In one part, since all gradients go back through the same images.
         yield AnswerScores(torch.cat(found), torch.tensor(question))
 
     def _shared_image_pass(self, images: Images) -> list[KeyValue]:
         """Each row's image keys and values.
 
-        A run of equal images, those of one image's questions, is passed once.
+        A run of equal images, such as for the questions about one image, is passed once.
         """
         assert isinstance(images, Tensor)
         begins = torch.ones(len(images), dtype=torch.bool)
         begins[1:] = (images[1:] != images[:-1]).flatten(1).any(1)
-        # The sum counts the runs up to each row, so that less one it is the number of its own.
+        # The sum counts the runs up to each row; minus 1, it is the index of the row's own run.
         row = send(begins.cumsum(0) - 1, self.device)
         _, image = self.image_pass(self.pixels(images[begins]))
         found = []
@@ -308,7 +308,7 @@ class EmbeddedVLM(Backbone):
         return found
 
     def number_texts(self, count: int) -> list[str]:
-        """Location words: the closed vocabulary has no other word for a quantity beyond four.
+        """Location words: the closed vocabulary has no other words for quantities above four.
 
         Numbers below 8 are one word, `x0` to `x7`, and more are two digits, `x0 y0` to `x7 y7`.
         """
@@ -325,10 +325,10 @@ class EmbeddedVLM(Backbone):
         _check_length(len(prompt) + max(len(reference) + 1, MAX_ANSWER - 1))
 
     def _pad(self, rows: Sequence[Sequence[int]], multiple: int = 1) -> tuple[Tensor, Tensor]:
-        """Rows of ids as ids [B, S] padded on the right, and their mask [B, S].
+        """Pad rows of ids on the right: ids [B, S] and their mask [B, S].
 
         Args:
-            multiple: S is a multiple of it.
+            multiple: the number that S is a multiple of.
         """
         longest = max(len(row) for row in rows)
         _check_length(longest)
@@ -361,10 +361,10 @@ class EmbeddedVLM(Backbone):
 
 
 def load_file(path: Path) -> tuple[EmbeddedVLM, dict[str, object]]:
-    """The model in an artifact, in float32, and its provenance.
+    """Load the model in an artifact, in float32, and its provenance.
 
     Raises:
-        AegisError: a damaged file, or other tensors than those of the model it describes.
+        AegisError: the file is damaged, or its tensors are not those of the model it describes.
     """
     return embedded_file.load(path, EmbeddedVLM, Shape)
 
@@ -379,16 +379,17 @@ def _check_length(tokens: int) -> None:
 
 
 def _prefix_causal(ids: Tensor, prompt_length: Tensor, pad: int) -> Tensor:
-    """Who attends to whom, [B, N, S, S] bool.
+    """The attention mask, [B, N, S, S] bool.
 
-    Tokens of the prompt attend both ways, those after it causally, and none to padding.
+    Prompt tokens attend to each other in both directions, later ones causally, and none to padding.
     """
     position = torch.arange(ids.shape[-1], device=ids.device)
     in_prompt = position < prompt_length.unsqueeze(-1)  # [B, N, S]
-    # The last dimension is that of the keys: what may be seen, by all or by what comes after it.
+    # The last dimension is that of the keys: prompt tokens are visible to all, others to later
+    # tokens.
     causal = position[:, None] >= position[None, :]  # [S, S]
     allowed = causal | in_prompt.unsqueeze(-2)
     is_token = (ids != pad).unsqueeze(-2)  # [B, N, 1, S]
-    # The diagonal keeps a padded row from attending to nothing at all.
+    # The diagonal gives padded rows something to attend to.
     itself = torch.eye(len(position), dtype=torch.bool, device=ids.device)
     return (allowed & is_token) | itself

@@ -1,4 +1,4 @@
-"""The embedded dual encoder: an image and a text tower of about a million parameters together."""
+"""The embedded dual encoder: an image and a text tower, together about a million parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.models.backbones.dual import DualEncoder, early_layer
 from aegis_cli.models.backbones.embedded import Layer
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 
-MAX_WORDS = 14  # tokens of a text, its end mark included
+MAX_WORDS = 14  # the most tokens of a text, including the end token
 SIDE = 4  # image tokens per side
 FIRST_SCALE, MAX_SCALE = 1 / 0.07, 100.0  # factors of the logits, as in CLIP
 
@@ -54,7 +54,7 @@ class Stem(nn.Module):
     def forward(self, pixels: Tensor) -> Tensor:
         x = self.patch(pixels)
         x = x + self.mix(F.relu(x))
-        tokens = self.token(F.relu(x))  # [B, D, 4, 4], each of 5 x 5 patches that overlap
+        tokens = self.token(F.relu(x))  # [B, D, 4, 4], each from 5 x 5 overlapping patches
         return tokens.flatten(2).transpose(1, 2) + self.position.weight
 
 
@@ -76,7 +76,7 @@ class Tower(nn.Module):
         return self.norm(self._pass(x, mask, len(self.layers)))
 
     def early(self, x: Tensor) -> Tensor:
-        """[B, T, D] after two thirds of the layers, at least one, with no mask."""
+        """Hidden states [B, T, D] after two thirds of the layers (at least one), without a mask."""
         return self._pass(x, None, early_layer(len(self.layers)))
 
     def _pass(self, x: Tensor, mask: Tensor | None, count: int) -> Tensor:
@@ -86,8 +86,8 @@ class Tower(nn.Module):
         return x.squeeze(1)
 
     def feature(self, pooled: Tensor) -> Tensor:
-        """The rows of [B, D] at length 1, float32."""
-        # Under autocast the projection is in half precision, and cosines would be too.
+        """The projected rows [B, D], normalized to length 1, in float32."""
+        # Under autocast the projection is in half precision; cosines are to be in float32.
         return F.normalize(self.project(pooled).float(), dim=-1)
 
 
@@ -124,10 +124,10 @@ class EmbeddedDual(DualEncoder):
         return self.id_features(self.ids(texts))
 
     def ids(self, texts: Sequence[str]) -> Tensor:
-        """Texts -> ids [N, T] int64 with the mark of the end, padded on the right.
+        """Texts -> ids [N, T] int64 with the end token, padded on the right.
 
         Raises:
-            AegisError: an unknown word, or too many.
+            AegisError: a word is unknown, or there are too many.
         """
         rows = [[*self.tokenizer.encode(text), self.tokenizer.end] for text in texts]
         length = max(map(len, rows))
@@ -140,7 +140,7 @@ class EmbeddedDual(DualEncoder):
         return torch.tensor(padded, device=self.device)
 
     def id_features(self, ids: Tensor) -> Tensor:
-        """The hidden state [N, D] at the end of each text of ids [N, T], which has read it all."""
+        """Features [N, D] of texts of ids [N, T], taken at the end token, which has read it all."""
         mask = additive(ids != self.tokenizer.pad)[:, None, None, None]  # [N, 1, 1, 1, T]
         tokens = self.words(ids) + self.position.weight[: ids.shape[1]]  # [N, T, D]
         hidden = self.text(tokens, mask)
@@ -166,9 +166,9 @@ class EmbeddedDual(DualEncoder):
 
 
 def load_file(path: Path) -> tuple[EmbeddedDual, dict[str, object]]:
-    """The model in an artifact, in float32, and its provenance.
+    """Load the model in an artifact, in float32, and its provenance.
 
     Raises:
-        AegisError: a damaged file, or other tensors than those of the model it describes.
+        AegisError: the file is damaged, or its tensors are not those of the model it describes.
     """
     return embedded_file.load(path, EmbeddedDual, Shape)

@@ -22,7 +22,7 @@ from aegis_cli.models.backbones.tokenizer import Tokenizer
 
 
 class EmbeddedModel(Protocol):
-    """What both embedded models have, by which their files are written and read.
+    """The interface of both embedded models through which their files are written and read.
 
     Attributes:
         kind: the artifact's kind.
@@ -71,11 +71,11 @@ def save(
 
 
 def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, dict[str, object]]:
-    """The model in an artifact, in float32 and ready to be asked, and its provenance.
+    """Load the model in an artifact, in float32 and evaluation mode, and its provenance.
 
     Raises:
-        AegisError: no artifact of that model's kind, a damaged one, or other tensors than those of
-            the model that it describes.
+        AegisError: the file is no artifact of that model's kind or is damaged, or its tensors are
+            not those of the model that it describes.
     """
     artifact = artifacts.load(path, model_type.kind)
     meta, tensors = artifact.header.meta, artifact.tensors
@@ -85,9 +85,9 @@ def load(path: Path, model_type: type[Model], shape_type: type) -> tuple[Model, 
     with outline(path):
         check_heads(shape.width, shape.heads)
         model = model_type(shape, vocabulary)
-    # Not exact: a file may be in half precision, and the model is float32.
+    # Not exact: a file may be in half precision, while the model is in float32.
     check_state(f"'{path}'", tensors, model.state_dict(), exact=False)
-    # A copy: what a training changes is never the memory that the file is read through.
+    # A copy, so that training never changes the memory map of the file.
     weights = {name: t.to(torch.float32, copy=True) for name, t in tensors.items()}
     model.load_state_dict(weights, assign=True)
     model.eval()

@@ -1,7 +1,7 @@
 """The known Hugging Face model families: where their language layers are, and how they are asked.
 
-All of them keep their language model as Llama does: `layers`, and beside them `rotary_emb` and
-`norm`; each layer has one attention module, which hands its keys and values to a cache.
+All of them structure their language model as Llama does: `layers`, and beside them `rotary_emb` and
+`norm`; each layer has one attention module, which passes its keys and values to a cache.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def _nothing(model: Any) -> tuple[str, ...]:
 
 
 def _beyond_features(model: Any) -> tuple[str, ...]:
-    """What lies behind the layer of a CLIP tower whose output the language model is given.
+    """The parts of a CLIP tower after the layer whose output the language model reads.
 
     `vision_feature_layer` counts the embeddings as 0, and -1 is the last layer.
     """
@@ -32,20 +32,21 @@ def _beyond_features(model: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Family:
-    """One row of module paths and prompt shapes.
+    """Module paths and prompt formats of one family.
 
     Attributes:
         layers: dotted path of the language model's layers.
-        prompt: what a question becomes before the processor sees it, after an `<image>` for each of
-            its images; None: the processor's own chat template.
-        answer: how an answer continues the prompt; with a chat template, where it leaves off for
-            the model to speak.
-        answer_types: what the processor would say of the tokens of an answer, by the name of its
-            tensor; 0 where nothing is named.
-        held: names of parameters that no input describes, such as a matrix that is no map of
-            torch's: they are protected by holding them still.
-        connector: dotted name of what makes tokens of image features, where transformers 5.5 puts
-            them among words without looking at their type, which autocast changes; None elsewhere.
+        prompt: the format of a question for the processor, after an `<image>` for each of its
+            images; None: the processor's own chat template.
+        answer: how an answer continues the prompt; with a chat template, after the prompt for the
+            model's turn.
+        answer_types: values for an answer's tokens in the processor's per-token tensors, by the
+            tensor's name; 0 if not named.
+        held: names of parameters that no input describes, such as a matrix outside of any torch
+            module: they are protected by freezing them.
+        connector: dotted name of the module that makes tokens of image features, if transformers
+            5.5 inserts these among the words without checking their dtype, which autocast changes;
+            else None.
         idle: the model -> dotted names of the parts whose outputs nothing reads.
     """
 
@@ -59,7 +60,7 @@ class Family:
 
 
 FAMILIES: dict[str, Family] = {
-    # PaliGemma 2 too. Its tokens of type 0 attend both ways, and those of type 1 causally.
+    # PaliGemma 2 too. Its tokens of type 0 attend bidirectionally, and those of type 1 causally.
     "paligemma": Family(
         "model.language_model.layers",
         prompt="answer en {}",
@@ -86,7 +87,7 @@ _OLD_REPOSITORY = (
     "it is of the model's first repository, whose own code reads the images, and no code of a "
     "model folder is run; transformers' own conversion has a name that ends in -hf"
 )
-# Families that cannot be used, whatever is named after a `#`: why.
+# Families that cannot be used, whatever layers are named after a `#` -> the reason.
 REFUSED: dict[str, str] = {
     "internvl_chat": _OLD_REPOSITORY,
     "llava_llama": _OLD_REPOSITORY,

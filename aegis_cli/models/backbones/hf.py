@@ -1,8 +1,8 @@
 """Hugging Face VLMs as backbones.
 
-Nothing here computes what a model computes: it runs the model's own forward pass and `generate`, on
-what its own processor makes of images and texts, and records what passes (recording.py). Beside
-this file only clip.py and from_hub.py import transformers.
+Nothing here reimplements a model: its own forward pass and `generate` run on what its own processor
+makes of images and texts, and what passes through is recorded (recording.py). Besides this file,
+only clip.py and from_hub.py import transformers.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from aegis_cli.models.backbones.prompting import Prompter
 from aegis_cli.models.backbones.recording import Seen, recording, sliding_window, unrotated
 from aegis_cli.models.structure import of_type, outermost_lists, widest
 
-MAX_ANSWER = 32  # tokens that an answer is given at most, where its reference is not longer
+MAX_ANSWER = 32  # the most tokens of an answer, unless its reference is longer
 
 
 class _Answered(NamedTuple):
-    """Prompts [B] that their answers follow.
+    """Prompts [B] followed by their answers.
 
     Attributes:
-        lengths: tokens of each prompt alone.
+        lengths: number of tokens of each prompt alone.
         said: tokens of each answer, without its end.
     """
 
@@ -58,7 +58,7 @@ class HFBackbone(Backbone):
     reads_several = True
     rounds = True
     inside = "vlm."
-    _multiple = 1  # tokens; of it the lengths of prompts are multiples
+    _multiple = 1  # tokens; prompt lengths are multiples of it
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class HFBackbone(Backbone):
 
         Args:
             family: where the language layers are, and how the model is asked.
-            files: the processor's files as they were found; `save` writes them beside the weights.
+            files: the contents of the processor's files, which `save` writes beside the weights.
 
         Raises:
             AegisError: processor and model do not fit together, the layers are not where the
@@ -83,7 +83,7 @@ class HFBackbone(Backbone):
         table, head = model.get_input_embeddings(), model.get_output_embeddings()
         if head is None:
             raise model_folder.headless(model)
-        # The table's own length counts, because a processor may know more words than the model.
+        # The table's own length, because a processor may know more tokens than the model.
         limits = (text.max_position_embeddings, len(table.get_parameter("weight")))
         self._prompter = Prompter(processor, family, *limits, model.config.image_token_id)
         self.held = tuple(f"vlm.{name}" for name in family.held)
@@ -106,8 +106,8 @@ class HFBackbone(Backbone):
         self.depth = len(self._layers)
         self.kv_heads, self.head_dim = self._measure_keys()
 
-    # Both are looked up whenever they are needed: a module that is kept as an attribute would be a
-    # part of this one a second time, with further names for its weights.
+    # Both are looked up when needed: a module kept as an attribute would be registered a second
+    # time, with further names for its weights.
 
     @property
     def _layers(self) -> nn.ModuleList:
@@ -124,9 +124,9 @@ class HFBackbone(Backbone):
         return {"ends": str(self.vlm.generation_config.eos_token_id), **digests}
 
     def _measure_keys(self) -> tuple[int, int]:
-        """Number and size of the heads of keys, from a pass over one black image.
+        """The number and size of the key heads, from a pass over one black image.
 
-        The pass tells what the model does, whatever its configuration says.
+        The pass shows what the model does, whatever its configuration says.
         """
         black = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
         try:
@@ -135,7 +135,7 @@ class HFBackbone(Backbone):
                 seen = self._passed(batch)
             encoding = self._encoding(seen, batch)
         except AegisError as error:
-            # A text of one letter is refused only for what the processor makes of it.
+            # A text of one letter can only be refused because of how the processor expands it.
             found = error.found
             if not self._prompter.places_image():
                 found = "the chat template places no image in what the model is asked"
@@ -161,7 +161,7 @@ class HFBackbone(Backbone):
     def _check_rotation(self, encoding: Encoding, plain: Mapping[int, Tensor]) -> None:
         """Raise AegisError unless each layer rotates keys as the expert rotates its own.
 
-        The last token's key is compared; `plain` holds the keys before the rotation.
+        The last token's key is compared; `plain` has the keys before the rotation.
         """
         last = encoding.mask.shape[1] - 1
         wanted = {}
@@ -172,7 +172,7 @@ class HFBackbone(Backbone):
                 as_block = key[:, :, None, last:]  # [B, h, 1, 1, d], as `rotate` takes it
                 wanted[i] = rotate(as_block, rotations[i])[:, :, 0]
         except (TypeError, ValueError, RuntimeError, LookupError, AttributeError) as error:
-            # For instance, its rotary embedding is called in another way.
+            # For instance, its rotary embedding has another signature.
             raise model_folder.foreign_rotation(0) from error
         for i, key in wanted.items():
             own = encoding.keys_values[i].key[:, :, last:]
@@ -185,7 +185,7 @@ class HFBackbone(Backbone):
         return self._encoding(self._passed(batch), batch)
 
     def _passed(self, batch: Batch) -> Seen:
-        """What a pass without the head leaves: an action expert reads no scores of words."""
+        """The record of a pass without the head: an action expert does not read scores of words."""
         with recording(self._layers, self._rotary) as seen:
             self.vlm.base_model(**_arguments(batch), use_cache=False)
         return seen
@@ -203,8 +203,8 @@ class HFBackbone(Backbone):
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
         """How `count` tokens that follow the encoding see it.
 
-        They take the positions that a generated answer would take. In layers with a sliding window
-        they see as far back as the answer would.
+        They take the positions that a generated answer would take, and in layers with a sliding
+        window see as far back as the answer would.
         """
         ahead = torch.arange(count, device=encoding.mask.device)
         rotations = self._rotations(encoding, ahead)
@@ -213,8 +213,8 @@ class HFBackbone(Backbone):
         if not any(windows):
             return Suffix(encoding.mask, rotation)
         visible = encoding.mask[:, None].expand(-1, count, -1)  # [B, S, T]
-        place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], where the tokens that follow stand
-        # How far each of them is from each token of the encoding, [B, S, T].
+        place = encoding.mask.sum(1)[:, None] + ahead  # [B, S], indices of the tokens that follow
+        # The distance of each of them from each token of the encoding, [B, S, T].
         back = place[:, :, None] - torch.arange(encoding.mask.shape[1], device=place.device)
         per_layer = []
         for window in windows:
@@ -222,11 +222,11 @@ class HFBackbone(Backbone):
         return Suffix(tuple(per_layer), rotation)
 
     def _rotations(self, encoding: Encoding, ahead: Tensor) -> list[Rotation]:
-        """Each layer's rotary embedding of tokens at distances [S] from the first that follows."""
+        """Each layer's rotary embedding for tokens at offsets [S] from the first that follows."""
         assert encoding.next_position is not None
         like = encoding.hidden[0].new_empty(0, dtype=torch.float32)
         places = encoding.next_position[:, None] + ahead  # [B, S]
-        if self._axes is not None:  # on each of which text stands at the same place
+        if self._axes is not None:  # text has the same position on each axis
             places = places.expand(self._axes, *places.shape)
         if self._layer_types is None:
             return [self._rotation(like, places)] * self.depth
@@ -236,17 +236,17 @@ class HFBackbone(Backbone):
         return [of_type[kind] for kind in self._layer_types]
 
     def _rotation(self, *asked: Any) -> Rotation:
-        """What the rotary embedding answers, as cosines and sines [B, S, head_dim]."""
+        """The output of the rotary embedding, as cosines and sines [B, S, head_dim]."""
         cosines, sines = self._rotary(*asked)
         if cosines.ndim == 4:
-            # In transformers 5.5 Qwen2-VL's gives those of each axis, [3, B, S, head_dim], and
-            # attention chooses among them. At the places of text all axes have the same.
+            # In transformers 5.5, Qwen2-VL's returns those of each axis, [3, B, S, head_dim], and
+            # attention chooses among them. For text all axes are the same.
             return Rotation(cosines[0], sines[0])
         return Rotation(cosines, sines)
 
     def checkpoint_gradients(self) -> None:
-        # Reentrant checkpointing would lose what the hooks record. The other kind needs no inputs
-        # with a gradient either.
+        # Reentrant checkpointing would lose what the hooks record. The non-reentrant kind also
+        # works without inputs that require a gradient.
         how = {"use_reentrant": False}
         if hasattr(self.vlm, "activation_checkpointing_enable"):
             self.vlm.activation_checkpointing_enable(how)
@@ -255,15 +255,15 @@ class HFBackbone(Backbone):
         self.vlm.disable_input_require_grads()
 
     def compile_passes(self, backend: str = "inductor") -> None:
-        """Compile the transformer layers, and pad prompts to multiples of some tokens.
+        """Compile the transformer layers, and pad prompts to multiples of `MULTIPLE` tokens.
 
-        The whole pass is full of Python that depends on the data: to compile two steps of a tiny
-        model took over five minutes. The last language layer stays as it is, for nobody may read
-        its output. A compiled one would give a gradient of zeros to what has none, and an optimizer
-        moves what has a gradient.
+        The whole pass is full of Python that depends on the data: compiling two steps of a tiny
+        model took over five minutes. The last language layer is not compiled, since its output may
+        be unused: compiled, it would give zero gradients to parameters that have none, and an
+        optimizer updates whatever has a gradient.
 
         Raises:
-            AegisError: language layers that are not given a cache by the name that others have.
+            AegisError: the language layers take no cache under a known name.
         """
         for layer in self._layers:
             if not takes_cache(layer):
@@ -293,17 +293,17 @@ class HFBackbone(Backbone):
         return self._generated(self._to_answer(images, questions), [tokens] * len(questions))
 
     def _to_answer(self, images: Images, questions: Sequence[str]) -> Batch:
-        # Padding on the left, so that what is generated follows each prompt directly.
+        # Padding on the left, so that generated tokens directly follow each prompt.
         return self._prompter.process(images, questions, "left")
 
     @torch.no_grad()
     def _generated(self, prompts: Batch, most: Sequence[int]) -> list[str]:
-        """The answers that the model generates, each up to its own number of tokens."""
+        """Generate the model's answers, each up to its own number of tokens."""
         batch = prompts.to(self.device)
         assert isinstance(self.vlm, transformers.GenerationMixin)
         with _greedy(self.vlm, self._prompter.filler):
             said = self.vlm.generate(**_arguments(batch), max_new_tokens=max(most))
-        rows = said[:, batch.ids.shape[1] :].tolist()  # what is generated follows the prompts
+        rows = said[:, batch.ids.shape[1] :].tolist()  # without the prompts
         return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
@@ -315,7 +315,7 @@ class HFBackbone(Backbone):
 
         with prefetch.for_device(prepare, batches, self.device) as prepared:
             for prompts, answered in prepared:
-                # One more than the reference, so that nothing longer is taken for it.
+                # One more than the reference, so that a longer answer is not taken for it.
                 most = [max(MAX_ANSWER, len(said) + 1) for said in answered.said]
                 yield self._generated(prompts, most), self._log_likelihood(answered)
 
@@ -329,7 +329,7 @@ class HFBackbone(Backbone):
             self.prepare_answers([image], [question], [answer])
 
     def _ends(self) -> list[int]:
-        """The tokens each of which ends an answer."""
+        """The tokens that each end an answer."""
         ends = self.vlm.generation_config.eos_token_id
         return list(ends) if isinstance(ends, list | tuple) else [ends]
 
@@ -345,7 +345,7 @@ class HFBackbone(Backbone):
     def prepare_answers(
         self, images: Images, questions: Sequence[str], answers: Sequence[str]
     ) -> _Answered:
-        """Prompts that the answers follow, on the CPU: to read lengths of a GPU would wait."""
+        """Prompts followed by their answers, on the CPU: reading lengths from a GPU would wait."""
         said = self._prompter.answer_ids(answers)
         prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
@@ -355,9 +355,9 @@ class HFBackbone(Backbone):
     def _log_likelihood(self, answered: _Answered) -> Tensor:
         """See `answer_log_likelihood`."""
         batch, lengths, said = answered.batch.to(self.device), answered.lengths, answered.said
-        # Each position has as many scores as the vocabulary has words, and where images differ in
-        # size a batch has a thousand positions. So none is scored but those that predict an answer.
-        first = min(lengths) - 1  # the earliest of them; scores are of the positions from it on
+        # Each position has a score for every word of the vocabulary, and a batch of images of
+        # several sizes has a thousand positions. So only those that predict an answer are scored.
+        first = min(lengths) - 1  # the earliest of them, from which on scores are taken
         rows: list[int] = []
         columns: list[int] = []
         for row, (length, words) in enumerate(zip(lengths, said, strict=True)):
@@ -368,7 +368,7 @@ class HFBackbone(Backbone):
         with _head_at(self.get_submodule(self._head), *places):
             (scores,) = self._scores(batch, batch.ids.shape[1] - first)  # [sum of words + 1, V]
         log_shares = scores.log_softmax(-1)
-        # What predicts the end has no word; there the first stands for none.
+        # The position that predicts the end has no word; index 0 is a placeholder there.
         words = send(torch.tensor([word for own in said for word in (*own, 0)]), self.device)
         of_words = log_shares.gather(1, words[:, None]).squeeze(1)  # [sum of words + 1]
         # Any of the end tokens ends the answer, so their probabilities add up.
@@ -392,12 +392,12 @@ class HFBackbone(Backbone):
         answers: Sequence[str],
         together: int = 8,
     ) -> Iterator[AnswerScores]:
-        """See `Backbone.read_vqa`; an image is passed for each question, which may change it."""
+        """See `Backbone.read_vqa`; an image is passed for each question, which may affect it."""
         said = self._prompter.answer_ids(answers)
-        # The shapes matter because an image of another size may become another number of tokens.
+        # Shapes matter because images of different sizes may become different numbers of tokens.
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
-        # Equal sizes need no padding, so that every token that a hook sees is a true one.
+        # Equal sizes need no padding, so hooks see only real tokens.
         parts: list[list[int]] = []
         for size in sorted(set(sizes)):
             rows = [i for i, own in enumerate(sizes) if own == size]
@@ -422,7 +422,7 @@ class HFBackbone(Backbone):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups: dict[str, list[nn.Parameter]] = {f"layers.{i}": [] for i in range(self.depth)}
-        # `named_parameters` gives a tied weight once, by its first name.
+        # `named_parameters` yields a tied weight once, under its first name.
         for name, parameter in self.named_parameters():
             groups.setdefault(self._group(name), []).append(parameter)
         return groups
@@ -446,18 +446,18 @@ class HFBackbone(Backbone):
         """Write a folder that `from_pretrained` loads.
 
         It has one file of weights, the configuration and the processor's files. All weights are
-        of one type: what is frozen may be narrower here than what learns.
+        written in one dtype: frozen ones may be narrower here than trainable ones.
         """
         folder.mkdir(parents=True, exist_ok=True)
         weights = list(self.parameters())
         with quiet(), of_type(weights, widest(weights)):
             self.vlm.save_pretrained(folder, max_shard_size="1000TB")
-        # safetensors lets nobody but the owner read the file.
+        # safetensors makes the file readable by its owner only.
         shutil.copymode(folder / "config.json", folder / "model.safetensors")
         self._save_processor(folder)
 
     def save_description(self, folder: Path) -> None:
-        """Write what `save` writes, but for the weights; `described` reads it."""
+        """Write everything that `save` writes except the weights; `described` reads it."""
         folder.mkdir(parents=True, exist_ok=True)
         self.vlm.config.save_pretrained(folder)
         self.vlm.generation_config.save_pretrained(folder)
@@ -472,22 +472,22 @@ class HFBackbone(Backbone):
 
 
 def _layer_types(text: Any, rotary: nn.Module) -> Sequence[str] | None:
-    """The kind of each layer, where the rotary embedding depends on it; None: one for all.
+    """The type of each layer, if the rotary embedding depends on it; None: one for all layers.
 
-    Gemma 3's layers with a window have an embedding of their own.
+    Gemma 3's layers with a sliding window have their own rotary embedding.
     """
     by_kind = "layer_type" in inspect.signature(rotary.forward).parameters
     return text.layer_types if by_kind else None
 
 
 def _in_own_type(module: nn.Module, _: tuple[Any, ...], output: Tensor) -> Tensor:
-    """A module's output in the type of its weights, whatever autocast has made of it."""
+    """Cast a module's output to the dtype of its weights, whatever autocast has made of it."""
     return output.to(next(module.parameters()).dtype)
 
 
 @contextmanager
 def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Generator[None]:
-    """Inside the block, a head that is given [B, T, D] sees [1, n, D] of it."""
+    """Inside the block, reduce the head's input [B, T, D] to n chosen positions, [1, n, D]."""
 
     def chosen(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
         return given[0][rows, columns][None], *given[1:]
@@ -501,11 +501,11 @@ def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Generator[None]:
 
 @contextmanager
 def _greedy(model: transformers.PreTrainedModel, filler: int) -> Generator[None]:
-    """Inside the block, a model generates the likeliest token after each, until one that ends it.
+    """Inside the block, the model decodes greedily until an end token.
 
-    Its own settings may sample, and may penalise the words that a question has, such as
-    `repetition_penalty`. Of them the tokens that begin and end a text are left. What fills a row
-    that has ended is the tokenizer's: the model's own may be none of its words.
+    Its own settings may sample, or penalise words of the question, as `repetition_penalty` does.
+    Only its tokens for begin and end of a text are kept. The padding token is the tokenizer's: the
+    model's own may not be in its vocabulary.
     """
     own = model.generation_config
     tokens = {"bos_token_id": own.bos_token_id, "eos_token_id": own.eos_token_id}
@@ -518,7 +518,7 @@ def _greedy(model: transformers.PreTrainedModel, filler: int) -> Generator[None]
 
 
 def _arguments(batch: Batch) -> dict[str, Tensor]:
-    """A batch as the model's own arguments, by its own names."""
+    """A batch as the model's arguments, by their names."""
     return {
         "pixel_values": batch.pixels,
         "input_ids": batch.ids,
@@ -546,6 +546,14 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
     backbone = _assembled(folder, layers, lambda config: complete(kind, folder, config))
     backbone.stored = model_folder.stored_type(folder)
     return backbone
+
+
+def check(folder: Path) -> None:
+    """Raise AegisError unless a folder is that of a model which takes images with its text."""
+    model_folder.check_files(folder, transformers.CONFIG_MAPPING)
+    with quiet(), loading(folder, "model"):
+        config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
+        _check_kind(folder, config)
 
 
 def described(folder: Path) -> HFBackbone:

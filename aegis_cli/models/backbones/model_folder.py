@@ -11,7 +11,7 @@ from typing import Any
 from safetensors import safe_open
 from torch import nn
 
-from aegis_cli.common import files, hub
+from aegis_cli.common import commands, files, hub
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models.backbones.base import FLOAT32
 from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
@@ -78,6 +78,44 @@ def is_own_config(content: bytes) -> bool:
     except ValueError:
         return False  # whoever loads it as a model of the hub says what is wrong
     return isinstance(config, dict) and config.get("type") == "aegis"
+
+
+def foreign_policy(path: Path) -> str | None:
+    """What LeRobot calls the policy of another program; None: this is none.
+
+    Args:
+        path: its folder, or a file in it.
+    """
+    config = (path if path.is_dir() else path.parent) / "config.json"
+    if not config.is_file():
+        return None
+    try:
+        said = files.parse_json(config.read_bytes())
+    except ValueError:
+        return None
+    if not isinstance(said, dict) or "model_type" in said or said.get("type") == "aegis":
+        return None
+    return said["type"] if isinstance(said.get("type"), str) else None
+
+
+def refuse_foreign_policy(path: Path) -> None:
+    """Raise AegisError for a robot policy of LeRobot's that is not of ours."""
+    if (kind := foreign_policy(path)) is not None:
+        folder = path if path.is_dir() else path.parent
+        raise AegisError(
+            f"'{path}', a policy of LeRobot's of the type '{kind}'",
+            "a policy that Aegis has trained, or a vision-language model by itself",
+            take_out(folder),
+        )
+
+
+def take_out(policy: object) -> str:
+    """How the VLM is had of a policy that another program trained."""
+    command = commands.aegis("extract", policy)
+    return (
+        f"if it was made from a VLM, take that out, as {command} --base VLM --out FOLDER: aegis "
+        "probe, merge and train take FOLDER"
+    )
 
 
 def weights(folder: Path) -> list[Path]:
@@ -208,6 +246,7 @@ def check_path(model: nn.Module, layers: str) -> nn.ModuleList:
 def check_files(folder: Path, kinds: Container[str]) -> None:
     """Raise AegisError unless the folder is of one of these `kinds` of models, in safetensors."""
     refuse_adapter(folder)
+    refuse_foreign_policy(folder)
     path, again = folder / "config.json", "download or export the model again"
     expected = "the configuration of a Hugging Face model"
     try:
@@ -269,6 +308,7 @@ def refuse_part(path: Path) -> None:
     """Raise AegisError for a file of weights out of a model's folder, where the folder is meant."""
     folder = path.parent
     if path.suffix == ".safetensors" and is_model(folder) and not is_policy(folder):
+        refuse_foreign_policy(path)
         raise AegisError(
             f"'{path}', the weights of a Hugging Face model",
             "the model's folder, which has its configuration and its processor too",

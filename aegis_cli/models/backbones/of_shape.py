@@ -1,7 +1,7 @@
-"""A Hugging Face VLM of a true shape with random weights, made of its configuration alone.
+"""A Hugging Face VLM of a real shape with random weights, made from its configuration alone.
 
-It serves to measure time and memory where no model was downloaded. Its processor is a stand-in:
-it scales images and numbers words, and knows no language.
+It is used to measure time and memory without downloading a model. Its processor is a stand-in: it
+scales images and hashes words, and knows no language.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _MARKER = "<image>"
 
 
 def build(name: str, seed: int = 0) -> HFBackbone:
-    """The model of that shape in float32, on the device that is chosen.
+    """The model of that shape in float32, on the chosen device.
 
-    As those of the hub's models, its weights are numbers in bfloat16. On a device equal seeds give
-    equal weights. A GPU draws them itself, for a CPU takes long over billions.
+    Like those of the hub's models, its weights are representable in bfloat16. On one device equal
+    seeds give equal weights. On a GPU they are drawn there, since a CPU takes long for billions.
 
     Raises:
-        AegisError: no such shape.
+        AegisError: there is no such shape.
     """
     return make(get(name), seed)
 
 
 def make(shape: Shape, seed: int = 0) -> HFBackbone:
-    """As `build`, of any shape."""
+    """As `build`, for any shape."""
     device = devices.pick()
     with torch.random.fork_rng([device] if device.type == "cuda" else []), quiet(), device:
         torch.manual_seed(seed)
@@ -51,7 +51,7 @@ def make(shape: Shape, seed: int = 0) -> HFBackbone:
 
 
 def assemble(shape: Shape) -> transformers.PreTrainedModel:
-    """The model alone, with the weights that transformers draws."""
+    """The model alone, with the initial weights of transformers."""
     tokens = {"pad_token_id": _PAD, "bos_token_id": _END, "eos_token_id": _END}
     config = transformers.AutoConfig.for_model(
         shape.family,
@@ -67,7 +67,7 @@ def assemble(shape: Shape) -> transformers.PreTrainedModel:
 
 
 class StandInProcessor:
-    """Stands where a model's own processor would: pixels of the true size, and a token a word."""
+    """Stands in for a model's own processor: pixels of the real size, and one token per word."""
 
     chat_template = _MARKER
 
@@ -108,7 +108,7 @@ class StandInProcessor:
 
 
 class _Words:
-    """A tokenizer by the checksum of each word."""
+    """A tokenizer that numbers words by their checksum."""
 
     bos_token = None
     pad_token_id = _PAD
@@ -117,7 +117,7 @@ class _Words:
         self._size, self._image_tokens = size, image_tokens
 
     def ids(self, text: str) -> list[int]:
-        """The tokens of a text, an image's among them."""
+        """The tokens of a text, including those of its images."""
         found: list[int] = []
         for word in text.replace(_MARKER, f" {_MARKER} ").split():
             if word == _MARKER:
@@ -133,7 +133,7 @@ class _Words:
         return {"input_ids": [self.ids(each) for each in text]}
 
     def apply_chat_template(self, said: Sequence[Mapping[str, Any]], **_: Any) -> str:
-        """The conversation's only turn: a mark for each image, and the text."""
+        """The conversation's only turn: a marker for each image, and the text."""
         content = said[0]["content"]
         return " ".join(_MARKER if c["type"] == "image" else c["text"] for c in content)
 

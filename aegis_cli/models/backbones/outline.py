@@ -1,4 +1,4 @@
-"""What a backbone is besides its weights, so that one file may hold a whole policy's tensors."""
+"""A description of a backbone without its weights, so that one file can hold a policy's tensors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape
 
 
 def describe(backbone: Backbone, folder: Path) -> dict[str, Any]:
-    """What `build` makes the backbone of again, as JSON-ready values.
+    """What `build` needs to make the backbone again, as values that JSON can hold.
 
     Args:
-        folder: is written where a model has files of its own, as one of the hub has.
+        folder: written if a model has its own files, as one from the hub has.
     """
     if isinstance(backbone, EmbeddedVLM):
         vocabulary = list(backbone.tokenizer.vocabulary)
@@ -26,15 +26,15 @@ def describe(backbone: Backbone, folder: Path) -> dict[str, Any]:
 
 
 def build(described: Mapping[str, Any], folder: Path, path: Path, tensors: int) -> Backbone:
-    """The backbone that `describe` described; its weights are still to come.
+    """The backbone that `describe` described, whose weights are still to be loaded.
 
     Args:
-        folder: the one that `describe` was given.
+        folder: the folder that `describe` was given.
         path: the file that the description was read from, for the error.
-        tensors: how many it has, which a model has more of than layers.
+        tensors: how many tensors the file has; a model has more of them than layers.
 
     Raises:
-        AegisError: a description of no model.
+        AegisError: it describes no model.
     """
     with reading_meta(path):
         kind = described["kind"]

@@ -1,7 +1,7 @@
-"""Images and texts as a model's own processor makes them, and answers that continue them.
+"""Prompts of images and texts by a model's own processor, and answers that continue them.
 
-The processor is whatever a model's folder holds; it is called, and its tokenizer, and nothing is
-known of its type.
+The processor is whatever a model's folder contains; only it and its tokenizer are called, and its
+type is not assumed.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
 
 _PIXEL_MASK = "pixel_attention_mask"
-_IMAGE = "<image>"  # stands for an image in a prompt that is no conversation
+_IMAGE = "<image>"  # stands for an image in a prompt without a chat template
 
 
 class Processors:
-    """A processor, and copies of it for those that call it.
+    """A processor, with copies of it for concurrent calls.
 
-    A call changes a tokenizer's settings, so no two threads may call one and the same. Several do:
-    they make the batches of the next steps.
+    A call changes a tokenizer's settings, so no two threads may call the same one, and several
+    threads prepare the batches of the next steps.
 
     Attributes:
-        original: which nobody calls; what a call leaves as it is may be read of it.
+        original: is never called; attributes that calls do not change may be read from it.
     """
 
     def __init__(self, original: Any) -> None:
@@ -41,11 +41,11 @@ class Processors:
         self._idle: list[Any] = []
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Processors:
-        return self  # copies of a model may share it: no call depends on those before
+        return self  # copies of a model may share it: no call depends on earlier ones
 
     @contextmanager
     def one(self) -> Generator[Any]:
-        """A copy that nobody else calls meanwhile; as many are made as are in use at once."""
+        """A copy for exclusive use; as many are made as are in use at once."""
         try:
             processor = self._idle.pop()
         except IndexError:
@@ -57,15 +57,14 @@ class Processors:
 
 
 class Prompter:
-    """A processor, and how its family is asked."""
+    """A processor with the prompt format of its family."""
 
     def __init__(
         self, processor: Any, family: Family, longest: int, words: int, image_token: int
     ) -> None:
         """Take a processor and its limits.
 
-        `longest` is how many tokens the model has positions for, `words` how many it has embeddings
-        for.
+        The model has positions for `longest` tokens, and embeddings for `words` tokens.
         """
         self._processors, self._family = Processors(processor), family
         self._longest, self._words = longest, words
@@ -73,11 +72,11 @@ class Prompter:
         self._markers = _markers(processor, image_token)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
-        """An image [H, W, 3] uint8 of any size, or several, and a prompt each, padded on that side.
+        """Prompts with one or several images [H, W, 3] uint8 of any size each, padded on `side`.
 
         Raises:
-            AegisError: an image or a text that the processor refuses, a text too long, or words
-                that the model has not.
+            AegisError: the processor refuses an image or a text, a text is too long, or the model
+                lacks a token.
         """
         for text in prompts:
             self.check_text(text)
@@ -103,7 +102,7 @@ class Prompter:
         }
         ids, mask = tensors.pop("input_ids"), tensors.pop("attention_mask")
         pixels = tensors.pop("pixel_values")
-        if _PIXEL_MASK in tensors:  # as large as a picture, in eight bytes a pixel
+        if _PIXEL_MASK in tensors:  # as large as a picture, with eight bytes per pixel
             tensors[_PIXEL_MASK] = tensors[_PIXEL_MASK].bool()
         self._check_length(ids.shape[1], prompts[int(mask.sum(1).argmax())])
         self._check_known(int(ids.max()))
@@ -112,7 +111,7 @@ class Prompter:
     def _first_refused(
         self, pictures: Sequence[list[Image.Image]], prompts: Sequence[str], texts: Sequence[str]
     ) -> AegisError | None:
-        """What the processor says of the first row that it refuses alone."""
+        """The error for the first row that the processor refuses by itself."""
         for own, asked, text in zip(pictures, prompts, texts, strict=True):
             try:
                 with self._processors.one() as processor:
@@ -123,7 +122,7 @@ class Prompter:
         return None
 
     def padded(self, batch: Batch, multiple: int) -> Batch:
-        """The batch, padded on the right to a multiple of that many tokens where the model can."""
+        """The batch, padded on the right to a multiple of `multiple` tokens if the model can."""
         rows, length = batch.ids.shape
         rounded_up = -(-length // multiple) * multiple
         # The model has no positions beyond `_longest`.
@@ -132,7 +131,7 @@ class Prompter:
             return batch
         ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)
         mask = batch.mask.new_zeros(room)
-        # What the processor says of each token, such as its type.
+        # Per-token tensors of the processor, such as token types.
         types = {
             name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape
         }
@@ -146,7 +145,7 @@ class Prompter:
             return _IMAGE * images + self._family.prompt.format(text)
         shown = [{"type": "image"} for _ in range(images)]
         said = [{"role": "user", "content": [*shown, {"type": "text", "text": text}]}]
-        # The processor's own method will not do: SmolVLM's reads settings of videos, which need
+        # Not the processor's own method: SmolVLM's reads settings of videos, which need
         # torchvision.
         return self._tokenizer.apply_chat_template(
             said,
@@ -157,29 +156,29 @@ class Prompter:
 
     @property
     def filler(self) -> int:
-        """The token that fills a row up to the longest."""
+        """The padding token."""
         return self._tokenizer.pad_token_id
 
     def places_image(self) -> bool:
-        """Whether the mark of an image is in what the model is asked about one."""
+        """Whether a prompt about an image contains its marker."""
         return any(marker in self._prompt("a") for marker in self._markers)
 
     def _special(self, text: str) -> dict[str, bool]:
-        """Arguments that keep a template with the first token from getting it twice."""
+        """Arguments that avoid a second begin token if the template already has one."""
         first = self._tokenizer.bos_token
         if self._family.prompt is None and first and text.startswith(first):
             return {"add_special_tokens": False}
         return {}
 
     def check_text(self, text: str) -> None:
-        """Raise AegisError if a question, instruction or answer can be read beside no image.
+        """Raise AegisError if a question, instruction or answer cannot be read with any image.
 
-        It holds the mark of an image or of another medium, or is too long by itself.
+        It then contains the marker of an image or of another medium, or is too long by itself.
         """
         found = next((marker for marker in self._markers if marker in text), None)
         if found is not None:
             raise _refused(f"{_quoted(text)} holds {found}, which stands for an image")
-        # A text of fewer bytes has no more tokens than the model reads.
+        # A text of fewer bytes cannot have too many tokens.
         if len(text.encode("utf-8", "surrogatepass")) > self._longest:
             with self._processors.one() as processor:
                 own = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
@@ -196,7 +195,7 @@ class Prompter:
     def _check_known(self, largest: int) -> None:
         """Raise AegisError for an id past the end of the embedding table.
 
-        It would end in an error of the arithmetic, on a GPU long after.
+        It would cause an index error later, on a GPU much later.
         """
         if largest >= self._words:
             raise misfit(f"a token of number {largest} where the model has {self._words} words")
@@ -204,12 +203,12 @@ class Prompter:
     # --- answers -------------------------------------------------------------------------------
 
     def answer_ids(self, answers: Sequence[str]) -> list[list[int]]:
-        """The tokens with which each answer continues a prompt, without its end."""
+        """The tokens with which each answer continues its prompt, without the end token."""
         shape, said = self._family.answer, list[list[int]]()
         with self._processors.one() as processor:
             for text in answers:
                 ids = processor.tokenizer(shape.format(text), add_special_tokens=False)["input_ids"]
-                # The shape may hold a space, which is a token: an empty answer has none.
+                # The format may contain a space, which is a token: an empty answer has none.
                 said.append(ids if text else [])
                 self._check_known(max(said[-1], default=0))
         return said
@@ -220,7 +219,7 @@ class Prompter:
         return [text.strip() for text in texts]
 
     def lengths(self, prompts: Sequence[str]) -> list[int]:
-        """Tokens of each prompt, its image counted as one marker: equal ones need no padding."""
+        """Token count of each prompt, with its image as one marker: equal ones need no padding."""
         asked = [self._prompt(text) for text in prompts]
         with self._processors.one() as processor:
             rows = processor.tokenizer(asked)["input_ids"]
@@ -233,7 +232,7 @@ class Prompter:
         self._check_length(max(lengths), "a question with its answer")
         room = (len(said), max(lengths))
         ids = batch.ids.new_full(room, self._tokenizer.pad_token_id)
-        # What the processor says of each token, such as its type, has to be said of the answer's.
+        # Per-token tensors, such as token types, have to be extended to the answer's tokens.
         types = {
             name: t.new_zeros(room) for name, t in batch.extra.items() if t.shape == batch.ids.shape
         }
@@ -248,8 +247,8 @@ class Prompter:
 
 
 def _markers(processor: Any, image_token: int) -> tuple[str, ...]:
-    """The words that a processor replaces by an image, a video or a sound."""
-    kinds = ("image", "video", "audio", "boi")  # the last is how an image begins
+    """The words that a processor replaces by an image, a video or audio."""
+    kinds = ("image", "video", "audio", "boi")  # the last is the begin-of-image token
     named = [
         getattr(owner, f"{kind}_token", None)
         for owner in (processor, processor.tokenizer)
@@ -281,5 +280,5 @@ def _refused(why: str) -> AegisError:
 
 
 def _several(row: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
-    """The images of a row."""
+    """The images of a row, one or several."""
     return (row,) if isinstance(row, Tensor) else row

@@ -1,9 +1,9 @@
-"""What passes through a language model's layers, seen by hooks that live as long as one pass.
+"""Record what passes through a language model's layers, by hooks that last for one pass.
 
-A hook on each layer sees what leaves it. A hook on each attention module hands it a cache that
-stores nothing and gives back what it is given: keys and values after the rotary embedding, in as
-many heads as the model has. A compiled layer tells them itself. Whatever gradient checkpointing
-computes a second time comes later and meets no hook.
+A hook on each layer sees its output. A hook on each attention module passes it a cache that only
+returns what it is given: keys and values after the rotary embedding, in the model's own number of
+heads. A compiled layer reports them itself. What gradient checkpointing recomputes comes later,
+when the hooks are gone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from aegis_cli.models.backbones.compiling import CompiledForward
 
 @dataclass
 class Seen:
-    """What one pass left, by layer, and the positions of its tokens.
+    """The record of one pass, by layer, and the positions of its tokens.
 
     Hidden states are [B, T, D], keys and values [B, kv_heads, T, head_dim].
     """
@@ -32,26 +32,27 @@ class Seen:
     positions: Tensor | None = None
 
     def axes(self) -> int | None:
-        """How many positions each token was given; None: a single one, without a dimension of it.
+        """The number of positions per token; None: one, without a dimension for it.
 
-        Qwen2.5-VL counts time, height and width apart: [3, B, T].
+        Qwen2.5-VL counts time, height and width separately: [3, B, T].
         """
         assert self.positions is not None
         return len(self.positions) if self.positions.ndim == 3 else None
 
     def next_position(self, mask: Tensor) -> Tensor:
-        """One more than each row's largest position [B] at its valid tokens.
+        """One more than the largest position [B] among each row's valid tokens.
 
-        The mask is [B, T]; a position with several axes counts by its largest.
+        The mask is [B, T]; of a position with several axes the largest counts.
         """
         assert self.positions is not None
         positions = self.positions if self.axes() is None else self.positions.amax(0)
-        # [1, T] for all rows, or [B, T]. Padding is below any position, so that it is no maximum.
+        # [1, T] for all rows, or [B, T]. Padding is set below any position, so it is never the
+        # maximum.
         return positions.expand_as(mask).masked_fill(~mask, -1).amax(-1) + 1
 
 
 class _PassThrough:
-    """Stands where an attention module expects its cache."""
+    """Stands in for an attention module's cache."""
 
     def __init__(self, seen: Seen, layer: int) -> None:
         self._seen, self._layer = seen, layer
@@ -65,7 +66,7 @@ def attention(layer: nn.Module) -> nn.Module:
     """The layer's one attention module.
 
     Raises:
-        LookupError: none, or several.
+        LookupError: there is none, or there are several.
     """
     found = [child for child in layer.children() if type(child).__name__.endswith("Attention")]
     if len(found) != 1:
@@ -74,14 +75,14 @@ def attention(layer: nn.Module) -> nn.Module:
 
 
 def sliding_window(layer: nn.Module) -> int | None:
-    """How many tokens the layer's attention sees, if not all before."""
+    """How many tokens the layer's attention sees; None: all earlier ones."""
     found = getattr(attention(layer), "sliding_window", None)
     return found if isinstance(found, int) else None
 
 
 @contextlib.contextmanager
 def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
-    """Record what happens in `layers`, and which positions their rotary embedding is asked for."""
+    """Record what passes through `layers`, and the positions given to their rotary embedding."""
     seen = Seen()
 
     def leaves(number: int) -> Any:
@@ -94,7 +95,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
         def hook(
             module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]
         ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-            # In the place of the layer's own cache, which is None: no answer is generated here.
+            # Replaces the layer's own cache, which is None: no answer is generated here.
             return arguments, named | {cache_argument(module): _PassThrough(seen, number)}
 
         return hook
@@ -121,7 +122,7 @@ def recording(layers: nn.ModuleList, rotary: nn.Module) -> Generator[Seen]:
 
 @contextlib.contextmanager
 def unrotated(layers: nn.ModuleList) -> Generator[dict[int, Tensor]]:
-    """The keys that each attention of a pass would have without its rotary embedding, by layer."""
+    """The keys that each attention would have without its rotary embedding, by layer."""
     seen = Seen()
     plain: dict[int, Tensor] = {}
 
@@ -130,7 +131,7 @@ def unrotated(layers: nn.ModuleList) -> Generator[dict[int, Tensor]]:
             cos, sin = named["position_embeddings"]
             # A rotation by 0: cosines of 1 and sines of 0.
             still = {"position_embeddings": (cos.new_ones(cos.shape), sin.new_zeros(sin.shape))}
-            # Calling the module itself would run its hooks, this one among them, again.
+            # Calling the module itself would run its hooks again, including this one.
             cache = {cache_argument(module): _PassThrough(seen, number)}
             module.forward(*arguments, **named | still | cache)
             plain[number] = seen.keys_values[number].key

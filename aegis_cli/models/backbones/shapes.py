@@ -1,6 +1,6 @@
-"""The true shapes of some Hugging Face VLMs, by which `aegis bench` makes them of random numbers.
+"""The real shapes of some Hugging Face VLMs, which `aegis bench` builds with random weights.
 
-They are what the models' own `config.json` say. `of_shape.py` makes the models.
+They are taken from the models' own `config.json`. `of_shape.py` builds the models.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from typing import Any
 
 from aegis_cli.common.errors import AegisError
 
-PREFIX = "random:"  # a backbone's name begins so that is a shape with random weights
+PREFIX = "random:"  # prefix of a backbone's name that is a shape with random weights
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One model's sizes, in the words of its configuration.
+    """One model's sizes, with the keys of its configuration.
 
     Attributes:
         family: `model_type` in transformers, and the row of `families.FAMILIES`.
         text, vision: the sizes of its two towers.
-        more: what the configuration has beside them.
-        image_token: the name that the configuration has for the token of an image.
+        more: further keys of the configuration.
+        image_token: the configuration's key for the image token.
         tokens: tokens of an image of `vision["image_size"]` pixels.
-        parameters: how many numbers it has, in millions.
+        parameters: number of parameters, in millions.
     """
 
     family: str
@@ -36,7 +36,7 @@ class Shape:
     parameters: int
 
 
-# SmolVLM puts 4 x 4 neighbouring patches into one token: (512 / 16 / 4)^2 = 64 of an image.
+# SmolVLM merges 4 x 4 neighbouring patches into one token: (512 / 16 / 4)^2 = 64 per image.
 _SMOL = {"scale_factor": 4, "tie_word_embeddings": False}
 _SMOL_TEXT = {
     "model_type": "llama",
@@ -120,7 +120,7 @@ SHAPES: dict[str, Shape] = {
     ),
 }
 
-# No model has this shape. It has all their parts, to see whether this transformers is known.
+# No model has this shape. It has all their parts, to check that this transformers is supported.
 SMALL = Shape(
     "smolvlm",
     {
@@ -163,5 +163,5 @@ def get(name: str) -> Shape:
 
 
 def of_backbone(name: str) -> str | None:
-    """The shape that a backbone's name asks for; None where it asks for a model that is there."""
+    """The shape that a backbone's name asks for; None if it names an actual model."""
     return name.removeprefix(PREFIX) if name.startswith(PREFIX) else None

@@ -1,4 +1,4 @@
-"""Words to ids for the embedded models: a closed vocabulary, so an unknown word is an error."""
+"""Words to ids for the embedded models: the vocabulary is closed; unknown words are errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Tokenizer:
     `vocabulary` holds the special tokens first.
 
     Raises:
-        ValueError: something else than words, or no special tokens.
+        ValueError: it holds something else than words, or lacks the special tokens.
     """
 
     def __init__(self, vocabulary: Sequence[str]) -> None:
@@ -53,7 +53,7 @@ class Tokenizer:
         return [self._ids[word] for word in words]
 
     def prompt(self, text: str) -> list[int]:
-        """The ids of a question or instruction, closed by the token that an answer follows."""
+        """The ids of a question or instruction, ending with the token that an answer follows."""
         return [*self.encode(text), self.answer]
 
     def decode(self, ids: Sequence[int]) -> str:

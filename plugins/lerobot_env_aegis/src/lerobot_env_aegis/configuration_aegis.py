@@ -1,4 +1,4 @@
-"""What LeRobot may set of our simulated tasks."""
+"""The settings of our simulated tasks in LeRobot."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from lerobot_env_aegis.task_env import SIZE, AegisTask
 @EnvConfig.register_subclass("aegis")
 @dataclass
 class AegisEnvConfig(EnvConfig):
-    """One of our tasks, or a set of MetaWorld's, each task of which is evaluated by itself.
+    """One of our tasks, or a set of MetaWorld's whose tasks are evaluated separately.
 
     Attributes:
         task: reach, point, suite/DOMAIN-TASK or metaworld/TASK.
-        fps: of the control steps; a new value changes nothing, the task says it.
-        colors: of the targets: seen, held-out or all; of tasks that have some.
-        camera: which of the task's cameras takes the picture; another name is what that of its own
-            is called; None: as the task's own camera.
-        episode_length: control steps; None: as many as the task has.
+        fps: control rate; set by the task, so a new value has no effect.
+        colors: colours of the targets, for tasks that have some: seen, held-out or all.
+        camera: the task's camera that takes the picture; any other name renames the task's own
+            camera; None: the task's own camera and name.
+        episode_length: control steps; None: the task's own number.
     """
 
     task: str = "reach"
@@ -70,7 +70,7 @@ class AegisEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """What `AegisTask` is given besides the task's name."""
+        """The arguments of `AegisTask` besides the task's name."""
         return {
             "colors": self.colors,
             "camera": self.camera,

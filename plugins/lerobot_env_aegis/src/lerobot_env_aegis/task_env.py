@@ -1,4 +1,4 @@
-"""A task of ours as an environment of Gymnasium."""
+"""One of our tasks as a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from aegis_cli import sim
 from aegis_cli.models.acting import EVALUATION_SEED, TARGET_COLORS
 from aegis_cli.sim.contract import EVALUATION, Observation, episode_rng
 
-SIZE = 64  # pixels of a picture's side
+SIZE = 64  # pixels per side of a picture
 
 
 class AegisTask(gym.Env):
-    """One task. The episode of seed n is episode n of `aegis rollout`.
+    """One task. The episode with seed n is episode n of `aegis rollout`.
 
-    Observations are {"pixels": {camera: [64, 64, 3] uint8}, "agent_pos": [P] float32}, actions [A]
-    in [-1, 1]. The reward is the task's, or 1 at success. `info["is_success"]` is the task's own
-    verdict; of a task measured by its return it is always False.
+    Observations are {"pixels": {camera: [64, 64, 3] uint8}, "agent_pos": [P] float32}, actions are
+    [A] in [-1, 1]. The reward is that of the task, or 1 at success. `info["is_success"]` is the
+    task's own verdict; for a task measured by its return it is always False.
 
     Attributes:
-        task: its name.
-        task_description: this episode's instruction.
+        task: name of the task.
+        task_description: the instruction of this episode.
     """
 
     def __init__(self, task: str, colors: str, camera: str, max_steps: int | None = None) -> None:
-        """Make the task, seen by its camera of that name, else by its own under that name."""
+        """Create the task with its camera of that name, or with its own camera under that name."""
         seen_by = (camera,) if camera in sim.cameras(task) else ()
         self._env = sim.make(task, seen_by=seen_by)
         spec = self._env.spec
@@ -48,7 +48,7 @@ class AegisTask(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episode `seed`; without a seed, one that follows from the seeds before."""
+        """Begin episode `seed`; without a seed, one that is determined by the previous seeds."""
         super().reset(seed=seed)
         number = seed if seed is not None else int(self.np_random.integers(2**31))
         rng = episode_rng(EVALUATION_SEED, EVALUATION, number)

@@ -1,4 +1,4 @@
-"""What LeRobot may set of a policy of Aegis."""
+"""The settings of an Aegis policy in LeRobot."""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ class AegisConfig(PreTrainedConfig):
     """A backbone with an action expert.
 
     Attributes:
-        normalization_mapping: LeRobot's steps change no number, because the policy has scales.
-        backbone: of a new policy: 'embedded', a folder, or an id on the hub; with `anchor`, the VLM
-            that this was measured on.
+        normalization_mapping: identity for everything, because the policy scales its own inputs
+            and outputs.
+        backbone: VLM of a new policy: 'embedded', a folder, or an id on the hub; with `anchor`, the
+            VLM that the anchor was measured on.
         normalization: how a new policy scales: mean_std or quantiles.
-        expert_width, expert_mlp_ratio: of a new policy's action expert.
-        chunk_size: H, actions that are predicted at once.
-        n_action_steps: of which so many are executed.
-        temporal_ensemble_coeff: decay of a temporal ensemble, as ACT's; it predicts at every step,
+        expert_width, expert_mlp_ratio: sizes of a new policy's action expert.
+        chunk_size: H, the number of actions predicted at once.
+        n_action_steps: how many of them are executed.
+        temporal_ensemble_coeff: decay of a temporal ensemble as in ACT; it predicts at every step,
             so `n_action_steps` has to be 1. None: chunks are executed as they are.
-        noise_seed: seeds the noise that the flow begins with, at every reset.
-        flow_samples: flow times that are drawn per frame in training.
+        noise_seed: seed of the flow's initial noise, used at every reset.
+        flow_samples: number of flow times drawn per frame in training.
         method: how `lerobot-train` fine-tunes the backbone; kfac and nullspace need `anchor`.
-        decay_steps: after so many steps the learning rates have fallen; None: at the end.
-        action_feature_names: of a loaded policy, what its actions are called, where it knows;
-            LeRobot reads it. It is no setting, and the file of settings does not have it.
+        decay_steps: step at which the decay of the learning rates ends; None: the end of training.
+        action_feature_names: names of a loaded policy's actions, if known; read by LeRobot. It is
+            not a setting and is not in the settings file.
     """
 
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_unscaled)
@@ -118,10 +119,10 @@ class AegisConfig(PreTrainedConfig):
             )
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """AdamW; or for kfac and nullspace the optimizer that protects.
+        """AdamW, or for kfac and nullspace the protecting optimizer.
 
         Raises:
-            AegisError: a method that protects, without an anchor.
+            AegisError: a protecting method has no anchor.
         """
         common = {
             "lr": self.expert_lr,
@@ -137,12 +138,12 @@ class AegisConfig(PreTrainedConfig):
         return AdamWConfig(**common)
 
     def get_scheduler_preset(self) -> AegisSchedulerConfig:
-        """The learning rates of `aegis train`."""
+        """The learning-rate schedule of `aegis train`."""
         return AegisSchedulerConfig(self.warmup_steps, self.decay_steps, self.final_lr_share)
 
     @property
     def observation_delta_indices(self) -> None:
-        """One frame, without a dimension of time."""
+        """A single frame, without a time dimension."""
         return None
 
     @property

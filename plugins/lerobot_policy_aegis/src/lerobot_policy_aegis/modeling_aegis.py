@@ -1,4 +1,4 @@
-"""A policy of Aegis as LeRobot calls it: batches of tensors in, actions or a loss out."""
+"""An Aegis policy with LeRobot's interface: batches of tensors in, actions or a loss out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from aegis_cli.training import checkpoint
 from lerobot_policy_aegis.configuration_aegis import AegisConfig
 
 TASK, IS_PAD, INDEX = "task", "action_is_pad", "index"
-OBSERVED = "observation."  # what whole names of LeRobot's begin with
+OBSERVED = "observation."  # prefix of LeRobot's full names
 Statistics = Mapping[str, Mapping[str, Any]]
 _LOG = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class AegisPolicy(PreTrainedPolicy):
     """`aegis_cli.models.policy.Policy` behind LeRobot's interface.
 
     Attributes:
-        model: the policy itself; it takes and gives raw values.
+        model: the policy itself; it takes and returns raw values.
     """
 
     config_class = AegisConfig
@@ -55,18 +55,18 @@ class AegisPolicy(PreTrainedPolicy):
         dataset_meta: Any = None,
         **_: Any,
     ) -> None:
-        """Wrap a policy, or make a new one.
+        """Wrap a policy, or create a new one.
 
         Args:
             config: with the features.
-            dataset_stats: what a new policy is scaled by.
+            dataset_stats: statistics by which a new policy is scaled.
             model: a loaded policy; None for a new one, with the backbone that the config names.
-            meta: what a loaded policy's user has to know.
-            dataset_meta: LeRobot's metadata of the dataset; a new policy has the joints' names and
-                the control rate from it.
+            meta: what the user of a loaded policy has to know.
+            dataset_meta: LeRobot's metadata of the dataset; a new policy takes the names of joints
+                and the control rate from it.
 
         Raises:
-            AegisError: features that the policy does not have, or a new policy without statistics.
+            AegisError: the features are not those of the policy, or a new policy has no statistics.
         """
         super().__init__(config)
         config.validate_features()
@@ -86,7 +86,7 @@ class AegisPolicy(PreTrainedPolicy):
         _check_cameras(self._cameras, self.model)
         chosen = methods.get(config.method)
         chosen.adapt(self.model.backbone, self.model.backbone.language_maps(), {})
-        # LeRobot's programs for robots name a policy's actions by these, where they ask for it.
+        # LeRobot's programs for robots use these names for a policy's actions, if they need any.
         config.action_feature_names = self._meta.get("action_names")
         self._is_told_of_compiling = False
         self._generator = torch.Generator()
@@ -95,26 +95,26 @@ class AegisPolicy(PreTrainedPolicy):
     # --- acting -----------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Begin episodes: forget the last prediction, and begin the flow's noise anew."""
+        """Begin episodes: forget the last prediction, and restart the flow's noise."""
         self._ahead: deque[Tensor] = deque()
         decay = self.config.temporal_ensemble_coeff
         self._averaged = None if decay is None else TemporalEnsemble(decay)
-        self._is_told = False  # whether this episode has been warned of an empty text
-        self._follow: list[str] = []  # the texts that the actions ahead are of
+        self._is_told = False  # whether a warning about an empty text was given in this episode
+        self._follow: list[str] = []  # the texts that the pending actions were predicted for
         self._generator.manual_seed(self.config.noise_seed)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """The next action of each row, [B, A]; every `n_action_steps`-th call predicts.
+        """The next action of each row [B, A]; every `n_action_steps`-th call predicts a chunk.
 
-        With a temporal ensemble each call predicts, and the action is the mean of what the calls so
-        far have predicted for it. Other texts than those of the chunk predict at once, and drop
-        what is left of earlier ones.
+        With a temporal ensemble every call predicts, and the action is the weighted mean of the
+        predictions so far for this step. If the texts change, a new chunk is predicted at once and
+        the rest of the old one is dropped.
 
         Raises:
-            AegisError: what `predict_action_chunk` finds wrong with texts and state, or a picture
-                that is not finite, at each call: a robot whose sensor fails does not move on by an
-                older prediction.
+            AegisError: the texts or the state are invalid, as in `predict_action_chunk`, or a
+                picture is not finite. This is checked at every call, so that a robot whose sensor
+                fails does not continue with an older prediction.
         """
         texts = _texts(batch)
         self._state(batch, len(texts))
@@ -136,10 +136,12 @@ class AegisPolicy(PreTrainedPolicy):
         return self._ahead.popleft()
 
     def supports_rtc(self) -> bool:
-        """LeRobot's real-time chunking (`--inference.type=rtc`) asks for chunks that continue.
+        """True: LeRobot's real-time chunking (`--inference.type=rtc`) is supported.
+
+        It asks for chunks that continue each other.
 
         Raises:
-            AegisError: the policy averages chunks, which it could not do with these.
+            AegisError: the policy averages chunks, which is not possible with such chunks.
         """
         decay = self.config.temporal_ensemble_coeff
         if decay is not None:
@@ -150,7 +152,7 @@ class AegisPolicy(PreTrainedPolicy):
             )
         return True
 
-    @torch.compiler.disable  # backbones' processors of pictures and texts do not compile
+    @torch.compiler.disable  # the backbones' processors for pictures and texts do not compile
     @torch.no_grad()
     def predict_action_chunk(
         self,
@@ -164,14 +166,14 @@ class AegisPolicy(PreTrainedPolicy):
         Args:
             batch: pictures [B, 3, H, W] in [0, 1], `observation.state` [B, P] and B texts `task`.
             noise: must be None; the policy draws its own, from `noise_seed`.
-            inference_delay: how many of the actions that are left are executed before these are
-                there; None: none.
-            prev_chunk_left_over: what is left of the chunk before [n, A] or [B, n, A], which these
-                continue (`aegis_cli.core.continuation`); None: they begin anew.
+            inference_delay: how many of the remaining actions are executed before the new ones
+                arrive; None: none.
+            prev_chunk_left_over: the rest of the previous chunk [n, A] or [B, n, A], which the new
+                one continues (`aegis_cli.core.continuation`); None: it starts afresh.
 
         Raises:
-            AegisError: pictures, texts or a state that the policy cannot act on, actions of other
-                sizes, or predicted ones that are not finite.
+            AegisError: the policy cannot act on the pictures, texts or state, the previous actions
+                have other sizes, or predicted actions are not finite.
         """
         if noise is not None:
             raise AegisError("noise that was drawn elsewhere", "none", "set policy.noise_seed")
@@ -184,7 +186,7 @@ class AegisPolicy(PreTrainedPolicy):
         return check_actions(self.model.act(images, texts, state, self._generator, continued))
 
     def _warn_of_compiling(self) -> None:
-        """Say once that `--use_torch_compile` changes nothing; LeRobot sets a method for it."""
+        """Warn once that `--use_torch_compile` has no effect; LeRobot replaces a method for it."""
         if "predict_action_chunk" in vars(self) and not self._is_told_of_compiling:
             self._is_told_of_compiling = True
             _LOG.warning(
@@ -192,17 +194,17 @@ class AegisPolicy(PreTrainedPolicy):
             )
 
     def _warn_of_no_task(self, texts: Sequence[str]) -> None:
-        """Say once an episode that a text is blank, as LeRobot's is where `--task` is left out."""
+        """Warn once per episode of a blank text, as LeRobot passes if `--task` is left out."""
         if self._is_told or all(text.strip() for text in texts):
             return
         self._is_told = True
         _LOG.warning("The task is an empty text, which tells a policy nothing: give --task=TEXT")
 
     def _continued(self, left: Tensor | None, delay: int, rows: int) -> Continued | None:
-        """What chunks are to continue, as LeRobot gives it; None where nothing is left.
+        """The chunk to continue, from LeRobot's arguments; None if nothing of it is left.
 
         Raises:
-            AegisError: actions of other sizes.
+            AegisError: the actions have other sizes.
         """
         if left is None:
             return None
@@ -213,8 +215,8 @@ class AegisPolicy(PreTrainedPolicy):
                 f"({rows}, n, {self._actions})",
                 "give the actions as the policy predicted them",
             )
-        # LeRobot fills up what is shorter than --inference.rtc.execution_horizon, in some versions
-        # with zeros, in others with the last action, which cannot be told from one that is meant.
+        # LeRobot pads a rest shorter than --inference.rtc.execution_horizon, in some versions with
+        # zeros, in others with the last action, which cannot be distinguished from a real one.
         given = actions.abs().amax((0, 2)).nonzero()
         count = int(given[-1]) + 1 if len(given) else 0
         actions = actions[:, : min(count, self.config.chunk_size)]
@@ -246,8 +248,8 @@ class AegisPolicy(PreTrainedPolicy):
     ) -> tuple[Tensor, dict[str, float]]:
         """The flow-matching loss of a batch of frames with their chunks of actions [B, H, A].
 
-        The noise is a function of the seed and the frames, so that a resumed training draws what
-        the uninterrupted one drew; LeRobot's own generator does not come back to the same state.
+        The noise is a function of the seed and the frames, so that a resumed run draws the same as
+        an uninterrupted one; LeRobot's own generator does not return to the same state.
         """
         if reduction != "mean":
             raise AegisError(
@@ -267,14 +269,14 @@ class AegisPolicy(PreTrainedPolicy):
         return loss, {"flow_loss": loss.item()}
 
     def _seed_of(self, batch: Mapping[str, Any]) -> int:
-        """A seed by the numbers that the frames have in their dataset, if they have any."""
+        """A seed from the indices of the frames in their dataset, if they have any."""
         if (index := batch.get(INDEX)) is None:
             return int(torch.randint(2**62, ()))
         numbers = [self.config.noise_seed, *index.flatten().tolist()]
         return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
     def get_optim_params(self) -> list[dict[str, Any]]:
-        """Backbone and expert with learning rates of their own."""
+        """Parameter groups of backbone and expert, each with its own learning rate."""
         parts = (
             (self.model.backbone, self.config.backbone_lr),
             (self.model.expert, self.config.expert_lr),
@@ -324,16 +326,16 @@ class AegisPolicy(PreTrainedPolicy):
         strict: bool = True,
         **kwargs: Any,
     ) -> AegisPolicy:
-        """The policy in a folder, or of an id on the hub; always strict.
+        """Load the policy in a folder or with an id on the hub; always strict.
 
         Args:
-            strict: there is no other way; LeRobot's own default is ignored.
-            kwargs: what LeRobot gives besides; statistics of a dataset change no trained scale, and
-                its joints have to be the policy's.
+            strict: ignored; loading is always strict.
+            kwargs: further arguments from LeRobot; the statistics of a dataset do not change the
+                scales of a trained policy, and its joints must be those of the policy.
 
         Raises:
-            AegisError: a file or tensor that is missing, damaged or left over, or a dataset whose
-                joints have another order than the policy's.
+            AegisError: a file or tensor is missing, damaged or unexpected, or the joints of the
+                dataset are in another order than those of the policy.
         """
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
@@ -365,7 +367,7 @@ class AegisPolicy(PreTrainedPolicy):
     # --- batches ----------------------------------------------------------------------------------
 
     def _in_order(self) -> list[str]:
-        """Names of the pictures in the order in which the backbone takes them."""
+        """Names of the pictures, in the order that the backbone expects."""
         named = self._meta.get("cameras")
         given = list(self.config.image_features)
         if not named:
@@ -378,10 +380,10 @@ class AegisPolicy(PreTrainedPolicy):
         return keys
 
     def _state(self, batch: Mapping[str, Any], rows: int) -> Tensor:
-        """The positions [B, P] that `rows` robots are in.
+        """The positions [B, P] of `rows` robots.
 
         Raises:
-            AegisError: none, of another shape, or not finite.
+            AegisError: they are missing, have another shape, or are not finite.
         """
         wanted, found = (rows, len(self.model.proprio_scale.mean)), batch.get(OBS_STATE)
         if found is None or tuple(found.shape) != wanted:
@@ -416,10 +418,10 @@ class AegisPolicy(PreTrainedPolicy):
         return list(zip(*pictures, strict=True))
 
     def _pictures(self, batch: Mapping[str, Any], name: str) -> list[Tensor]:
-        """B pictures [H, W, 3] uint8 of one camera, in the size that training showed.
+        """B pictures [H, W, 3] uint8 of one camera, in the size used in training.
 
         Raises:
-            AegisError: numbers that are not finite, of which no byte could be made.
+            AegisError: values are not finite, so they have no byte value.
         """
         found = batch[name]
         if found.is_floating_point():
@@ -435,7 +437,7 @@ class AegisPolicy(PreTrainedPolicy):
 
 
 def _check_picture(name: str, found: Tensor) -> None:
-    """Raise AegisError for a picture of numbers that are not finite: no byte is made of them."""
+    """Raise AegisError for a picture with values that are not finite: they have no byte value."""
     if bad := int((~found.isfinite()).sum()):
         raise AegisError(
             f"a picture {name} with {bad:,} values that are not finite",
@@ -456,19 +458,19 @@ def _texts(batch: Mapping[str, Any]) -> list[str]:
 
 
 def _short(name: str) -> str:
-    """A picture's name as it is saved; one such as `observation.image` is saved whole."""
+    """A picture's name as it is saved; a name such as `observation.image` is saved in full."""
     return name.removeprefix(lerobot_folder.IMAGES)
 
 
 def _key(name: str, given: Sequence[str]) -> str:
-    """LeRobot's name of the picture that was saved by `name`."""
+    """LeRobot's name of the picture that was saved as `name`."""
     key = f"{lerobot_folder.IMAGES}{name}"
-    # `aegis export` once put the prefix before whole names too, and such policies still load.
+    # `aegis export` once put the prefix before full names too, and such policies still load.
     return name if name.startswith(OBSERVED) and key not in given else key
 
 
 def _new(config: AegisConfig, statistics: Statistics | None) -> Policy:
-    """A new policy: a pre-trained backbone, and an action expert that knows nothing yet."""
+    """A new policy: a pre-trained backbone and an untrained action expert."""
     if statistics is None:
         raise AegisError(
             "a new policy without the statistics of a dataset",
@@ -492,7 +494,7 @@ def _new(config: AegisConfig, statistics: Statistics | None) -> Policy:
 
 
 def _recorded(dataset_meta: Any) -> dict[str, Any]:
-    """What a LeRobot dataset says of its robot, as checkpoints of `aegis train` have it."""
+    """A LeRobot dataset's facts about its robot, as in checkpoints of `aegis train`."""
     if dataset_meta is None:
         return {}
     found: dict[str, Any] = {"fps": float(dataset_meta.fps)}
@@ -507,7 +509,7 @@ def _recorded(dataset_meta: Any) -> dict[str, Any]:
 
 
 def _say_what_robot(known: Mapping[str, Any]) -> None:
-    """Say what LeRobot does not compare with a robot: the control rate and the joints' order."""
+    """Log what LeRobot does not check against a robot: the control rate and the order of joints."""
     if (fps := known.get("fps")) is not None:
         _LOG.info("Trained at %g actions a second; a robot does as many with --fps=%g", fps, fps)
     if names := known.get("proprio_names"):
@@ -515,10 +517,10 @@ def _say_what_robot(known: Mapping[str, Any]) -> None:
 
 
 def _check_recorded(known: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Warn of a dataset that calls joints otherwise than a policy, or is of another control rate.
+    """Warn if a dataset names joints differently from the policy, or has another control rate.
 
     Raises:
-        AegisError: a joint has another place.
+        AegisError: a joint is in another place.
     """
     for other in joints.differences(known, found):
         if other.moved is not None:
@@ -565,7 +567,7 @@ def _numbers(values: Any) -> Tensor:
 
 
 def _never_varies(of: Mapping[str, Any]) -> Tensor | None:
-    """Which numbers [D] of a feature have one value in the dataset; None where it does not say."""
+    """Which components [D] of a feature are constant in the dataset; None if it does not tell."""
     if any(of.get(name) is None for name in ("min", "max", "mean")):
         return None
     low, high, mean = (_numbers(of[name]) for name in ("min", "max", "mean"))
@@ -573,7 +575,7 @@ def _never_varies(of: Mapping[str, Any]) -> Tensor | None:
 
 
 def _spread(statistics: Statistics | None, name: str) -> Tensor | None:
-    """The standard deviations [D] of a feature, 0 where it never varies; None if not told."""
+    """The standard deviations [D] of a feature, 0 where it is constant; None if unknown."""
     of = (statistics or {}).get(name, {})
     if of.get("std") is None:
         return None

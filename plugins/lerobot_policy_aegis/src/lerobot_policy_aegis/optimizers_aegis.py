@@ -1,7 +1,7 @@
-"""Optimizers that keep what a policy's VLM knew, for `lerobot-train --optimizer.type=...`.
+"""Optimizers that preserve what a policy's VLM knows, for `lerobot-train --optimizer.type=...`.
 
-LeRobot gives an optimizer parameters without names. How they are told nevertheless is said in
-aegis_cli/guard/optimizer.py.
+LeRobot gives an optimizer parameters without names. How they are identified nevertheless is
+explained in aegis_cli/guard/optimizer.py.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from aegis_cli.models import backbones
 
 @dataclass
 class _ProtectingConfig(OptimizerConfig, abc.ABC):
-    """AdamW's settings, and what the VLM is protected by.
+    """The settings of AdamW and of the VLM's protection.
 
     Attributes:
-        anchor: file of `aegis anchor`, measured on `base`.
-        base: the VLM that the policy begins with: 'embedded', a folder, or an id on the hub.
+        anchor: file from `aegis anchor`, measured on `base`.
+        base: the VLM that the policy starts from: 'embedded', a folder, or an id on the hub.
     """
 
     method: ClassVar[str]
@@ -41,10 +41,10 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
         """The method's own options."""
 
     def check_anchor(self, option: str) -> None:
-        """Raise AegisError where no anchor is named.
+        """Raise AegisError if no anchor is given.
 
         Args:
-            option: what `.anchor` names it of, on the command line.
+            option: the command-line option that `.anchor` is appended to.
         """
         if self.anchor:
             return
@@ -57,10 +57,10 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
         )
 
     def build(self, params: Any) -> ProtectedAdamW:
-        """The optimizer of these parameters.
+        """The optimizer for these parameters.
 
         Raises:
-            AegisError: no anchor, or what `ProtectedAdamW` refuses.
+            AegisError: there is no anchor, or `ProtectedAdamW` refuses its arguments.
         """
         self.check_anchor("--optimizer")
         return ProtectedAdamW(
@@ -79,13 +79,13 @@ class _ProtectingConfig(OptimizerConfig, abc.ABC):
 @OptimizerConfig.register_subclass("aegis_kfac")
 @dataclass
 class AegisKfacConfig(_ProtectingConfig):
-    """What the VLM's maps have moved is drawn back along the curvature of its answers.
+    """The VLM's maps are drawn back along the curvature of its answers.
 
     Attributes:
-        weight: of the penalty per step; with `balance` 0 too, 0 is AdamW.
-        damping: is added to the curvature of each output, whose mean is 1.
-        balance: how much less maps of small gradients move.
-        protect: kinds of maps, of maps and stem.
+        weight: weight of the penalty per step; 0 with `balance` 0 is plain AdamW.
+        damping: added to the curvature of each output, whose mean is 1.
+        balance: how much less maps with small gradients move.
+        protect: kinds of maps to protect: maps, stem.
     """
 
     method: ClassVar[str] = "kfac"
@@ -103,13 +103,13 @@ class AegisKfacConfig(_ProtectingConfig):
 @OptimizerConfig.register_subclass("aegis_nullspace")
 @dataclass
 class AegisNullspaceConfig(_ProtectingConfig):
-    """The applied update is kept out of what the VLM's maps read on questions.
+    """The applied update is kept out of the span of the VLM maps' inputs on questions.
 
     Attributes:
-        soft: share of the energy of a map's inputs at which a direction is half protected.
-        energy: instead of `soft`, the leading directions that hold this share are protected wholly;
-            0 is AdamW.
-        protect: kinds of modules, of maps, norms, embeddings and stem.
+        soft: fraction of the energy of a map's inputs at which a direction is half protected.
+        energy: instead of `soft`, protect the leading directions that hold this fraction of the
+            energy completely; 0 is plain AdamW.
+        protect: kinds of modules to protect: maps, norms, embeddings, stem.
     """
 
     method: ClassVar[str] = "nullspace"

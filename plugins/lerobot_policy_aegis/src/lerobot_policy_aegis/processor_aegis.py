@@ -1,4 +1,4 @@
-"""LeRobot's steps before and after the policy: its default ones, which scale nothing here."""
+"""LeRobot's processing steps before and after the policy: the default ones, which scale nothing."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def make_aegis_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """The steps before and after the policy; it takes and gives raw values.
+    """The processing steps before and after the policy, which takes and returns raw values.
 
-    The statistics of the dataset have become part of the policy when it was made.
+    The statistics of the dataset became part of the policy when it was created.
     """
     return make_default_pre_post_processors(config)

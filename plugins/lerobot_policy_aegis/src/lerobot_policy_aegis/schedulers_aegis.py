@@ -1,4 +1,4 @@
-"""The learning rates of `aegis train`, for `lerobot-train`."""
+"""The learning-rate schedule of `aegis train`, for `lerobot-train`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from aegis_cli.training.schedule import warmup_then_decay
 @LRSchedulerConfig.register_subclass("aegis")
 @dataclass
 class AegisSchedulerConfig(LRSchedulerConfig):
-    """A rise, then a cosine down to a share of the peak at the training's end.
+    """A warm-up, then a cosine decay to a fraction of the peak at the end of training.
 
-    LeRobot's own cosine shortens the rise of a training that is shorter than planned: 100 steps of
+    LeRobot's own cosine shortens the warm-up if training is shorter than planned: 100 steps of
     30,000 become 5 of 1,500.
 
     Attributes:
-        num_warmup_steps: over which the rates rise; never shortened.
-        num_decay_steps: after so many steps the rates have fallen; None: at the training's end.
-        final_lr_share: share of the peaks to which they fall.
+        num_warmup_steps: steps over which the learning rates rise; never shortened.
+        num_decay_steps: step at which the decay ends; None: the end of training.
+        final_lr_share: fraction of the peak rates at the end of the decay.
     """
 
     num_warmup_steps: int = 100
@@ -31,7 +31,7 @@ class AegisSchedulerConfig(LRSchedulerConfig):
     final_lr_share: float = 0.1
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """The schedule of an optimizer, each of whose groups has its peak as its rate."""
+        """The schedule for an optimizer whose groups have their peak rates as learning rates."""
         steps = self.num_decay_steps or num_training_steps
         if self.num_warmup_steps >= num_training_steps:
             logging.getLogger(__name__).warning(

@@ -1,0 +1,350 @@
+"""`aegis extract`: the VLM in a robot policy of another program, as a plain Hugging Face model.
+
+Its configuration, tokenizer and processor are those of the model that the policy was made from, and
+so are the tensors that the policy does not have.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.files import (
+    check_utf8,
+    folder_aside,
+    load_json,
+    make_folder,
+    put,
+    save_json,
+    write_text,
+)
+from aegis_cli.models.backbones import model_folder
+from aegis_cli.publishing import foreign_policy, tensor_files
+from aegis_cli.publishing.foreign_policy import Pair
+from aegis_cli.publishing.tensor_files import NAMES, TYPES
+from aegis_cli.publishing.vlm_names import Spec
+from aegis_cli.training import checkpoint
+from aegis_cli.training.card import without_folders
+
+SOURCE = "source"  # the type that each tensor of the base is stored in
+_COPIED = ("config.json", "generation_config.json", "aegis.json")
+_TYPE_KEYS = ("dtype", "torch_dtype")  # of transformers 5, and of those before it
+_CARD = """# The VLM of `{policy}`
+
+`aegis extract` has taken it out of the robot policy: {taken} of its {tensors} tensors are the
+policy's, of which {moved} differ from those of `{base}`. All others, the configuration and the
+processor are that model's.
+"""
+
+
+@dataclass(frozen=True)
+class Share:
+    """Tensors of which one thing is to be said."""
+
+    what: str
+    why: str
+    tensors: int
+    parameters: int
+
+
+@dataclass(frozen=True)
+class ExtractReport:
+    """What was taken out, and what was not.
+
+    Attributes:
+        type: what LeRobot calls the policy; None of another program's.
+        prefix: what the policy's names have before the VLM's.
+        dtype: the types that the weights are stored in.
+        tensors, parameters: of the VLM, of which `taken` are the policy's.
+        moved: of those that were taken, how many differ from the base's by more than the rounding
+            of the type that the policy stores them in.
+        rounded: of those that were taken, how many have lost digits.
+        kept: what is the base's.
+        more: the policy's names under the prefix which the base has not.
+    """
+
+    out: str
+    policy: str
+    type: str | None
+    base: str
+    prefix: str
+    dtype: str
+    tensors: int
+    parameters: int
+    taken: int
+    taken_parameters: int
+    moved: int
+    moved_parameters: int
+    rounded: int
+    kept: tuple[Share, ...]
+    more: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run(
+    policy: str, base: str, out: Path, dtype: str = SOURCE, on_event: OnEvent = ignore
+) -> ExtractReport:
+    """Write the VLM of a policy as a folder that everything takes which takes a backbone.
+
+    Args:
+        policy: a folder, a file or a hub id of safetensors.
+        base: the VLM that the policy was made from.
+        out: a new folder; nothing is left of it where this fails.
+        dtype: of the weights, SOURCE or one of `STORED_TYPES`.
+
+    Raises:
+        AegisError: a policy of Aegis, or none; a base that is no VLM, or not the policy's; or a
+            folder that is there already.
+    """
+    check_new(out)
+    with foreign_policy.opened(policy, base) as pair:
+        types = _types(pair, dtype)
+        counted = _Counted(pair, types, (policy, base))
+        make_folder(out.parent)
+        with checkpoint.writing(out), folder_aside(out) as aside:
+            _write_weights(aside, pair, types, counted, on_event)
+            _copy_records(aside, pair, None if dtype == SOURCE else dtype)
+            report = _report(pair, counted, types, (str(out), policy, base))
+            write_text(aside / "README.md", _card(report))
+            put(aside, out)
+    _warn(report, pair, on_event)
+    return report
+
+
+def check_new(out: Path) -> None:
+    """Raise AegisError where something is at a path already."""
+    if os.path.lexists(out):  # a link that leads nowhere too
+        raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
+    check_utf8(out, "choose another --out")
+
+
+class _Counted:
+    """Rows of the VLM's tensors, the policy's where it has them, and what is seen of them."""
+
+    def __init__(self, pair: Pair, types: Mapping[str, str], called: tuple[str, str]) -> None:
+        self._pair, self._types, self._called = pair, types, called
+        self.moved: set[str] = set()
+        self.rounded: set[str] = set()
+
+    def rows(self, name: str, first: int, last: int) -> Tensor:
+        """Rows of a tensor of the base's name, as they are to be written."""
+        pair, dtype = self._pair, TYPES.get(self._types[name])
+        before = pair.vlm.rows(name, first, last)
+        if name not in pair.match.taken:
+            return before if dtype is None else before.to(dtype)
+        until = min(last, pair.match.rows.get(name, last))
+        if until <= first:
+            return before if dtype is None else before.to(dtype)
+        own = pair.policy.rows(pair.match.taken[name], first, until)
+        shared = before[: until - first] if before.ndim else before
+        if not torch.equal(own, shared.to(own.dtype)):
+            self.moved.add(name)
+        if dtype is None:
+            return own
+        written = checked_cast(own, dtype, pair.match.taken[name], self._called[0])
+        if not torch.equal(written.to(own.dtype), own):
+            self.rounded.add(name)
+        if until < last:
+            return torch.cat([written, before[until - first :].to(dtype)])
+        return written
+
+
+def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Tensor:
+    """A tensor in another type.
+
+    Raises:
+        AegisError: numbers that are not finite, before or by it.
+    """
+    written = own.to(dtype)
+    if written.isfinite().all():
+        return written
+    if own.isfinite().all():
+        said = str(dtype).removeprefix("torch.")
+        raise AegisError(
+            f"'{name}' of '{called}' has numbers that {said} is too small for",
+            "a type that holds them",
+            "extract with --dtype float32",
+        )
+    raise AegisError(
+        f"'{name}' of '{called}' has NaN or infinite values",
+        "finite numbers",
+        "take a checkpoint of before its training diverged",
+    )
+
+
+def _types(pair: Pair, dtype: str) -> dict[str, str]:
+    """safetensors' name of the type that each tensor is to be written in."""
+    wanted = NAMES.get(dtype)
+    return {
+        name: wanted if wanted is not None and spec.is_float else spec.dtype
+        for name, spec in pair.vlm.specs.items()
+    }
+
+
+def _write_weights(
+    folder: Path,
+    pair: Pair,
+    types: Mapping[str, str],
+    counted: _Counted,
+    on_event: OnEvent,
+) -> None:
+    """Write files of the base's names, and their index, if they have one."""
+    rows = told(counted.rows, "extract", len(pair.vlm.specs), on_event)
+    size = 0
+    for part in pair.vlm.parts:
+        new = tensor_files.retyped(part, types)
+        size += sum(tensor_files.nbytes(spec) for spec in new.specs.values())
+        tensor_files.write(folder / part.path.name, new, rows)
+    names = {part.path.name for part in pair.vlm.parts}
+    for index in sorted(pair.vlm_at.glob("*.safetensors.index.json")):
+        said = load_json(index)
+        if isinstance(said, dict) and set((said.get("weight_map") or {}).values()) == names:
+            metadata = {**(said.get("metadata") or {}), "total_size": size}
+            save_json(folder / index.name, {**said, "metadata": metadata})
+
+
+def told(
+    rows: Callable[[str, int, int], Tensor], stage: str, total: int, on_event: OnEvent
+) -> Callable[[str, int, int], Tensor]:
+    """The same rows, with an event for each tensor that they begin."""
+    done = 0
+    on_event(Progress(stage, 0, total, "tensors"))
+
+    def counting(name: str, first: int, last: int) -> Tensor:
+        nonlocal done
+        found = rows(name, first, last)
+        if first == 0:
+            done += 1
+            on_event(Progress(stage, done, total, "tensors"))
+        return found
+
+    return counting
+
+
+def _copy_records(folder: Path, pair: Pair, dtype: str | None) -> None:
+    """Copy what the base has beside its weights; its configuration names the type of these."""
+    for name, content in model_folder.processor_files(pair.vlm_at).items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+    for name in _COPIED:
+        if (pair.vlm_at / name).is_file():
+            shutil.copyfile(pair.vlm_at / name, folder / name)
+    if dtype is not None:
+        config = load_json(folder / "config.json")
+        for part in (config, *(each for each in config.values() if isinstance(each, dict))):
+            part |= {key: dtype for key in _TYPE_KEYS if isinstance(part.get(key), str)}
+        save_json(folder / "config.json", config)
+    if pair.layers is not None:
+        model_folder.remember_layers(folder, pair.layers)
+
+
+def _report(
+    pair: Pair, counted: _Counted, types: Mapping[str, str], named: tuple[str, str, str]
+) -> ExtractReport:
+    found, specs = pair.match, pair.vlm.specs
+    out, policy, base = named
+    stored = {types[name] for name, spec in specs.items() if spec.is_float}
+    long = {short: long for long, short in NAMES.items()}
+    shared = {name: _shared(specs[name], found.rows.get(name)) for name in found.taken}
+    kept = [
+        Share(each.what, each.why, len(each.names), sum(count(specs[n]) for n in each.names))
+        for each in found.kept
+    ]
+    kept += [
+        Share(
+            f"the last {specs[name].shape[0] - rows:,} rows of {name}",
+            "the policy's vocabulary ends before them",
+            0,
+            count(specs[name]) - shared[name],
+        )
+        for name, rows in found.rows.items()
+        if rows < specs[name].shape[0]
+    ]
+    return ExtractReport(
+        out,
+        policy,
+        model_folder.foreign_policy(pair.policy_at),
+        base,
+        found.prefix,
+        ", ".join(sorted(long[each] for each in stored)),
+        len(specs),
+        sum(map(count, specs.values())),
+        len(found.taken),
+        sum(shared.values()),
+        len(counted.moved),
+        sum(shared[name] for name in counted.moved),
+        len(counted.rounded),
+        tuple(kept),
+        _more(pair),
+    )
+
+
+def _more(pair: Pair) -> tuple[str, ...]:
+    """What the policy has of a VLM, and the base has not."""
+    found, own = pair.match, pair.policy
+    more = list(found.more)
+    for name, rows in found.rows.items():
+        other = found.taken[name]
+        if rows < own.specs[other].shape[0]:
+            more.append(f"{other} (rows {rows:,} to {own.specs[other].shape[0] - 1:,})")
+    # The base has one tensor for both. Where they are equal there is nothing to say.
+    if found.second is not None and not tensor_files.equal(own, *found.second):
+        more.append(f"{found.second[0]} (which the base ties to {found.second[1]})")
+    return tuple(more)
+
+
+def count(spec: Spec) -> int:
+    """How many numbers a tensor has."""
+    return math.prod(spec.shape)
+
+
+def _shared(spec: Spec, rows: int | None) -> int:
+    """How many numbers of a tensor are in its first rows."""
+    return count(spec) if rows is None else rows * count(spec) // max(1, spec.shape[0])
+
+
+def _card(report: ExtractReport) -> str:
+    places = {"policy": without_folders(report.policy), "base": without_folders(report.base)}
+    return _CARD.format(**{**asdict(report), **places})
+
+
+def _warn(report: ExtractReport, pair: Pair, on_event: OnEvent) -> None:
+    """Say what a probe would not show by itself."""
+    if report.rounded:
+        on_event(
+            Warned(
+                "extract",
+                f"{report.rounded} of the policy's tensors have lost digits, since the base is "
+                f"stored in {report.dtype}; --dtype float32 keeps them",
+            )
+        )
+    if report.moved == 0:
+        on_event(
+            Warned(
+                "extract",
+                "none of the policy's tensors differs from the base's: its VLM was frozen, and has "
+                "nothing to forget",
+            )
+        )
+    for name in pair.match.rows:
+        own = pair.policy.specs[pair.match.taken[name]].shape[0]
+        theirs = pair.vlm.specs[name].shape[0]
+        on_event(
+            Warned(
+                "extract",
+                f"{own:,} rows of the vocabulary in the policy and {theirs:,} in the base's "
+                f"{name}: the first {min(own, theirs):,} are taken for the same words",
+            )
+        )

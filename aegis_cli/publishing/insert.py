@@ -1,0 +1,187 @@
+"""`aegis insert`: a VLM back into the robot policy of another program that it was taken out of."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.files import folder_aside, make_folder, put
+from aegis_cli.publishing import foreign_policy, tensor_files
+from aegis_cli.publishing.extract import Share, check_new, checked_cast, count, told
+from aegis_cli.publishing.foreign_policy import Pair
+from aegis_cli.publishing.tensor_files import TYPES
+from aegis_cli.training import checkpoint
+
+_NOT_COPIED = (".git", ".cache")  # of a copy of a repository, and what a download leaves
+
+
+@dataclass(frozen=True)
+class InsertReport:
+    """What was put into the policy.
+
+    Attributes:
+        prefix: what the policy's names have before the VLM's.
+        tensors, parameters: of the policy, of which `put` are the VLM's now.
+        changed: of those that were put in, how many differ from what the policy had.
+        rounded: of those that were put in, how many have lost digits.
+        left_out: what the VLM has, and the policy has not.
+    """
+
+    out: str
+    vlm: str
+    policy: str
+    prefix: str
+    tensors: int
+    parameters: int
+    put: int
+    put_parameters: int
+    changed: int
+    rounded: int
+    left_out: tuple[Share, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertReport:
+    """Write a policy's folder again, with the tensors of a VLM in place of its own VLM's.
+
+    They are written in the types and under the names that the policy has. Where the type holds all
+    digits, what `aegis extract` took out of a policy gives the same files again.
+
+    Args:
+        vlm: a Hugging Face model, such as what `aegis merge` made of an extracted one.
+        policy: a folder or a hub id.
+        out: a new folder; nothing is left of it where this fails.
+
+    Raises:
+        AegisError: as `aegis extract` does, or a policy that is a file.
+    """
+    check_new(out)
+    with foreign_policy.opened(policy, vlm) as pair:
+        if not pair.policy_at.is_dir():
+            raise AegisError(
+                f"'{policy}', a file",
+                "the policy's folder, which is copied with its configuration",
+                f"give '{pair.policy_at.parent}'",
+            )
+        if out.resolve().is_relative_to(pair.policy_at.resolve()):
+            raise AegisError(
+                f"--out {out}, inside of the policy that is copied",
+                "a folder elsewhere",
+                "choose another --out",
+            )
+        rows = _Rows(pair, vlm)
+        make_folder(out.parent)
+        with checkpoint.writing(out), folder_aside(out) as aside:
+            _copy(pair, aside)
+            counted = told(rows.rows, "insert", len(pair.policy.specs), on_event)
+            for part in pair.policy.parts:
+                place = aside / part.path.relative_to(pair.policy_at)
+                tensor_files.write(place, part, counted)
+            put(aside, out)
+    return _report(pair, rows, (str(out), vlm, policy))
+
+
+class _Rows:
+    """Rows of the policy's tensors, the VLM's where they are of it, and what is seen of them."""
+
+    def __init__(self, pair: Pair, called: str) -> None:
+        self._pair, self._called = pair, called
+        self.source = _sources(pair)
+        self.changed: set[str] = set()
+        self.rounded: set[str] = set()
+
+    def rows(self, name: str, first: int, last: int) -> Tensor:
+        """Rows of a tensor of the policy's name, as they are to be written."""
+        pair = self._pair
+        before = pair.policy.rows(name, first, last)
+        source = self.source.get(name)
+        until = last if source is None else min(last, pair.match.rows.get(source, last))
+        if source is None or until <= first:
+            return before
+        own = pair.vlm.rows(source, first, until)
+        dtype = TYPES.get(pair.policy.specs[name].dtype)
+        written = own if dtype is None else checked_cast(own, dtype, source, self._called)
+        shared = before[: until - first] if before.ndim else before
+        if not torch.equal(written, shared):
+            self.changed.add(name)
+        if not torch.equal(written.to(own.dtype), own):
+            self.rounded.add(name)
+        return written if until == last else torch.cat([written, before[until - first :]])
+
+
+def _sources(pair: Pair) -> dict[str, str]:
+    """The policy's name of each tensor that the VLM has -> the VLM's name."""
+    # A table and a head that are one in the policy are alike in the VLM.
+    found = {other: name for name, other in pair.match.taken.items()}
+    if pair.match.second is not None:
+        second, first = pair.match.second
+        # A head that has learned by itself stays: the VLM has none.
+        if tensor_files.equal(pair.policy, second, first):
+            found[second] = found[first]
+    return found
+
+
+def _copy(pair: Pair, folder: Path) -> None:
+    """Copy all that the policy's folder holds beside its weights."""
+    weights = {part.path for part in pair.policy.parts}
+
+    def left_out(at: str, names: list[str]) -> list[str]:
+        inside = Path(at)
+        return [
+            name
+            for name in names
+            if inside / name in weights or (inside == pair.policy_at and name in _NOT_COPIED)
+        ]
+
+    shutil.copytree(pair.policy_at, folder, ignore=left_out, dirs_exist_ok=True)
+
+
+def _report(pair: Pair, rows: _Rows, named: tuple[str, str, str]) -> InsertReport:
+    found, own, specs = pair.match, pair.policy.specs, pair.vlm.specs
+    out, vlm, policy = named
+    put_parameters = 0
+    for name, source in rows.source.items():
+        whole = count(own[name])
+        shared = found.rows.get(source)
+        put_parameters += whole if shared is None else shared * whole // max(1, own[name].shape[0])
+    left_out = [
+        Share(
+            each.what,
+            "the policy does not have it",
+            len(each.names),
+            sum(count(specs[name]) for name in each.names),
+        )
+        for each in found.kept
+    ]
+    left_out += [
+        Share(
+            f"the last {specs[name].shape[0] - shared:,} rows of {name}",
+            "the policy's vocabulary ends before them",
+            0,
+            count(specs[name]) * (specs[name].shape[0] - shared) // specs[name].shape[0],
+        )
+        for name, shared in found.rows.items()
+        if shared < specs[name].shape[0]
+    ]
+    return InsertReport(
+        out,
+        vlm,
+        policy,
+        found.prefix,
+        len(own),
+        sum(map(count, own.values())),
+        len(rows.source),
+        put_parameters,
+        len(rows.changed),
+        len(rows.rounded),
+        tuple(left_out),
+    )

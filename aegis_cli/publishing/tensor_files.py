@@ -1,0 +1,248 @@
+"""safetensors files read and written some rows of a tensor at a time, never a model as a whole."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
+from aegis_cli.publishing.vlm_names import Spec
+
+TYPES = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+}
+NAMES = {str(dtype).removeprefix("torch."): name for name, dtype in TYPES.items()}
+# Whole numbers, as of buffers. Of any other type, which is copied and nothing else, the bytes do.
+_WHOLE = {
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "BOOL": torch.bool,
+}
+_AT_ONCE = 2**26  # bytes of a tensor that are in memory
+_INDEX = "*.safetensors.index.json"
+_ONE = "model.safetensors"
+
+
+@dataclass(frozen=True)
+class TensorFile:
+    """What the header of one file says.
+
+    Attributes:
+        head: the header as it stands in the file, with its length before it.
+        specs: its tensors, in the order in which they lie in the file.
+        offsets: where each of them begins and ends, from the end of the header on [bytes].
+        metadata: what else it says; None: nothing.
+    """
+
+    path: Path
+    head: bytes
+    specs: Mapping[str, Spec]
+    offsets: Mapping[str, tuple[int, int]]
+    metadata: Mapping[str, str] | None
+
+
+class Tensors:
+    """The tensors of a model or a policy, wherever in its files they lie."""
+
+    def __init__(self, parts: Sequence[TensorFile], opened: Mapping[Path, BufferedReader]) -> None:
+        self.parts = parts
+        self.specs = {name: spec for part in parts for name, spec in part.specs.items()}
+        self._parts = {name: part for part in parts for name in part.specs}
+        self._files = opened
+
+    def rows(self, name: str, first: int, last: int) -> Tensor:
+        """Rows of a tensor; of one without axes all of it.
+
+        They are read and not mapped: what is mapped of a large model fills the memory, too.
+
+        Raises:
+            AegisError: the file has become shorter meanwhile.
+        """
+        part, spec = self._parts[name], self.specs[name]
+        start, end = part.offsets[name]
+        rows = spec.shape[0] if spec.shape else 1
+        a_row = (end - start) // max(1, rows)
+        file = self._files[part.path]
+        file.seek(len(part.head) + start + first * a_row)
+        values = torch.empty((last - first) * a_row, dtype=torch.uint8)
+        if values.numel() and file.readinto(values.numpy().data) != values.numel():
+            raise AegisError(f"'{part.path}' has become shorter", "a complete file", _AGAIN)
+        dtype = {**TYPES, **_WHOLE}.get(spec.dtype)
+        if dtype is None:
+            return values
+        shape = (last - first, *spec.shape[1:]) if spec.shape else ()
+        return values.view(dtype).reshape(shape)
+
+
+def paths(folder: Path) -> list[Path]:
+    """The files of weights in a folder: those of its index, else the model's, else all.
+
+    LeRobot puts the scales of its steps before and after a policy into files beside it, and
+    Mistral's repositories have their weights twice.
+
+    Raises:
+        AegisError: a file that the index names is not there.
+    """
+    found = sorted(folder.glob(_INDEX))
+    if found and not (folder / _ONE).is_file():
+        index = files.load_json(found[0])
+        listed = index.get("weight_map") if isinstance(index, dict) else None
+        if not isinstance(listed, dict) or not listed:
+            raise AegisError(
+                f"'{found[0]}' without a weight_map", "the index of files of weights", _AGAIN
+            )
+        parts = [folder / name for name in sorted(set(map(str, listed.values())))]
+        if absent := [part for part in parts if not part.is_file()]:
+            raise AegisError(
+                f"no file '{absent[0]}', which '{found[0].name}' names: {len(absent)} of "
+                f"{len(parts)} are missing",
+                "all files of the weights",
+                _AGAIN,
+            )
+        return parts
+    if (folder / _ONE).is_file():
+        return [folder / _ONE]
+    return sorted(folder.glob("*.safetensors"))
+
+
+_AGAIN = "download it again"
+
+
+@contextlib.contextmanager
+def opened(parts: Sequence[Path]) -> Generator[Tensors]:
+    """The tensors of these files, which stay open meanwhile.
+
+    Raises:
+        AegisError: a file that is missing, damaged or none of safetensors, or two that have a
+            tensor of the same name.
+    """
+    with contextlib.ExitStack() as stack:
+        read, found = [], {}
+        for path in parts:
+            files.check_utf8(path, files.RENAME)
+            try:
+                with files.reading(path, "check the path"):
+                    with safe_open(path, framework="np"):  # it finds what is wrong with a header
+                        pass
+                    found[path] = stack.enter_context(open(path, "rb"))
+                    read.append(_header(path, found[path]))
+            except SafetensorError as error:
+                files.refuse_pointer(path)
+                raise AegisError(
+                    f"'{path}' is truncated or not a safetensors file ({error})",
+                    "a complete safetensors file",
+                    _AGAIN,
+                ) from error
+        names = [name for part in read for name in part.specs]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise AegisError(
+                f"'{twice}' in more than one file of '{parts[0].parent}'",
+                "each tensor in one file",
+                "leave the files of one model alone in the folder",
+            )
+        yield Tensors(read, found)
+
+
+def _header(path: Path, file: BufferedReader) -> TensorFile:
+    """A file's header, which safetensors has found right already."""
+    length = file.read(8)
+    raw = file.read(int.from_bytes(length, "little"))
+    table: dict[str, Any] = json.loads(raw)
+    metadata = table.pop("__metadata__", None)
+    order = sorted(table, key=lambda name: (table[name]["data_offsets"], name))
+    specs = {name: Spec(tuple(table[name]["shape"]), table[name]["dtype"]) for name in order}
+    offsets = {name: tuple(table[name]["data_offsets"]) for name in order}
+    return TensorFile(path, length + raw, specs, offsets, metadata)
+
+
+def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
+    """A file with the same tensors, some of them of other types."""
+    if all(types.get(name, spec.dtype) == spec.dtype for name, spec in part.specs.items()):
+        return part
+    specs = {n: Spec(spec.shape, types.get(n, spec.dtype)) for n, spec in part.specs.items()}
+    # With the widest types first, every tensor is aligned. Other types are whole numbers, and last.
+    names = sorted(specs, key=lambda n: (-_size(specs[n].dtype), n))
+    table: dict[str, Any] = {} if part.metadata is None else {"__metadata__": dict(part.metadata)}
+    offsets, end = {}, 0
+    for name in names:
+        shape, dtype = specs[name]
+        start, end = end, end + nbytes(specs[name])
+        offsets[name] = start, end
+        table[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [start, end]}
+    raw = json.dumps(table, separators=(",", ":")).encode()
+    raw += b" " * (-len(raw) % 8)
+    head = len(raw).to_bytes(8, "little") + raw
+    in_order = {name: specs[name] for name in names}
+    return TensorFile(part.path, head, in_order, offsets, part.metadata)
+
+
+_BITS = {"64": 8, "32": 4, "16": 2}
+
+
+def _size(dtype: str) -> int:
+    """Bytes of one number."""
+    return next((size for bits, size in _BITS.items() if dtype.endswith(bits)), 1)
+
+
+def nbytes(spec: Spec) -> int:
+    """Bytes that a tensor takes in a file."""
+    count = 1
+    for size in spec.shape:
+        count *= size
+    return count * _size(spec.dtype)
+
+
+def blocks(spec: Spec) -> Iterator[tuple[int, int]]:
+    """The first row, and that after the last one, of parts of a tensor that fit into memory."""
+    if not spec.shape:
+        yield 0, 1
+        return
+    rows = spec.shape[0]
+    a_row = max(1, nbytes(spec) // max(1, rows))
+    at_once = max(1, _AT_ONCE // a_row)
+    for first in range(0, rows, at_once):
+        yield first, min(rows, first + at_once)
+
+
+def write(path: Path, part: TensorFile, rows: Callable[[str, int, int], Tensor]) -> None:
+    """Write a file with this header.
+
+    Args:
+        rows: what makes rows of a tensor, in the type that the header says; called for each
+            tensor in its order, from its first row to its last.
+    """
+
+    def parts() -> Iterator[memoryview]:
+        for name, spec in part.specs.items():
+            for first, last in blocks(spec):
+                yield rows(name, first, last).reshape(-1).view(torch.uint8).numpy().data
+
+    with open(path, "wb") as file:
+        file.write(part.head)
+        files.pour(file, parts())
+
+
+def equal(tensors: Tensors, one: str, other: str) -> bool:
+    """Whether two tensors have the same shape, type and values."""
+    spec = tensors.specs[one]
+    if spec != tensors.specs[other]:
+        return False
+    return all(
+        torch.equal(tensors.rows(one, *part), tensors.rows(other, *part)) for part in blocks(spec)
+    )

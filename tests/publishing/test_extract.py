@@ -1,0 +1,524 @@
+"""The VLM in a policy of another program is taken out, measured, and put back bit for bit."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from samples import foreign
+from samples.command import refused
+from samples.foreign import FORMS, SCALES, TABLE, WEIGHTS
+from samples.hub import Hub
+from samples.vqa_files import write_jsonl
+from torch import Tensor
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import Event, Progress, Warned
+from aegis_cli.models import backbones
+from aegis_cli.publishing import extract, insert, tensor_files
+
+Aegis = Callable[..., tuple[int, str, str]]
+Folder = Callable[[str], Path]
+HEAD = "language_model.lm_head.weight"
+
+
+@pytest.fixture
+def paligemma(hf_folder: Folder) -> Path:
+    return hf_folder("paligemma")
+
+
+@pytest.fixture
+def smolvlm(hf_folder: Folder) -> Path:
+    return hf_folder("smolvlm")
+
+
+def base_of(form: str, hf_folder: Folder) -> Path:
+    return hf_folder("smolvlm" if form == "smolvla" else "paligemma")
+
+
+def policy(folder: Path, vlm: Mapping[str, Tensor], form: str, shards: int = 1) -> Path:
+    return foreign.write(folder, foreign.tensors(vlm, FORMS[form]), FORMS[form], shards)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def equal(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[n], other[n]) for n in one)
+
+
+def take(source: Path, base: Path, out: Path, **options: str) -> extract.ExtractReport:
+    return extract.run(str(source), str(base), out, **options)
+
+
+# --- extract --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("shards", [1, 3])
+def test_what_is_extracted_is_the_policys_and_goes_back_bit_for_bit(
+    form: str, shards: int, hf_folder: Folder, tmp_path: Path
+) -> None:
+    base = base_of(form, hf_folder)
+    own = foreign.moved(base)
+    source = policy(tmp_path / "policy", own, form, shards)
+    report = take(source, base, tmp_path / "vlm")
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own)
+    assert report.taken == report.moved == report.tensors == len(own)
+    assert report.taken_parameters == report.parameters == sum(t.numel() for t in own.values())
+    assert (report.kept, report.rounded, report.type) == ((), 0, FORMS[form].type)
+    back = insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+    assert (back.put, back.changed, back.rounded, back.left_out) == (len(own), 0, 0, ())
+
+
+@pytest.mark.parametrize("form", ["pi0 of LeRobot", "pi0 of openpi"])
+def test_an_expert_of_the_vlms_own_width_is_never_taken(
+    form: str, paligemma: Path, tmp_path: Path
+) -> None:
+    own = foreign.moved(paligemma)
+    found = foreign.tensors(own, FORMS[form], width=None)
+    source = foreign.write(tmp_path / "policy", found, FORMS[form])
+    report = take(source, paligemma, tmp_path / "vlm")
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own)
+    assert not any("gemma_expert" in name for name in report.more)
+
+
+def test_everything_beside_the_weights_is_the_bases(smolvlm: Path, tmp_path: Path) -> None:
+    take(policy(tmp_path / "policy", foreign.moved(smolvlm), "smolvla"), smolvlm, tmp_path / "vlm")
+    own, other = files_of(tmp_path / "vlm"), files_of(smolvlm)
+    assert {n: c for n, c in own.items() if n not in (WEIGHTS, "README.md")} == {
+        n: c for n, c in other.items() if n != WEIGHTS
+    }
+    assert "are the\npolicy's" in own["README.md"].decode()
+    assert str(tmp_path) not in own["README.md"].decode()
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_layers_that_the_policy_lacks_are_put_back_and_counted(
+    depth: int, paligemma: Path, tmp_path: Path
+) -> None:
+    own, before = foreign.moved(paligemma), load_file(paligemma / WEIGHTS)
+    there = {name: t for name, t in own.items() if not foreign.is_layer(name, depth)}
+    source = policy(tmp_path / "policy", there, "pi0 of LeRobot")
+    report = take(source, paligemma, tmp_path / "vlm")
+    upper = {name: t for name, t in before.items() if name not in there}
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), {**upper, **there})
+    (kept,) = report.kept
+    assert kept.what == ("language layers 1 to 2" if depth == 1 else "language layer 2")
+    assert (kept.tensors, kept.parameters) == (len(upper), sum(t.numel() for t in upper.values()))
+    assert report.taken_parameters + kept.parameters == report.parameters
+    back = insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+    assert [share.what for share in back.left_out] == [kept.what]
+
+
+def test_a_head_alone_is_the_table(paligemma: Path, tmp_path: Path) -> None:
+    own = foreign.moved(paligemma)
+    alone = {HEAD if name == TABLE else name: tensor for name, tensor in own.items()}
+    source = policy(tmp_path / "policy", alone, "pi0 of openpi")
+    take(source, paligemma, tmp_path / "vlm")
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own)
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_head_of_the_policys_own_follows_the_table_where_both_are_one(
+    alike: bool, paligemma: Path, tmp_path: Path
+) -> None:
+    own = foreign.moved(paligemma)
+    head = own[TABLE].clone() if alike else own[TABLE] + 1
+    source = policy(tmp_path / "policy", {**own, HEAD: head}, "pi0 of LeRobot")
+    report = take(source, paligemma, tmp_path / "vlm")
+    name = "model.paligemma_with_expert.paligemma.lm_head.weight"
+    assert any(each.startswith(name) for each in report.more) == (not alike)
+    # The VLM moves on, and what is put back has its table, and its head where that was one with it.
+    later = foreign.moved(tmp_path / "vlm", seed=1)
+    save_file(later, tmp_path / "vlm" / WEIGHTS)
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    back = load_file(tmp_path / "back" / WEIGHTS)
+    assert torch.equal(back[name], later[TABLE] if alike else head)
+
+
+@pytest.mark.parametrize("head", [True, False])
+def test_a_base_that_stores_table_and_head_alike_takes_both_from_one(
+    head: bool, smolvlm: Path, tmp_path: Path
+) -> None:
+    base = shutil.copytree(smolvlm, tmp_path / "base")
+    table, named = "model.text_model.embed_tokens.weight", "lm_head.weight"
+    stored = load_file(base / WEIGHTS)
+    stored[named] = stored[table].clone()
+    save_file(stored, base / WEIGHTS, {"format": "pt"})
+    own = foreign.moved(base)
+    gone, there = (table, named) if head else (named, table)
+    del own[gone]
+    take(policy(tmp_path / "policy", own, "smolvla"), base, tmp_path / "vlm")
+    found = load_file(tmp_path / "vlm" / WEIGHTS)
+    assert torch.equal(found[gone], own[there]) and torch.equal(found[there], own[there])
+
+
+def test_an_untied_head_that_is_missing_is_the_bases(smolvlm: Path, tmp_path: Path) -> None:
+    own = foreign.moved(smolvlm)
+    del own["lm_head.weight"]
+    report = take(policy(tmp_path / "policy", own, "smolvla"), smolvlm, tmp_path / "vlm")
+    head = load_file(tmp_path / "vlm" / WEIGHTS)["lm_head.weight"]
+    assert torch.equal(head, load_file(smolvlm / WEIGHTS)["lm_head.weight"])
+    assert [share.what for share in report.kept] == ["behind the layers"]
+
+
+@pytest.mark.parametrize("rows", [-5, 5])
+def test_a_vocabulary_of_another_length_shares_its_first_rows(
+    rows: int, paligemma: Path, tmp_path: Path
+) -> None:
+    own = foreign.moved(paligemma)
+    table, before = own[TABLE], load_file(paligemma / WEIGHTS)[TABLE]
+    words = len(table)
+    longer = torch.cat([table, table[:5]])[: words + rows]
+    source = policy(tmp_path / "policy", {**own, TABLE: longer}, "pi0 of openpi")
+    said: list[Event] = []
+    report = extract.run(str(source), str(paligemma), tmp_path / "vlm", on_event=said.append)
+    found = load_file(tmp_path / "vlm" / WEIGHTS)[TABLE]
+    shared = words + min(rows, 0)
+    assert torch.equal(found, torch.cat([table[:shared], before[shared:]]))
+    assert any("rows of the vocabulary" in e.text for e in said if isinstance(e, Warned))
+    kept = sum(share.parameters for share in report.kept)
+    assert kept == max(-rows, 0) * table.shape[1]
+    assert report.taken_parameters + kept == report.parameters
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+def test_tensors_are_the_same_however_few_rows_are_in_memory(
+    paligemma: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = foreign.moved(paligemma)
+    longer = {**own, TABLE: own[TABLE][:-5]}
+    source = policy(tmp_path / "policy", longer, "pi0 of openpi")
+    whole = take(source, paligemma, tmp_path / "whole")
+    monkeypatch.setattr(tensor_files, "_AT_ONCE", 1000)
+    parts = take(source, paligemma, tmp_path / "parts")
+    assert files_of(tmp_path / "whole") == files_of(tmp_path / "parts")
+    assert (whole.moved, whole.kept) == (parts.moved, parts.kept)
+    insert.run(str(tmp_path / "parts"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+# --- types ----------------------------------------------------------------------------------------
+
+
+def test_an_untouched_policy_in_half_precision_has_moved_nowhere(
+    smolvlm: Path, tmp_path: Path
+) -> None:
+    """The base's own values, rounded, are no training."""
+    own = {name: t.bfloat16() for name, t in foreign.moved(smolvlm, by=0).items()}
+    one = next(iter(own))
+    own[one] = own[one] + 1
+    said: list[Event] = []
+    source = policy(tmp_path / "policy", own, "smolvla")
+    report = extract.run(str(source), str(smolvlm), tmp_path / "vlm", on_event=said.append)
+    assert (report.moved, report.moved_parameters) == (1, own[one].numel())
+    assert (report.dtype, report.rounded) == ("float32", 0)
+    assert [e.done for e in said if isinstance(e, Progress)] == [*range(report.tensors + 1)]
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), {n: t.float() for n, t in own.items()})
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+def test_a_base_in_half_precision_rounds_and_says_so(hf_folder: Folder, tmp_path: Path) -> None:
+    from samples import hf
+
+    base = hf.write("smolvlm", tmp_path / "base", dtype=torch.bfloat16)
+    own = {n: t.float() + 1e-4 for n, t in load_file(base / WEIGHTS).items()}
+    source = policy(tmp_path / "policy", own, "smolvla")
+    said: list[Event] = []
+    report = extract.run(str(source), str(base), tmp_path / "vlm", on_event=said.append)
+    assert report.dtype == "bfloat16" and 0 < report.rounded <= report.moved == report.tensors
+    warned = [event.text for event in said if isinstance(event, Warned)]
+    assert any("--dtype float32 keeps them" in text for text in warned)
+    wide = take(source, base, tmp_path / "wide", dtype="float32")
+    assert (wide.dtype, wide.rounded) == ("float32", 0)
+    assert equal(load_file(tmp_path / "wide" / WEIGHTS), own)
+    config = json.loads((tmp_path / "wide" / "config.json").read_text())
+    assert config["dtype"] == "float32"
+    backbones.load(str(tmp_path / "wide"))
+    insert.run(str(tmp_path / "wide"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+def test_a_base_in_shards_gives_its_shards_and_a_true_index(
+    paligemma: Path, tmp_path: Path
+) -> None:
+    import transformers
+
+    base = shutil.copytree(paligemma, tmp_path / "base")
+    (base / WEIGHTS).unlink()
+    model = transformers.AutoModelForImageTextToText.from_pretrained(paligemma)
+    model.save_pretrained(base, max_shard_size="60KB")
+    own = foreign.moved(paligemma)
+    source = policy(tmp_path / "policy", own, "pi0 of LeRobot")
+    take(source, base, tmp_path / "vlm", dtype="bfloat16")
+    shards = sorted(path.name for path in base.glob("*.safetensors"))
+    assert len(shards) > 1
+    assert sorted(path.name for path in (tmp_path / "vlm").glob("*.safetensors")) == shards
+    index = json.loads((tmp_path / "vlm" / f"{WEIGHTS}.index.json").read_text())
+    assert index["metadata"]["total_size"] == 2 * sum(tensor.numel() for tensor in own.values())
+    found = backbones.load(str(tmp_path / "vlm")).state_dict()
+    take(source, paligemma, tmp_path / "one", dtype="bfloat16")
+    assert equal(found, backbones.load(str(tmp_path / "one")).state_dict())
+
+
+# --- what others make of it -----------------------------------------------------------------------
+
+
+def test_a_probe_tells_what_the_policy_has_forgotten(
+    smolvlm: Path, tmp_path: Path, aegis: Aegis
+) -> None:
+    questions = write_jsonl(tmp_path / "questions")
+    probed = {}
+    for name, by in (("untouched", 0.0), ("trained", 0.3)):
+        source = policy(tmp_path / name, foreign.moved(smolvlm, by), "smolvla")
+        vlm, answers = tmp_path / f"vlm-{name}", tmp_path / f"{name}.jsonl"
+        code, said, err = aegis("extract", source, "--base", smolvlm, "--out", vlm)
+        assert code == 0, err
+        assert "what it has forgotten: aegis probe" in said
+        assert ("nothing to forget" in err) == (name == "untouched")
+        command = ("probe", vlm, "--baseline", smolvlm, "--vqa", questions)
+        code, said, err = aegis(*command, "--predictions", answers, "--json")
+        assert code == 0, err
+        probed[name] = json.loads(said), answers.read_text()
+    command = ("probe", smolvlm, "--vqa", questions, "--predictions", tmp_path / "base.jsonl")
+    code, said, err = aegis(*command, "--json")
+    before = json.loads(said)
+    untouched, answers = probed["untouched"]
+    assert untouched["drop_points"] == 0
+    assert untouched["cross_entropy"] == before["cross_entropy"]
+    assert answers == (tmp_path / "base.jsonl").read_text()
+    trained = probed["trained"][0]
+    assert trained["cross_entropy"] != before["cross_entropy"]
+    assert probed["trained"][1] != answers
+
+
+@pytest.mark.parametrize("form", ["smolvla", "pi0 of openpi"])
+def test_a_merge_of_it_goes_back_into_the_policy(
+    form: str, hf_folder: Folder, tmp_path: Path, aegis: Aegis
+) -> None:
+    base = base_of(form, hf_folder)
+    source = policy(tmp_path / "policy", foreign.moved(base), form)
+    for command in (
+        ("extract", source, "--base", base, "--out", tmp_path / "vlm"),
+        (
+            *("merge", tmp_path / "vlm", "--base", base, "--method", "linear"),
+            *("--strength", "0.5", "--out", tmp_path / "merged"),
+        ),
+        ("insert", tmp_path / "merged", "--into", source, "--out", tmp_path / "back"),
+        ("extract", tmp_path / "back", "--base", base, "--out", tmp_path / "again"),
+    ):
+        code, _, err = aegis(*command)
+        assert code == 0, err
+    before, back = load_file(source / WEIGHTS), load_file(tmp_path / "back" / WEIGHTS)
+    expert = {n: tensor for n, tensor in before.items() if n.startswith(FORMS[form].expert)}
+    assert expert and before.keys() == back.keys()
+    assert equal({name: back[name] for name in expert}, expert)
+    merged = load_file(tmp_path / "merged" / WEIGHTS)
+    assert equal(load_file(tmp_path / "again" / WEIGHTS), merged)
+    assert not equal(merged, load_file(tmp_path / "vlm" / WEIGHTS))
+
+
+def test_both_tell_their_report_as_json(smolvlm: Path, tmp_path: Path, aegis: Aegis) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(smolvlm), "smolvla")
+    out = tmp_path / "vlm"
+    code, said, _ = aegis("extract", source, "--base", smolvlm, "--out", out, "--json")
+    report = json.loads(said)
+    assert code == 0 and report["taken"] == report["tensors"]
+    assert report["prefix"] == "model.vlm_with_expert.vlm." and report["type"] == "smolvla"
+    code, said, _ = aegis("insert", out, "--into", source, "--out", tmp_path / "x", "--json")
+    assert code == 0 and json.loads(said)["put"] == report["taken"]
+
+
+def test_a_policy_comes_from_the_hub_by_its_id(
+    smolvlm: Path, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    own = foreign.moved(smolvlm)
+    hub.committed |= files_of(policy(tmp_path / "sent", own, "smolvla", shards=2))
+    report = extract.run("somebody/smolvla", str(smolvlm), Path("vlm"))
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own) and report.type == "smolvla"
+    insert.run("vlm", "somebody/smolvla", Path("back"))
+    assert files_of(tmp_path / "back") == files_of(tmp_path / "sent")
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bad(aegis: Aegis, tmp_path: Path) -> Callable[..., str]:
+    """What a command says that is refused, and leaves nothing where it would have written."""
+
+    def call(*command: object, out: Path | None = None) -> str:
+        place = out or tmp_path / "out"
+        there = sorted(tmp_path.iterdir())
+        said = refused(aegis(*command, "--out", place))
+        assert sorted(tmp_path.iterdir()) == there
+        return said
+
+    return call
+
+
+def test_what_is_no_policy_of_the_base_is_refused(
+    paligemma: Path, smolvlm: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    own = foreign.moved(paligemma)
+    source = policy(tmp_path / "policy", own, "pi0 of LeRobot")
+    said = bad("extract", source, "--base", smolvlm)
+    assert "give the VLM that the policy was made from" in said
+    assert "and none of its language layers" in said
+    gone = {n: t for n, t in own.items() if ".layers.1." not in n or "vision" in n}
+    middle = policy(tmp_path / "middle", gone, "pi0 of LeRobot")
+    said = bad("extract", middle, "--base", paligemma)
+    assert "not behind its last layer" in said and "layers.1." in said
+    cut = {**own, "vision_tower.embeddings.position_embedding.weight": torch.zeros(4, 16)}
+    shape = policy(tmp_path / "shape", cut, "pi0 of LeRobot")
+    assert "[4, 16] instead of F32 [16, 16]" in bad("extract", shape, "--base", paligemma)
+    worse = {**own, TABLE: own[TABLE] * torch.nan}
+    diverged = policy(tmp_path / "diverged", worse, "pi0 of LeRobot")
+    assert "NaN or infinite" in bad("extract", diverged, "--base", paligemma)
+
+
+def test_what_is_no_policy_at_all_is_refused(
+    paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    def asked(source: object) -> str:
+        return bad("extract", source, "--base", paligemma)
+
+    assert "no policy" in asked(tmp_path / "missing")
+    (tmp_path / "empty").mkdir()
+    assert "no *.safetensors" in asked(tmp_path / "empty")
+    inside = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
+    inside.mkdir(parents=True)
+    assert f"give '{inside}'" in asked(tmp_path / "train")
+    (tmp_path / "jax" / "params").mkdir(parents=True)
+    assert "convert_jax_model_to_pytorch.py" in asked(tmp_path / "jax")
+    (tmp_path / "pickled").mkdir()
+    (tmp_path / "pickled" / "policy.pt").write_bytes(b"x")
+    assert "policy.pt" in asked(tmp_path / "pickled")
+    (tmp_path / "cut.safetensors").write_bytes(b"x" * 20)
+    assert "truncated or not a safetensors file" in asked(tmp_path / "cut.safetensors")
+    (tmp_path / "policy.bin").write_bytes(b"x" * 20)
+    assert "no .safetensors file" in asked(tmp_path / "policy.bin")
+    (tmp_path / "adapter").mkdir()
+    (tmp_path / "adapter" / "adapter_config.json").write_text("{}")
+    assert "an adapter of PEFT" in asked(tmp_path / "adapter")
+    own = policy(tmp_path / "torn", foreign.moved(paligemma), "pi0 of openpi", shards=2)
+    next(own.glob("model-00002*")).unlink()
+    assert "1 of 2 are missing" in asked(own)
+
+
+def test_a_policy_of_ours_is_refused_with_what_to_do(
+    paligemma: Path, run_folder: Path, tiny_folder: Path, bad: Callable[..., str]
+) -> None:
+    for ours in (run_folder, run_folder / "checkpoints" / "last", tiny_folder):
+        said = bad("extract", ours, "--base", paligemma)
+        assert "which Aegis has trained" in said and f"aegis probe {ours}" in said
+
+
+def test_a_base_that_is_no_vlm_is_refused(
+    paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    assert "no Hugging Face model" in bad("extract", source, "--base", "embedded")
+    assert "no backbone at" in bad("extract", source, "--base", tmp_path / "missing")
+    text = tmp_path / "text"
+    text.mkdir()
+    (text / "config.json").write_text('{"model_type": "llama"}')
+    save_file({"model.layers.0.x": torch.zeros(2)}, text / WEIGHTS)
+    assert "takes no images" in bad("extract", source, "--base", text)
+
+
+def test_nothing_that_is_there_is_written_over(
+    paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    before = files_of(source)
+    for command in (
+        ("extract", source, "--base", paligemma),
+        ("insert", paligemma, "--into", source),
+    ):
+        assert "is there already" in bad(*command, out=source)
+    assert "inside of the policy" in bad("insert", paligemma, "--into", source, out=source / "x")
+    one = source / WEIGHTS
+    assert f"give '{source}'" in bad("insert", paligemma, "--into", one)
+    assert files_of(source) == before
+
+
+def test_a_disk_that_is_full_leaves_nothing(
+    paligemma: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+
+    def full(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(tensor_files, "write", full)
+    for run in (
+        lambda: extract.run(str(source), str(paligemma), tmp_path / "out"),
+        lambda: insert.run(str(paligemma), str(source), tmp_path / "out"),
+    ):
+        with pytest.raises(AegisError, match="free space"):
+            run()
+        assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+
+
+def test_other_commands_say_how_a_foreign_policy_is_measured(
+    paligemma: Path, smolvlm: Path, tmp_path: Path, aegis: Aegis
+) -> None:
+    lerobot = policy(tmp_path / "smolvla", foreign.moved(smolvlm), "smolvla")
+    openpi = policy(tmp_path / "openpi", foreign.moved(paligemma), "pi0 of openpi")
+    for command in (
+        ("probe", lerobot),
+        ("probe", lerobot / WEIGHTS),
+        ("rollout", lerobot),
+        ("export", lerobot, "--out", tmp_path / "x"),
+        ("merge", lerobot, "--base", smolvlm, "--strength", "1", "--out", tmp_path / "x"),
+        ("anchor", "--backbone", lerobot, "--out", tmp_path / "x"),
+        ("inspect", lerobot),
+    ):
+        if command[0] == "inspect":
+            code, said, _ = aegis(*command)
+            assert code == 0
+        else:
+            said = refused(aegis(*command))
+            assert "of the type 'smolvla'" in said
+        assert f"aegis extract {lerobot} --base VLM" in said, command
+    merge = ("merge", openpi, "--base", smolvlm, "--strength", "1", "--out", tmp_path / "x")
+    for command in (("probe", openpi), merge):
+        said = refused(aegis(*command))
+        assert "another program wrote it" in said and f"aegis extract {openpi} --base" in said
+    code, said, _ = aegis("inspect", lerobot, "--json")
+    report = json.loads(said)
+    weights = load_file(lerobot / WEIGHTS)
+    assert (report["kind"], report["facts"]["type"]) == ("lerobot-policy", "smolvla")
+    assert report["facts"]["parameters"] == sum(tensor.numel() for tensor in weights.values())
+
+
+def test_the_weights_have_the_header_of_the_bases(smolvlm: Path, tmp_path: Path) -> None:
+    """transformers refuses a file whose metadata does not say which program's it is."""
+    take(policy(tmp_path / "policy", foreign.moved(smolvlm), "smolvla"), smolvlm, tmp_path / "vlm")
+    with (
+        safe_open(tmp_path / "vlm" / WEIGHTS, "np") as found,
+        safe_open(smolvlm / WEIGHTS, "np") as own,
+    ):
+        assert found.metadata() == own.metadata() == {"format": "pt"}
+    assert (tmp_path / "policy" / SCALES).is_file()

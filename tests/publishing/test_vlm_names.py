@@ -1,0 +1,215 @@
+"""A VLM's tensors are found in a policy by names and shapes, and the action expert's never are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import foreign
+
+from aegis_cli.common.errors import AegisError
+from aegis_cli.publishing import vlm_names
+from aegis_cli.publishing.vlm_names import Spec
+
+WORDS, WIDTH, DEPTH = 40, 16, 4
+CALLED = ("policy", "base")
+PARTS = st.sampled_from(["model", "policy", "vlm", "vlm_with_expert", "paligemma", "net", "core"])
+PREFIXES = st.lists(PARTS, max_size=4).map(lambda parts: "".join(f"{part}." for part in parts))
+SIZES = {
+    "self_attn.q_proj.weight": (WIDTH, WIDTH),
+    "mlp.up_proj.weight": (2 * WIDTH, WIDTH),
+    "input_layernorm.weight": (WIDTH,),
+}
+# As PaliGemma's repository has them; its words are scored by the table.
+SEEING = {
+    "vision_tower.encoder.layers.0.self_attn.q_proj.weight": (8, 8),
+    "vision_tower.encoder.layers.1.self_attn.q_proj.weight": (8, 8),
+    "vision_tower.embeddings.position_embedding.weight": (9, 8),
+    "multi_modal_projector.linear.weight": (WIDTH, 8),
+}
+GENERATIONS = {
+    "saved": str,
+    "modules": foreign.of_modules,
+    "before 5.5": lambda name: foreign.with_vision_model(foreign.of_modules(name)),
+    "before 4.52": foreign.with_vision_model,
+}
+TABLE, HEAD = "language_model.model.embed_tokens.weight", "language_model.lm_head.weight"
+
+
+def layers(depth: int, width_of: float = 1) -> dict[str, tuple[int, ...]]:
+    return {
+        f"layers.{i}.{name}": tuple(int(size * width_of) for size in shape)
+        for i in range(depth)
+        for name, shape in SIZES.items()
+    }
+
+
+def base(depth: int = DEPTH) -> dict[str, Spec]:
+    own = {f"language_model.model.{name}": shape for name, shape in layers(depth).items()}
+    own |= {TABLE: (WORDS, WIDTH), "language_model.model.norm.weight": (WIDTH,), **SEEING}
+    return {name: Spec(shape, "F32") for name, shape in own.items()}
+
+
+def policy(
+    vlm: Mapping[str, Spec], prefix: str, generation: str, expert: float = 0.5
+) -> dict[str, Spec]:
+    """The VLM under a prefix, and beside it an expert of some width."""
+    named = {prefix + GENERATIONS[generation](name): spec for name, spec in vlm.items()}
+    beside = {
+        f"{prefix}gemma_expert.model.{name}": Spec(shape, "F32")
+        for name, shape in layers(DEPTH, expert).items()
+    }
+    return {**beside, **named, f"{prefix}action_in_proj.weight": Spec((3, 8), "F32")}
+
+
+def found(own: Mapping[str, Spec], other: Mapping[str, Spec], tied: bool = True) -> vlm_names.Match:
+    return vlm_names.match(own, other, tied, CALLED)
+
+
+@given(PREFIXES, st.sampled_from(sorted(GENERATIONS)), st.sampled_from([0.5, 1.0]))
+def test_each_tensor_is_found_under_any_prefix_in_any_generation_of_names(
+    prefix: str, generation: str, width: float
+) -> None:
+    own = base()
+    match = found(own, policy(own, prefix, generation, width))
+    assert match.taken == {name: prefix + GENERATIONS[generation](name) for name in own}
+    assert match.kept == () and match.rows == {} and match.prefix.startswith(prefix)
+    assert not any("gemma_expert" in other for other in match.taken.values())
+
+
+@given(
+    st.sampled_from(sorted(GENERATIONS)),
+    st.sampled_from(sorted(GENERATIONS)),
+    st.integers(1, DEPTH),
+)
+def test_a_base_of_any_generation_has_the_layers_behind_the_policys_kept(
+    of_base: str, of_policy: str, depth: int
+) -> None:
+    saved = base()
+    own = {GENERATIONS[of_base](name): spec for name, spec in saved.items()}
+    there = {n: s for n, s in saved.items() if not foreign.is_layer(n, depth)}
+    match = found(own, policy(there, "model.vlm.", of_policy))
+    upper = {GENERATIONS[of_base](n) for n in saved if foreign.is_layer(n, depth)}
+    assert {name for kept in match.kept for name in kept.names} == upper
+    assert set(match.taken) == set(own) - upper
+    spans = {1: "layers 1 to 3", 2: "layers 2 to 3", 3: "layer 3"}
+    assert [kept.what for kept in match.kept] == (
+        [f"language {spans[depth]}"] if depth < DEPTH else []
+    )
+
+
+@given(st.sampled_from(sorted(base())))
+def test_whatever_else_is_missing_is_refused(name: str) -> None:
+    own = base()
+    last = foreign.is_layer(name, DEPTH - 1)
+    if name == "language_model.model.norm.weight":
+        return  # it is behind the layers
+    there = {n: spec for n, spec in own.items() if n != name}
+    with pytest.raises(AegisError) as caught:
+        found(own, policy(there, "model.vlm.", "modules"))
+    assert name in caught.value.found, last
+
+
+@given(st.sampled_from(sorted(base())), st.sampled_from(["modules", "saved"]))
+def test_another_shape_is_refused_and_named(name: str, generation: str) -> None:
+    own = base()
+    shape = (*own[name].shape[:-1], own[name].shape[-1] + 1)
+    other = policy({**own, name: Spec(shape, "F32")}, "model.vlm.", generation)
+    with pytest.raises(AegisError, match="do not have the shapes") as caught:
+        found(own, other)
+    assert str(list(shape)) in caught.value.found
+
+
+def test_whole_numbers_in_the_place_of_weights_are_refused() -> None:
+    own = base()
+    packed = {**own, TABLE: Spec(own[TABLE].shape, "I8")}
+    with pytest.raises(AegisError, match="I8"):
+        found(own, policy(packed, "model.", "modules"))
+
+
+@pytest.mark.parametrize("rows", [-6, 6])
+def test_tables_may_have_other_numbers_of_words(rows: int) -> None:
+    own = base()
+    longer = {**own, TABLE: Spec((WORDS + rows, WIDTH), "F32")}
+    assert found(own, policy(longer, "model.", "modules")).rows == {TABLE: WORDS + min(rows, 0)}
+
+
+@pytest.mark.parametrize("generation", sorted(GENERATIONS))
+def test_a_head_alone_is_the_table_of_a_tied_base(generation: str) -> None:
+    own = base()
+    there = {HEAD if name == TABLE else name: spec for name, spec in own.items()}
+    match = found(own, policy(there, "model.vlm.", generation))
+    assert match.taken[TABLE] == f"model.vlm.{GENERATIONS[generation](HEAD)}"
+    assert match.second is None and match.kept == ()
+
+
+def test_one_of_two_tied_tables_is_both() -> None:
+    own = base() | {HEAD: base()[TABLE]}
+    for gone, there in ((HEAD, TABLE), (TABLE, HEAD)):
+        rest = {name: spec for name, spec in own.items() if name != gone}
+        match = found(own, policy(rest, "", "saved"))
+        assert match.taken[gone] == match.taken[there] == there
+
+
+def test_an_untied_head_is_kept_and_an_untied_table_refused() -> None:
+    own = base() | {HEAD: base()[TABLE]}
+    without_head = {name: spec for name, spec in own.items() if name != HEAD}
+    match = found(own, policy(without_head, "", "saved"), tied=False)
+    assert [kept.names for kept in match.kept] == [(HEAD,)]
+    without_table = {name: spec for name, spec in own.items() if name != TABLE}
+    with pytest.raises(AegisError, match="not behind its last layer"):
+        found(own, policy(without_table, "", "saved"), tied=False)
+
+
+def test_a_second_table_of_the_policys_is_told_apart() -> None:
+    own = base()
+    match = found(own, policy(own | {HEAD: own[TABLE]}, "model.", "modules"))
+    assert match.taken[TABLE] == "model.model.language_model.embed_tokens.weight"
+    assert match.second == ("model.lm_head.weight", match.taken[TABLE])
+    assert match.second[0] not in match.more
+
+
+def test_what_only_the_policy_has_is_listed() -> None:
+    own = base()
+    more = own | {"multi_modal_projector.scale": Spec((1,), "F32")}
+    match = found(own, policy(more, "model.vlm.", "modules"))
+    assert "model.vlm.model.multi_modal_projector.scale" in match.more
+
+
+def test_two_copies_of_the_vlm_are_refused() -> None:
+    own = base()
+    other = policy(own, "net.", "modules") | policy(own, "ema.", "modules")
+    with pytest.raises(AegisError, match=r"2 VLMs in 'policy' .* 'net\.', 'ema\.'"):
+        found(own, other)
+
+
+def test_of_two_vlms_the_one_of_the_bases_shapes_is_taken() -> None:
+    own = base()
+    wider = {n: Spec(tuple(2 * size for size in s.shape), "F32") for n, s in own.items()}
+    other = policy(own, "small.", "modules") | policy(wider, "large.", "modules")
+    assert found(own, other).prefix == "small.model."
+
+
+def test_a_base_with_fewer_layers_is_refused() -> None:
+    with pytest.raises(AegisError, match="behind the 3 of 'base'"):
+        found(base(3), policy(base(), "model.", "modules"))
+
+
+def test_a_policy_without_vision_or_without_anything_of_it_is_refused() -> None:
+    own = base()
+    blind = {name: spec for name, spec in own.items() if name not in SEEING}
+    with pytest.raises(AegisError, match="and none of its vision"):
+        found(own, policy(blind, "model.", "modules"))
+    with pytest.raises(AegisError, match=r"none of the tensors .* which has model\.resnet\.0"):
+        found(own, {"model.resnet.0.weight": Spec((3, 3), "F32")})
+
+
+def test_buffers_that_later_releases_do_not_save_are_kept() -> None:
+    own = base()
+    older = own | {
+        "vision_tower.embeddings.position_ids": Spec((1, 9), "I64"),
+        "language_model.model.layers.0.self_attn.rotary_emb.inv_freq": Spec((4,), "F32"),
+    }
+    assert [kept.what for kept in found(older, policy(own, "", "modules")).kept] == ["buffers"]
