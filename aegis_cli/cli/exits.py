@@ -279,7 +279,7 @@ def _what_now(meta: Mapping[str, Any]) -> str:
     flag = _WITH_RESUME.get(args[0])
     if flag is None or "--dry-run" in args:
         again = f"{_program()} {shlex.join(args)}"
-        # A merge of one strength is no sweep.
+        # A merge with a single strength is not a sweep and keeps nothing.
         if args[0] in _KEEPS and not any(word.startswith("--strength") for word in args):
             return f"{_KEEPS[args[0]]}; go on with: {again}"
         return f"no half-written file is left; begin again with: {again}"

@@ -1,4 +1,4 @@
-"""What was taken out of another program's policy, or put back into it, as a table."""
+"""Tables of a VLM that was taken out of another program's policy, or put back into it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Row = tuple[str, str, str]
 
 
 def extracted(report: Any) -> RenderableType:
-    """How much of the VLM is the policy's, and what to do with it."""
+    """How much of the VLM comes from the policy, and the command to probe it."""
     facts = {
         "policy": report.policy,
         "type": report.type,
@@ -45,7 +45,7 @@ def extracted(report: Any) -> RenderableType:
 
 
 def inserted(report: Any) -> RenderableType:
-    """How much of the policy is the VLM's now."""
+    """How much of the policy now comes from the VLM."""
     facts = {
         "vlm": report.vlm,
         "policy": report.policy,
