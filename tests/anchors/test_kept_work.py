@@ -305,21 +305,19 @@ def test_a_cache_that_cannot_be_written_is_told_once(
     assert len(told) == 1 and "AEGIS_CACHE" in told[0]
 
 
-def test_several_processes_go_on_each_with_its_own_sums(
-    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_several_processes_go_on_each_with_its_own_sums(tiny_folder: Path, tmp_path: Path) -> None:
     """Also where they were stopped at places of their own, and one has lost what it kept."""
-    monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "cache"))
+    kept_in = tmp_path / "cache"
     names = ("whole", "again", "lost")
     stops = (None, (9, 11), (26, 12))
     jobs = [
-        MeasuringAgain(tiny_folder, tmp_path / name, ALL, GROUP, stop, name == "lost")
+        MeasuringAgain(tiny_folder, tmp_path / name, kept_in, ALL, GROUP, stop, name == "lost")
         for name, stop in zip(names, stops, strict=True)
     ]
     run_together(2, jobs)
     found = [(tmp_path / name / "anchor.safetensors").read_bytes() for name in names]
     assert all(one == found[0] for one in found)
-    assert not list((tmp_path / "cache" / "anchors").iterdir())
+    assert not list((kept_in / "anchors").iterdir())
 
 
 @pytest.mark.skipif(not POSSIBLE, reason="this torch takes no device of others' making")

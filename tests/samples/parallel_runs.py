@@ -135,6 +135,7 @@ class MeasuringAgain:
     """An anchor that is interrupted, and measured again.
 
     Attributes:
+        cache: where what is measured is kept.
         memory: bytes of a group of maps' sums.
         stops: how often each process has kept something when it ends; None: none ends.
         lost: whether the last process finds nothing of its own.
@@ -142,6 +143,7 @@ class MeasuringAgain:
 
     model: Path
     out: Path
+    cache: Path
     settings: Anchor
     memory: int
     stops: Sequence[int] | None
@@ -151,6 +153,7 @@ class MeasuringAgain:
         """Measure here, alone or with the processes that the environment speaks of."""
         self.out.mkdir(exist_ok=True, parents=True)
         with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("AEGIS_CACHE", str(self.cache))
             patch.setattr(measure._PartMeasurement, "_memory", self.memory)
             patch.setattr(kept_work, "_EVERY_S", 0.0)
             patch.setattr(kept_work, "_TIMES", 0)
