@@ -232,7 +232,7 @@ class DeployedPolicy:
             raise AegisError(
                 f"an action of shape {np.shape(action)}",
                 f"({self.actions},): {', '.join(self.action_names)}",
-                "give one action; a chunk has one a row",
+                "give one action; a chunk has one per row",
             )
         found = {name: float(x) for name, x in zip(self.action_names, action, strict=True)}
         if len(found) < len(action):
@@ -281,8 +281,8 @@ class DeployedPolicy:
         if previous is None and delay:
             raise AegisError(
                 f"a delay of {delay} actions, and no previous actions",
-                "what is left of the last chunk, where actions of it are executed meanwhile",
-                "give previous=, or of a message to aegis serve previous_actions",
+                "what is left of the last chunk, whose actions are executed in the meantime",
+                "give previous=, or previous_actions in a message to aegis serve",
             )
         whole = isinstance(delay, int | np.integer) and delay >= 0
         if not whole or delay > len(left):
@@ -290,7 +290,7 @@ class DeployedPolicy:
             raise AegisError(
                 f"a delay of {delay} actions, where {len(left)} are left of the last chunk",
                 f"a whole number from 0 to {len(left)}",
-                later if whole else "count the actions that are executed meanwhile",
+                later if whole else "count the actions that are executed in the meantime",
             )
         return Continued(torch.from_numpy(left)[None], int(delay)) if len(left) else None
 
@@ -323,13 +323,13 @@ class DeployedPolicy:
             raise AegisError(
                 f"positions of shape {given.shape}",
                 f"({self.positions},){_after_colon(self.state_names)}",
-                "give what the demonstrations hold, in their order",
+                "give the positions that the demonstrations have, in their order",
             )
         if not np.isfinite(given).all():
             raise AegisError(
                 f"positions that are not finite: {given.tolist()}",
                 "finite numbers",
-                "see what the robot's sensors say",
+                "check the robot's sensors",
             )
         if not isinstance(instruction, str):
             found = f"an instruction of type {type(instruction).__name__}"
@@ -350,7 +350,7 @@ class DeployedPolicy:
                 raise AegisError(
                     f"pictures of {', '.join(pictures) or 'no camera'}",
                     expected,
-                    "name them as training did",
+                    "use the names of training",
                 )
             return [named[name] for name in names]
         if len(self.cameras) > 1:
@@ -402,7 +402,7 @@ def _picture(of: str, given: np.ndarray) -> np.ndarray:
         said = f"a picture{of} of shape {found.shape} and type {found.dtype}"
         fix = "channels come last, values are 0 to 255"
         if is_picture:
-            fix = "see whether the camera has given a frame"
+            fix = "check that the camera delivered a frame"
         raise AegisError(said, "[H, W, 3] uint8, RGB, of at least one pixel", fix)
     return found
 

@@ -332,7 +332,7 @@ def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
         ((), frame()[None], POSITIONS, ("shape (1, ", "[H, W, 3] uint8")),
         ((), frame().astype(np.float32) / 255, POSITIONS, ("float32", "0 to 255")),
         ((), frame().transpose(2, 0, 1), POSITIONS, ("shape (3, ", "channels come last")),
-        ((), np.zeros((0, 64, 3), np.uint8), POSITIONS, ("shape (0, 64, 3)", "given a frame")),
+        ((), np.zeros((0, 64, 3), np.uint8), POSITIONS, ("shape (0, 64, 3)", "delivered a frame")),
         ((), np.zeros((64, 0, 3), np.uint8), POSITIONS, ("shape (64, 0, 3)", "one pixel")),
         ((), {"top": frame()}, POSITIONS, ("pictures of top", "one picture")),
         (("top", "wrist"), frame(), POSITIONS, ("2 cameras", "top, wrist")),

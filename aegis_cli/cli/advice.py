@@ -39,8 +39,8 @@ def of_questions(model: str, *names: str | None) -> None:
     """
     if launch.rank() == 0 and _SCENES in names and _is_of_the_hub(model):
         render.note(
-            f"warning: 'scenes' are drawn toys, and what '{model}' knows of the world is neither "
-            "measured nor protected by them: give real questions, such as VQAv2's "
+            f"warning: 'scenes' are drawn toys: they neither measure nor protect what "
+            f"'{model}' knows of the world. Give real questions, such as VQAv2's "
             "(--vqa, or anchor.vqa and probe.vqa of a recipe; docs/own-data.md)"
         )
 
@@ -106,10 +106,11 @@ def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[
     falls = not (isinstance(train, Train) and train.schedule == CONSTANT)
     if train.warmup > train.steps or (falls and train.warmup == train.steps):
         share = 100 * train.steps / train.warmup  # the warm-up is linear
-        lost = ", and never fall" if falls else ""
+        lost = ", and they never decay" if falls else ""
         yield (
-            f"train.warmup: {train.warmup} with train.steps: {train.steps}: the learning rates end "
-            f"at {share:.3g} % of their peaks, where the rise ends{lost}. Set train.warmup lower"
+            f"train.warmup: {train.warmup} with train.steps: {train.steps}: training ends within "
+            f"the warmup, with the learning rates at {share:.3g} % of their peaks{lost}. Set "
+            "train.warmup lower"
         )
 
 
@@ -134,7 +135,7 @@ def _of_thresholds(chosen: Nullspace) -> Iterator[str]:
     if chosen.energy is not None and chosen.soft != Nullspace().soft:
         yield (
             f"nullspace.soft: {chosen.soft:g} changes nothing beside nullspace.energy: "
-            f"{chosen.energy:g}, which is instead of it. Delete one of them"
+            f"{chosen.energy:g}, which replaces it. Delete one of them"
         )
 
 

@@ -244,10 +244,10 @@ def _is_out_of_memory(error: Exception) -> bool:
 def _too_large(error: Exception) -> AegisError:
     said = (str(error).splitlines() or [""])[0]
     fix = (
-        "a smaller --batch-size or --set train.batch_size=..., fewer train.flow_samples or "
+        "use a smaller --batch-size or --set train.batch_size=..., fewer train.flow_samples or "
         "--workers, or train.gradient_checkpointing; see --dry-run"
     )
-    return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits", fix)
+    return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits in memory", fix)
 
 
 def _refused(error: OSError) -> AegisError:
@@ -258,8 +258,8 @@ def _refused(error: OSError) -> AegisError:
     if error.filename == render.STDOUT:  # set by `render.name_errors`
         return AegisError(
             f"{render.STDOUT} cannot be written: {error.strerror}",
-            "an output that takes what the command says",
-            "free space on the disk that it is sent to, or send it elsewhere",
+            "an output that can be written to",
+            "free some space on its disk, or redirect the output elsewhere",
         )
     found = str(error) if error.filename is None else f"'{error.filename}': {error.strerror}"
     fix = "check the path, the permissions of its folders (ls -ld) and the space on its disk"

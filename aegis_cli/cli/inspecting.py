@@ -114,7 +114,7 @@ def _cells(path: Path, plot: Path | None, as_json: bool, wide: bool) -> None:
     resolved = study_cells.load(_recipe_of(path))
     if isinstance(resolved, Recipe):
         fix = "give the folder that aegis run wrote"
-        raise AegisError(f"'{path}', which bears a recipe's name", "cells of a study", fix)
+        raise AegisError(f"'{path}', whose recipe is not a study's", "cells of a study", fix)
     _study(study.told(resolved, path), path, plot, as_json, wide)
 
 
@@ -122,7 +122,7 @@ def _recipe_of(cells: Path) -> Path:
     """The study's recipe: beside its cells, in the parent folder, or a shipped one."""
     if cells.name == _CELLS:  # in a study's own folder, which has its recipe and its table
         raise AegisError(
-            f"'{cells}', which does not say of which study it is",
+            f"'{cells}', which does not name its study",
             "a study's folder, or NAME.cells.json with its recipe NAME.yaml beside it",
             commands.aegis("inspect", cells.parent),
         )

@@ -86,5 +86,5 @@ def _of_run(model: str, asks: bool) -> tuple[Probe, ...]:
         resuming.check_seen(run, [str(first.vqa)], "probe")
     if asks and others and launch.rank() == 0:
         left = ", ".join(f"--vqa {shlex.quote(str(other.vqa))}" for other in others)
-        render.note(f"asked are the questions of '{first.vqa}'; the run's recipe also names {left}")
+        render.note(f"asking the questions of '{first.vqa}'; the run's recipe also names {left}")
     return named

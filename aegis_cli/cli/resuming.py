@@ -29,11 +29,21 @@ def recipe_of(run: Path, out: Path | None) -> Path:
     if out is not None:
         raise AegisError(
             f"--out {out} with the run '{run}'",
-            "a run alone, which goes on in its own folder",
-            "leave --out out, or train anew by its recipe: "
-            f"{commands.aegis('train', run / RECIPE, '--out', out)}",
+            "the run alone, which resumes in its own folder",
+            "leave out --out, or start a new run from its recipe: "
+            f"{commands.aegis('train', run / RECIPE, *_given(run), '--out', out)}",
         )
     return run / RECIPE
+
+
+def _given(run: Path) -> list[str]:
+    """What a run was given beside its recipe, as options; nothing where it does not say."""
+    from aegis_cli.training import inputs
+
+    kept = inputs.of(run)
+    if kept is None:
+        return []
+    return _options(kept.demos) + ([] if kept.anchor is None else ["--anchor", kept.anchor])
 
 
 def _instead(folder: Path) -> str:
@@ -46,8 +56,8 @@ def _instead(folder: Path) -> str:
     inner = sorted(path.parent for path in folder.glob(f"*/{RECIPE}"))
     if inner:
         return (
-            f"give one of its runs, e.g. {commands.aegis('train', inner[0])}; a job or study of "
-            "aegis run goes on when it is called again"
+            f"give one of its runs, e.g. {commands.aegis('train', inner[0])}; to "
+            "resume a job or study of aegis run, run its command again"
         )
     return "check the path, or begin a run: aegis train RECIPE --out RUN"
 
@@ -103,8 +113,8 @@ def check_seen(run: Path, names: Iterable[str], command: str) -> None:
             again = commands.aegis(command, run.absolute())
             raise AegisError(
                 f"no '{name}' here, which the recipe of the run in '{run}' names",
-                f"the folder that the run was begun in, '{began}', where it lies",
-                f"go on from there: {commands.shell('cd', began)} && {again}",
+                f"the folder that the run was started in, '{began}', which has it",
+                f"run the command there: {commands.shell('cd', began)} && {again}",
             )
 
 
@@ -122,7 +132,7 @@ def demonstrations_of(run: Path) -> Path:
     if kept is None:
         open_loop.check_policy(run)  # first, since a path without a policy is the larger mistake
         raise AegisError(
-            f"no --demos for '{run}', which does not say where those of its training lie",
+            f"no --demos for '{run}', which does not record what it was trained on",
             "demonstrations: a file, the folder of a LeRobot dataset, or its id on the hub",
             f"name them: {commands.aegis('evaluate', run, '--demos', 'PATH')}",
         )
@@ -157,8 +167,8 @@ def _there(run: Path, place: str, what: str, again: str) -> Path:
     if is_gone(place):
         raise AegisError(
             f"'{place}' is gone, the {what} of the run in '{run}'",
-            "what the run was begun with",
-            f"bring it back, or say where it lies now: {again}",
+            f"the {what} that the run began with",
+            f"bring it back, or give its new path: {again}",
         )
     return Path(place)
 
@@ -177,9 +187,9 @@ def _no_anchor(run: Path) -> None:
 
 def _unknown(run: Path, what: str, option: str) -> AegisError:
     return AegisError(
-        f"no place of its {what} in the run '{run}', as in those of an earlier version",
-        "what the run was begun with",
-        f"say where it lies: {commands.aegis('train', run)} {option}",
+        f"the run '{run}', which does not record its {what}: an earlier version started it",
+        f"the {what} that it was trained with",
+        f"give the path: {commands.aegis('train', run)} {option}",
     )
 
 

@@ -160,7 +160,7 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
     fields = json.loads(metadata["aegis"])
     if header.digest is not None and header.digest != _digest(fields, tensors):
         raise AegisError(
-            f"'{path}' is damaged: its content is not that of its digest",
+            f"'{path}' is damaged: its content does not match its digest",
             "the file as Aegis wrote it",
             f"bring back a copy of it, or {again}",
         )

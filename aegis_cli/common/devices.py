@@ -90,8 +90,8 @@ def _check_gpu(name: str, number: str) -> None:
     if number and launch.world_size() > 1:
         raise AegisError(
             f"the device '{name}' for {launch.world_size()} processes",
-            "a GPU for each, which torchrun gives them",
-            "--device cuda, and CUDA_VISIBLE_DEVICES to choose some",
+            "a GPU of its own for each process",
+            "use --device cuda, and name the GPUs to use in CUDA_VISIBLE_DEVICES",
         )
 
 

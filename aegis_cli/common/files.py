@@ -211,7 +211,7 @@ def put(aside: Path, folder: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
-        found = f"'{folder}', which another process has written meanwhile"
+        found = f"'{folder}', which another process wrote in the meantime"
         fix = "use that one, or choose another --out"
         raise AegisError(found, "a new or empty folder", fix) from error
 
@@ -385,7 +385,7 @@ def check_utf8(path: str | Path, fix: str) -> None:
         raise AegisError(
             f"the path '{named}' in a locale of {sys.getfilesystemencoding()} names",
             "a locale that reads names as UTF-8",
-            "LC_ALL=C.UTF-8, and no PYTHONUTF8=0",
+            "export LC_ALL=C.UTF-8, and do not set PYTHONUTF8=0",
         ) from error
 
 
@@ -408,8 +408,8 @@ def make_folder(path: Path) -> None:
     for above in (path, *path.parents):
         if above.is_symlink() and not above.exists():
             raise AegisError(
-                f"'{above}' is a link to '{os.readlink(above)}', and nothing is there",
-                "a link that leads to a folder",
+                f"'{above}' is a broken link to '{os.readlink(above)}'",
+                "a link to a folder",
                 commands.shell("mkdir", "-p", followed(above))
                 + ", mount its disk, or choose another output",
             )
@@ -452,7 +452,7 @@ def refuse_pointer(path: str | Path) -> None:
         return
     if is_pointer:
         raise AegisError(
-            f"'{path}' is a Git LFS pointer, which stands for a file that was not fetched",
+            f"'{path}' is a Git LFS pointer to a file that was not fetched",
             "the file itself",
             f"git lfs pull, in the repository of '{Path(path).parent}'",
         )

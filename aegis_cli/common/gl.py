@@ -91,5 +91,5 @@ def check() -> None:
             f"MUJOCO_GL={backend} cannot open an OpenGL context ({type(error).__name__}: {error})",
             "an OpenGL driver that renders without a screen",
             "sudo apt-get install libegl1 libegl-mesa0   (or libosmesa6, with MUJOCO_GL=osmesa); "
-            "where that is installed, memory may be wanting: see ulimit -v",
+            "if that is installed, memory may be short: see ulimit -v",
         ) from error

@@ -32,8 +32,8 @@ def not_asked(name: str) -> str:
     if not is_id(name) or not Path(_first(name)).is_dir():
         return ""
     return (
-        f"; the hub is not asked for '{name}', because a folder '{_first(name)}' is here: to have "
-        "it asked, go on in another folder"
+        f"; '{name}' was not looked up on the hub, because a folder '{_first(name)}' is here: "
+        "to look it up, run the command in another folder"
     )
 
 

@@ -186,8 +186,8 @@ def deferred(tell: Callable[[], None] | None = None) -> Generator[Deferred]:
 def saved_first(stage: str, on_event: OnEvent) -> Generator[Deferred]:
     """Like `deferred`, for a stage that saves its steps before it stops, and announces that."""
     text = (
-        "a signal came: the step under way is finished and saved first. Another one ends this at "
-        "once, without the steps since the last checkpoint"
+        "received a signal: finishing and saving the current step first. A second signal ends the "
+        "command at once and loses the steps since the last checkpoint"
     )
     with deferred(lambda: on_event(Warned(stage, text))) as held:
         yield held

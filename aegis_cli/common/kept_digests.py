@@ -87,7 +87,7 @@ def _know(large: Mapping[Path, tuple[Path, Stamp]], home: Path, on_event: OnEven
     except _Unkept as error:
         if left := {path: key for path, key in large.items() if key not in _known}:
             _read(left, on_event)
-        text = f"digests of '{home}' are not kept, so that each start reads it whole ({error})"
+        text = f"cannot cache the digests of '{home}', so each start reads all of it ({error})"
         on_event(Warned("checksums", f"{text}: set AEGIS_CACHE to a folder that can be written"))
 
 

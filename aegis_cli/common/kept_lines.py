@@ -63,7 +63,7 @@ class KeptLines:
         except (OSError, AegisError) as error:
             self._can_keep = False
             why = error.found if isinstance(error, AegisError) else error.strerror or str(error)
-            text = f"what is measured is not kept, so that an interruption loses it ({why})"
+            text = f"cannot keep what is measured, so an interruption loses it ({why})"
             fix = "set AEGIS_CACHE to a folder that can be written"
             self._on_event(Warned(self.path.parent.name, f"{text}: {fix}"))
 

@@ -42,7 +42,7 @@ def check_one() -> None:
         raise AegisError(
             f"one of {world_size()} processes that a launcher such as torchrun started "
             "(WORLD_SIZE)",
-            "one process: anchor, train, probe and run of a policy's recipe alone share their work",
+            "one process: only anchor, train, probe and run (of a policy) share their work",
             "start it without torchrun, or unset WORLD_SIZE; a "
             "study measures several cells at a time with --workers N",
         )
@@ -64,7 +64,7 @@ def check_meeting() -> None:
         return
     raise AegisError(
         found,
-        "all that a launcher says to each of its processes, or nothing of it",
+        "all the variables that a launcher sets for each process, or none of them",
         "start them with torchrun --nproc-per-node N -m aegis_cli ...; for one process alone: "
         "unset WORLD_SIZE",
     )

@@ -66,7 +66,7 @@ def peak(device: torch.device) -> int:
     if found is None:
         raise AegisError(
             f"no VmHWM in {_STATUS}",
-            "a kernel that keeps the peak memory",
+            "a kernel that reports peak memory",
             "use another kernel or sandbox",
         )
     return int(found[1]) * 1024

@@ -48,7 +48,7 @@ def decoded(data: bytes) -> np.ndarray:
                     ImageOps.exif_transpose(image, in_place=True)
                 return rgb(image)
     except UnidentifiedImageError as error:  # its message is the address of the bytes
-        raise ValueError("of no raster format that is known here") from error
+        raise ValueError("not in a known raster format") from error
     except Exception as error:  # damaged data makes Pillow's decoders raise nearly anything
         raise ValueError(str(error) or type(error).__name__) from error
 
@@ -74,7 +74,7 @@ def rgb(image: Image) -> np.ndarray:
         grey = (np.asarray(image) / 257).round().astype(np.uint8)  # 65535 becomes 255
         return np.repeat(grey[..., None], 3, axis=-1)
     if image.mode in ("I", "F"):
-        raise ValueError(f"numbers of mode {image.mode}, which do not say what is white")
+        raise ValueError(f"mode {image.mode}, whose numbers have no defined white")
     if image.has_transparency_data:
         drawn = image.convert("RGBA")
         image = pillow.alpha_composite(pillow.new("RGBA", drawn.size, "white"), drawn)

@@ -112,7 +112,7 @@ class WorkerPool:
                 "a script that calls nothing when it is imported",
                 "put what it calls below: if __name__ == '__main__':",
             )
-        plural = "process that lives" if self.workers == 1 else "processes that live"
+        plural = "running process" if self.workers == 1 else "running processes"
         return AegisError(f"{self._name} died", f"{self.workers} {plural}", self._fix)
 
     def _stop(self) -> None:

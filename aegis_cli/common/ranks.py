@@ -155,8 +155,8 @@ def joined() -> Generator[Ranks]:
             raise
         raise PeerLost(
             "another process of this training has ended",
-            "all processes alive",
-            "see what it said itself; then start all of them again, with --resume",
+            "all processes running",
+            "read the error of that process; then start all of them again, with --resume",
         ) from error
     finally:
         dist.destroy_process_group()

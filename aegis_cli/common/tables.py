@@ -74,7 +74,7 @@ def _checked(path: Path, lines: Iterator[Sequence[Any]]) -> Iterator[Sequence[An
         if isinstance(error, OSError) and error.errno is not None:
             raise  # from the system; openpyxl raises OSErrors without errno for other files
         files.refuse_pointer(path)
-        found = f"'{path}' is no table, or is damaged: {in_short(error)}"
+        found = f"'{path}' is not a table, or is damaged: {in_short(error)}"
         raise AegisError(found, f"a whole {path.suffix} file", _FIX) from error
 
 

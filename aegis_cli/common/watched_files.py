@@ -80,8 +80,8 @@ class WatchedPaths:
 def _written_to(path: Path) -> AegisError:
     return AegisError(
         f"'{path}' was written to while it was being read",
-        "a file that nobody writes to before the work is done",
-        "bring back the file that the work began with, and resume; or start anew in another --out",
+        "a file that does not change while the command runs",
+        "restore the file that the command began with, and resume; or start anew in another --out",
     )
 
 

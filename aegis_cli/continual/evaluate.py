@@ -81,8 +81,8 @@ def _own(recipe: RobotStreamRecipe, number: int, run: Path) -> Path:
         again = commands.aegis("evaluate", run, "--task", task, "--demos", "PATH")
         raise AegisError(
             f"'{place}' is gone, the demonstrations of '{task}' in the stream '{run}'",
-            "what the task was learned from",
-            f"bring it back, or say where it lies now, or give others: {again}",
+            "the demonstrations that the task was learned from",
+            f"bring it back, or give its new path or other demonstrations: {again}",
         )
     return place
 

@@ -58,7 +58,7 @@ def read(path: Path) -> StreamReport:
     """
     if not is_done(path):
         raise AegisError(
-            f"{path} has no {REPORT}: the stream is not learned to its end",
+            f"{path} has no {REPORT}: the stream is not finished",
             "a finished run of a stream",
             f"continue it: {commands.aegis('train', path)}",
         )

@@ -225,7 +225,7 @@ def load(
     needed = [OWN_ENCODER if OWN_ENCODER in now else "encoder", "image set"]
     if changed := [name for name in needed if before.inputs.get(name) != now[name]]:
         raise AegisError(
-            f"another {', '.join(changed)} than the run in '{path}' was measured with",
+            f"a different {', '.join(changed)} than the run in '{path}' was measured with",
             "the same images, words and encoder",
             "bring them back, or train the stream again in another --out",
         )

@@ -35,12 +35,12 @@ def check(path: Path, task: str | None) -> int:
         counts = [len(routers[router]["experts"]) for routers in of_maps if router in routers]
     if several := sum(count > 1 for count in counts):
         raise AegisError(
-            f"'{name}' of the stream in '{path}', which weighs several experts at {several} of "
-            f"{len(of_maps)} maps, anew at each position by what is read there: no single weight "
-            "does the same",
-            "a task with at most one expert at each map, which becomes part of its weights, as all "
-            "that isolated-lora and sequential learn",
-            f"let it act as it is: {commands.aegis('serve', path, '--task', name)}, or "
+            f"'{name}' of the stream in '{path}', which mixes several experts at {several} of "
+            f"{len(of_maps)} maps, with weights that depend on what is read at each position: no "
+            "fixed weight does the same",
+            "a task with at most one expert at each map, which can be merged into its weights, as "
+            "after isolated-lora and sequential",
+            f"use it as it is: {commands.aegis('serve', path, '--task', name)}, or "
             "aegis_cli.load_policy with task=; or train with --method isolated-lora",
         )
     return number

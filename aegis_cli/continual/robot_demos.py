@@ -76,8 +76,8 @@ def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
                 )
             shared = f"{len(own & theirs)} episodes of '{path}' are both '{other}' and '{task}'"
             text = (
-                f"{shared}: what one holds out the other may learn from, so that their errors on "
-                "held-out episodes tell too little"
+                f"{shared}: what one holds out the other may learn from, so their errors on "
+                "held-out episodes mean little"
             )
             on_event(Warned("train", text))
         seen.append((task, place, own))
@@ -164,9 +164,9 @@ def given(recipe: RobotStreamRecipe, number: int) -> tuple[Path, Selection]:
         return path, demos.selection(demos.only[number])
     if _is_shared(recipe, number) and not recipe.simulated:
         raise AegisError(
-            f"'{path}' for '{recipe.tasks[number]}' and other tasks, all of whose episodes each "
-            "would learn",
-            "demonstrations of its own for each task, or which of these episodes are whose",
+            f"'{path}' for '{recipe.tasks[number]}' and other tasks, each of which would "
+            "learn all its episodes",
+            "demonstrations of its own for each task, or a choice of episodes for each",
             "choose the episodes of each task: demos.only, such as [0-49, 50-99]",
         )
     only = demonstrations.part_of(path, recipe.tasks[number], _is_shared(recipe, number))

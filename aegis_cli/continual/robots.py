@@ -363,7 +363,7 @@ def load(
     asked = {name: sha for name, sha in before.inputs.items() if name.startswith(QUESTION_FILE)}
     if changed := changed_inputs(asked, source.sha256):
         raise AegisError(
-            f"other questions than the run in '{path}' was measured with: {', '.join(changed)}",
+            f"different questions than the run in '{path}' was measured with: {', '.join(changed)}",
             "the same files",
             "bring them back, or train the stream again in another --out",
         )
@@ -387,7 +387,7 @@ def _as_learned(
     then = {name: before.inputs.get(name, "") for name in now}
     if changed := changed_inputs(then, now):
         raise AegisError(
-            f"other {', '.join(changed)} than the run in '{run.out}' learned from",
+            f"different {', '.join(changed)} than the run in '{run.out}' learned from",
             "the same demonstrations, whose held-out episodes it was measured on",
             "bring them back, or train the stream again in another --out",
         )
@@ -431,7 +431,7 @@ def _saved_expert(path: Path, recipe: RobotStreamRecipe, fingerprint: str) -> ar
     saved = artifacts.load(path, "expert", fingerprint=fingerprint)
     if saved.header.meta.get("tasks") != list(recipe.tasks):
         raise AegisError(
-            f"'{path}' is no action expert of {', '.join(recipe.tasks)}",
+            f"'{path}' is not the action expert of {', '.join(recipe.tasks)}",
             "the file of this run",
             "train the stream again",
         )
@@ -494,8 +494,8 @@ def no_simulator(run: Path, task: str) -> AegisError:
     """The error for playing a task that is not simulated."""
     return AegisError(
         f"'{task}' of the stream in '{run}', a task that no simulator has",
-        "a simulated task, to be played",
-        f"let the robot act: {commands.aegis('serve', run, '--task', task)}; how far its actions "
+        "a simulated task, to roll out",
+        f"run it on the robot: {commands.aegis('serve', run, '--task', task)}; how far its actions "
         f"are from held-out ones, {commands.aegis('evaluate', run, '--task', task)} shows",
     )
 
@@ -614,8 +614,8 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
         if len(left) == len(grown):  # none of the maps that get experts is frozen
             raise AegisError(
                 f"{with_learner}, which trains none of it anyway",
-                "parts with maps beside which experts would stand: the MLPs and attention outputs "
-                "of all language layers but the last",
+                "parts with maps that would get experts: the MLPs and attention outputs of all"
+                " language layers but the last",
                 "name such parts, delete train.freeze, or --method sequential, which trains all",
             )
     freezing.check_something_learns(with_learner, left, "freeze less")

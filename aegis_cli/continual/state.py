@@ -382,7 +382,7 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     saved = artifacts.load(path, "training-state")
     if different := changed_inputs(_as_written_now(run, saved.header.inputs), run.inputs):
         raise AegisError(
-            f"another {', '.join(different)} than the run in '{run.out}' began with",
+            f"a different {', '.join(different)} than the run in '{run.out}' began with",
             "the same inputs",
             "give what the run began with, or start anew in another --out",
         )

@@ -108,7 +108,7 @@ def _check_same_recording(out: Path, recipe: StreamRecipe | RobotStreamRecipe) -
     learned = recipes.load(out / "recipe.yaml", kind=RobotStreamRecipe).demos
     if dataclasses.replace(learned, paths=None) != recipe.demos:
         raise AegisError(
-            f"other demonstrations than the finished stream in '{out}' learned from",
+            f"different demonstrations than the finished stream in '{out}' learned from",
             f"episodes {learned.episodes}, noise {learned.noise:g} and seed {learned.seed}",
             "give what it was trained with, start anew in another --out, or --overwrite it",
         )

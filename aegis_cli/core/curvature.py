@@ -192,7 +192,7 @@ def curvatures(
     if missing:
         raise AegisError(
             f"an anchor without the curvature of {', '.join(missing)}",
-            "that of every map that learns",
+            "the curvature of every map that learns",
             "measure it again with aegis anchor --parts moments,inputs,curvature",
         )
     # If some factors are sketched, the anchor file stores all of them in half precision. Keeping

@@ -25,7 +25,7 @@ def check(decay: float) -> None:
     """Raise AegisError for a decay that is not finite."""
     if not math.isfinite(decay):
         raise AegisError(
-            f"a temporal ensemble with decay {decay}", "a finite number", "ACT has 0.01"
+            f"a temporal ensemble with decay {decay}", "a finite number", "use e.g. 0.01"
         )
 
 

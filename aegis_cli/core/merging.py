@@ -103,9 +103,9 @@ def basis(task: Tensor, questions: Tensor) -> Basis:
     root, failed = torch.linalg.cholesky_ex(task + questions)
     if failed:
         raise AegisError(
-            f"second moments of {len(task)} directions with less damping than rounding",
+            f"too little damping (less than rounding) for second moments of {len(task)} directions",
             "enough for a Cholesky factor of both together",
-            "merge with --damping 1e-6, or merge.damping: 1e-6 of a recipe, or more",
+            "use a damping of 1e-6 or more: --damping, or merge.damping in a recipe",
         )
     half = torch.linalg.solve_triangular(root, task, upper=False)  # L^-1 A
     whitened = torch.linalg.solve_triangular(root, half.T, upper=False)  # L^-1 A L^-T

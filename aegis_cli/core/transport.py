@@ -46,7 +46,7 @@ def layer_weights(anchor: Sequence[Moments], weighting: str) -> Tensor:
     if (traces == 0).any():
         raise AegisError(
             f"layer {int((traces == 0).nonzero()[0])} of the anchor has no variance",
-            "a positive variance in every layer, for the weighting 'variance' divides by it",
+            "a positive variance in every layer: the weighting 'variance' divides by it",
             "--set aegis.weighting=none, or measure the anchor on more samples",
         )
     return 1 / traces

@@ -66,7 +66,7 @@ def chosen(text: str, count: int, splits: Mapping[str, str], path: Path) -> list
     if beyond and not count:
         raise AegisError(
             f"demos.only: {text} of '{path}', which has no episode",
-            "recorded episodes to choose of",
+            "recorded episodes to choose from",
             "record some, or give other demonstrations",
         )
     if beyond:

@@ -93,7 +93,7 @@ def successes(
     lacking = ", ".join(task for task, count in left.items() if count)
     raise AegisError(
         f"the expert succeeded in {episodes - sum(left.values())} of {limit} episodes",
-        f"{episodes} successes; of {lacking} there are too few",
+        f"{episodes} successes; there are too few of {lacking}",
         "lower --noise",
     )
 

@@ -184,17 +184,17 @@ def digests(inputs: Mapping[str, str]) -> frozenset[str]:
 
 
 def differing(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """Which inputs of a run have different digests here, as a text such as "another anchor"."""
+    """Which inputs of a run have different digests here, as a text such as "a different anchor"."""
     names = sorted(name for name in there.keys() | here.keys() if there.get(name) != here.get(name))
     sets = [name for name in names if name.startswith(f"{_INPUT} ")]
     if not sets:
-        return f"another {', '.join(names)}"
+        return f"a different {', '.join(names)}"
     if {there.get(name) for name in sets} == {here.get(name) for name in sets}:
-        return "the sets of demonstrations in another order"
+        return "the sets of demonstrations in a different order"
     # If a set differs, so does the digest of all together, which adds nothing.
     others = [name for name in names if name not in (_INPUT, *sets)]
     numbered = [f"set {name.removeprefix(f'{_INPUT} ')} of the demonstrations" for name in sets]
-    return f"another {', '.join([*others, *numbered])}"
+    return f"a different {', '.join([*others, *numbered])}"
 
 
 # --- shares ---------------------------------------------------------------------------------------
@@ -206,8 +206,8 @@ def check_weights(weights: Sequence[float] | None, sets: int) -> None:
         return
     raise AegisError(
         f"demos.weights: {_numbers(weights)} with {_counted(sets)} of demonstrations",
-        "a weight for each of several sets, in their order",
-        "correct demos.weights, or delete it and let each set have the share of its frames",
+        "a weight for each of two or more sets, in their order",
+        "correct demos.weights, or delete it: each set is then weighted by its frames",
     )
 
 
@@ -234,9 +234,9 @@ def drawn(found: Demonstrations, weights: Sequence[float] | None) -> list[int]:
     for member, count in zip(found.members, counts, strict=True):
         if count == 0:
             raise AegisError(
-                f"demos.weights: {_numbers(weights)}, by which none of an epoch's {total} frames "
-                f"is of '{member.name}'",
-                "weights by which every set has a frame in an epoch",
+                f"demos.weights: {_numbers(weights)}, which leave '{member.name}' none of an "
+                f"epoch's {total} frames",
+                "weights that give every set at least one frame per epoch",
                 "raise its weight, or leave the set out",
             )
     return counts
@@ -268,7 +268,7 @@ def _check_selection(paths: Sequence[Path], selection: Selection) -> None:
     if selection.only is not None:
         raise AegisError(
             f"demos.only: {selection.only} with {_counted(len(paths))} of demonstrations",
-            "one set, to choose episodes of",
+            "one set, to choose episodes from",
             "leave demos.only out, or give one set",
         )
 
@@ -362,8 +362,8 @@ def _check_robot(path: Path, robot: Robot, known_path: Path, known: Robot) -> No
         raise AegisError(
             f"the camera {', '.join(robot.cameras)} of '{path}'",
             f"{', '.join(known.cameras)}, as in '{known_path}'",
-            "choose cameras that all sets have with demos.camera; give a camera that is called "
-            f"otherwise in '{path}' the same name with --set 'demos.rename={{ITS NAME: NAME}}'",
+            "choose cameras that all sets have with demos.camera; or, where a camera of "
+            f"'{path}' has another name, rename it: --set 'demos.rename={{ITS NAME: NAME}}'",
         )
     if None not in (robot.fps, known.fps) and robot.fps != known.fps:
         raise AegisError(
@@ -386,7 +386,7 @@ def _refuse_names(path: Path, known_path: Path, other: joints.Difference) -> Non
         raise AegisError(
             f"'{other.moved}' in another place in '{path}', with {other.what} {found}",
             f"{known}, in this order, as in '{known_path}'",
-            "give demonstrations in one order",
+            "give demonstrations that share one order",
         )
     raise AegisError(
         f"{other.what} named {found} in '{path}'",

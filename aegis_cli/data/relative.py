@@ -68,8 +68,8 @@ def places(
         raise AegisError(
             f"train.relative_actions: true with {sizes[0]} actions and {sizes[1]} positions, not "
             "all of which have names",
-            "names of both in the demonstrations; without any, as many positions as actions and no "
-            "train.relative_exclude",
+            "names of both in the demonstrations; or, without any names, as many positions as "
+            "actions and no train.relative_exclude",
             "delete train.relative_actions, or name the features' components in info.json",
         )
     lowered = [name.lower() for name in actions]
@@ -78,7 +78,7 @@ def places(
         # A word that excludes nothing is a mistake, and would leave the gripper relative.
         if not any(as_found in name for name in lowered):
             raise AegisError(
-                f"train.relative_exclude: '{word}', which no action's name has",
+                f"train.relative_exclude: '{word}', which is in no action's name",
                 f"a word of {', '.join(actions)}",
                 "correct it, or delete it",
             )
@@ -88,8 +88,8 @@ def places(
     if lacking:
         raise AegisError(
             f"train.relative_actions: true, and no position is named {' or '.join(lacking)}",
-            f"actions that say which positions to take: {', '.join(positions)}",
-            "name what stays absolute in train.relative_exclude, or delete train.relative_actions",
+            f"actions named as positions are: {', '.join(positions)}",
+            "list what stays absolute in train.relative_exclude, or delete train.relative_actions",
         )
     twice = [name for name in moved if moved.count(name) > 1 or positions.count(name) > 1]
     if twice:

@@ -71,7 +71,7 @@ def check_known(rename: Renaming, names: Iterable[str], where: str) -> None:
         if name not in known:
             raise AegisError(
                 f"'{name}' in demos.rename (or --rename), which does not occur in {where}",
-                f"a name of theirs: {', '.join(known)}",
+                f"one of the names there: {', '.join(known)}",
                 "correct it, or leave it out",
             )
 

@@ -52,7 +52,7 @@ class Selection:
             named = chosen if isinstance(chosen, str) else ", ".join(chosen)
             raise AegisError(
                 f"demos.{name}: {named} with the file '{path}'",
-                f"a LeRobot folder, to choose {what} of",
+                f"a LeRobot folder, to choose {what} from",
                 f"leave demos.{name}{of_anchor.get(name, '')} out",
             )
 

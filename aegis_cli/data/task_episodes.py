@@ -30,7 +30,7 @@ def of_task(found: Dataset, task: str) -> list[int]:
     if not numbers:
         raise AegisError(
             f"no episode of '{task}' in '{found.folder}', by the instructions of its meta folder",
-            f"its instructions, such as '{libero_table.instructions(task)[0]}'",
+            f"episodes with instructions of it, such as '{libero_table.instructions(task)[0]}'",
             "give demonstrations of that task, or choose episodes by their numbers (demos.only)",
         )
     _check_told_apart(found, task, own)
@@ -54,7 +54,7 @@ def is_choice(found: Dataset, task: str, shared: bool) -> bool:
         return not all(tasks & own for tasks in tasks_of_each)
     if shared:
         raise AegisError(
-            f"'{found.folder}' for '{task}' and other tasks, none of whose instructions it has",
+            f"'{found.folder}' for '{task}' and other tasks, which has none of their instructions",
             f"instructions such as '{libero_table.instructions(task)[0]}'",
             "choose the episodes of each task by their numbers: demos.only",
         )
@@ -100,7 +100,7 @@ def _check_told_apart(found: Dataset, task: str, own: set[str]) -> None:
         for other in sorted(told - own if told & own else ()):
             if libero_table.place(other)[0] in there:
                 raise AegisError(
-                    f"'{text}' in '{found.folder}', which is said in '{other}' and in '{task}'",
-                    "instructions that tell these apart",
+                    f"'{text}' in '{found.folder}', an instruction of both '{other}' and '{task}'",
+                    "instructions that tell the two tasks apart",
                     "choose the episodes by their numbers: demos.only",
                 )

@@ -81,7 +81,7 @@ def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
                 _add(log, number, line)
             reading.read(len(line))
     if not log.asked:
-        fix = "evaluate again: the harness has written the file and no line of it"
+        fix = "evaluate again: the harness wrote an empty file"
         raise AegisError(f"no question in '{path}'", WRITTEN, fix)
     _check_lines(log)
     return log

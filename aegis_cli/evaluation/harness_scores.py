@@ -25,7 +25,7 @@ from aegis_cli.evaluation.question_log import Harness, QuestionLog, Reading, Tas
 
 _HARNESSES = (harness_samples.HARNESS, vlmevalkit_tables.HARNESS)
 _WRITTEN = f"{harness_samples.WRITTEN}, or {vlmevalkit_tables.WRITTEN}"
-_NOT_NOTED = "what each of its questions got is not noted"
+_NOT_NOTED = "no per-question scores were written"
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,9 @@ def _harness(before: Path, after: Path) -> Harness:
     first, second = _harness_of(before), _harness_of(after)
     if first is not second:
         raise AegisError(
-            f"what {first.name} wrote in '{before}', and what {second.name} wrote in '{after}'",
-            "what one harness wrote of both models",
-            "ask both models by the same one, since each asks and judges in its own way",
+            f"output of {first.name} in '{before}', and of {second.name} in '{after}'",
+            "the output of one harness for both models",
+            "evaluate both models with the same one, since each asks and judges in its own way",
         )
     return first
 
@@ -151,8 +151,8 @@ def _harness_of(place: Path) -> Harness:
     held = [harness for harness in _HARNESSES if harness.holds(place)]
     if len(held) > 1:
         names = " and ".join(harness.name for harness in held)
-        fix = "give a folder with what one of them wrote"
-        raise AegisError(f"what {names} wrote, in '{place}'", "what one harness wrote", fix)
+        fix = "give a folder with the output of one of them"
+        raise AegisError(f"output of {names} in '{place}'", "the output of one harness", fix)
     if not held:
         raise _nothing_known(place)
     return held[0]
@@ -161,14 +161,14 @@ def _harness_of(place: Path) -> Harness:
 def _nothing_known(place: Path) -> AegisError:
     if place.is_file():
         return AegisError(
-            f"'{place}', whose name is none that a harness gives to samples or tables",
+            f"'{place}', which is not named as a harness names samples or tables",
             "e.g. 20260131_120000_samples_TASK.jsonl, samples_TASK_2026-01-31T12-00-00.jsonl, or "
             "MODEL_BENCHMARK_exact_matching_result.xlsx in a folder MODEL",
-            "give it the name again that it was written under: it tells the task",
+            "give it back the name that it was written under, which tells the task",
         )
     table = vlmevalkit_tables.unnamed(place)
     if table is not None:
-        fix = "give the folder the name again that VLMEvalKit gave it, which is the model's"
+        fix = "give the folder back the name that VLMEvalKit gave it, which is the model's"
         found = f"'{table}', whose name does not begin with that of its model's folder"
         return AegisError(found, vlmevalkit_tables.WRITTEN, fix)
     fix = "evaluate again, by lmms-eval with --log_samples, and give the folder of its output"
@@ -192,9 +192,9 @@ def _refuse_unjudged(first: Tasks, second: Tasks, before: Path, after: Path) -> 
     tasks = sorted(task for task, own in first.items() if own and not second.get(task))
     if tasks:
         raise AegisError(
-            f"no scores in '{after}' of {', '.join(tasks)}, of which '{before}' has some",
-            "scores of every task of both models, where --max-drop is to judge",
-            "ask the second model the same tasks, or take these files out of the first folder",
+            f"no scores in '{after}' of {', '.join(tasks)}, which '{before}' has",
+            "scores of both models for every task, so that --max-drop can judge them",
+            "evaluate the second model on these tasks, or remove them from the first folder",
         )
 
 
@@ -208,7 +208,7 @@ def _warn_of_lone(why: Mapping[str, str], max_drop: float | None, on_event: OnEv
 
 def _warn_of_nothing(task: str, reason: str, max_drop: float | None, on_event: OnEvent) -> None:
     judged = "" if max_drop is None else ", and --max-drop does not judge it"
-    on_event(Warned("scores", f"{task}: nothing of it is compared{judged}: {reason}"))
+    on_event(Warned("scores", f"{task}: not compared{judged}: {reason}"))
 
 
 def _warn_of_doubts(task: str, logs: tuple[QuestionLog, QuestionLog], on_event: OnEvent) -> None:
@@ -221,9 +221,9 @@ def _warn_of_doubts(task: str, logs: tuple[QuestionLog, QuestionLog], on_event: 
 def _nothing_in_common(before: Path, after: Path, why: Mapping[str, str]) -> AegisError:
     reasons = few([f"{task}: {reason}" for task, reason in sorted(why.items())])
     return AegisError(
-        f"no score of one question in common between '{before}' and '{after}' ({reasons})",
-        "what one harness noted of each question, of the same tasks",
-        "ask both models the same tasks, in the same way",
+        f"no question with a score in both '{before}' and '{after}' ({reasons})",
+        "the scores that one harness wrote for each question, of the same tasks",
+        "evaluate both models on the same tasks, in the same way",
     )
 
 
@@ -272,7 +272,7 @@ def _judged_otherwise(
     if max_drop is not None:
         raise AegisError(
             f"{task}: {reason}, in '{logs[0].path}' and '{logs[1].path}'",
-            "a metric of both models, where --max-drop is to judge",
+            "a metric of both models, so that --max-drop can judge it",
             "evaluate both with the same judge, version of the harness and settings",
         )
     return reason
@@ -288,11 +288,11 @@ def _unfit(metric: str, logs: tuple[QuestionLog, QuestionLog]) -> str | None:
     values = [value for log in logs for value in log.values[metric].values()]
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
-        return "not one number a question"
+        return "not one number per question"
     if any(metric.split(",")[0] in log.falling for log in logs):
         return "less of it is better"
     if min(numbers) < 0 or max(numbers) > 1:
-        return f"from {min(numbers):g} to {max(numbers):g}, which are no shares"
+        return f"from {min(numbers):g} to {max(numbers):g}, which are not shares"
     return None
 
 

@@ -151,7 +151,9 @@ def _whole(batch_size: int | str) -> int:
     except ValueError:
         found = 0
     if found < 1:
-        raise AegisError(f"--batch_size {batch_size}", "a whole number, 1 or more", "such as 16")
+        raise AegisError(
+            f"--batch_size {batch_size}", "a whole number, 1 or more", "e.g. --batch_size 16"
+        )
     return found
 
 
@@ -177,7 +179,7 @@ def _check_greedy(settings: Mapping[str, Any], task: str) -> None:
         wanted = {name: settings.get(name) for name in ("do_sample", "temperature", "num_beams")}
         raise AegisError(
             f"the task '{task}' with {wanted}",
-            "the likeliest token after each, the same answer every time",
+            "greedy decoding, which gives the same answer every time",
             "--gen_kwargs do_sample=False,temperature=0,num_beams=1",
         )
 
@@ -190,7 +192,7 @@ def _check_images(shown: Sequence[Any], task: str, backbone: Backbone) -> None:
         raise AegisError(found, "images", "choose tasks about images")
     if not shown:
         found = f"the task '{task}' asks about no image"
-        raise AegisError(found, "at least one image a question", "choose tasks about images")
+        raise AegisError(found, "at least one image per question", "choose tasks about images")
     if len(shown) > 1 and not backbone.reads_several:
         found = f"the task '{task}' asks about {len(shown)} images at once"
         raise AegisError(found, "one, which is all that this model reads", "choose another task")

@@ -256,8 +256,8 @@ def warn_of_few_questions(
     if apart <= max_drop or not low <= max_drop <= high:
         return
     text = (
-        f"{questions:,} questions tell the drop to ±{apart:.2f} points, too coarsely for a "
-        f"gate at {max_drop:g}: whether it passes is up to chance, or to how few they are. "
+        f"{questions:,} questions measure the drop to ±{apart:.2f} points, too coarsely for a "
+        f"gate at {max_drop:g}: whether it passes depends on chance, or on how few they are. "
         f"{fix}, or allow a larger drop"
     )
     on_event(Warned(stage, text))
@@ -274,7 +274,7 @@ def _warn_of_another_start(
     if before.fingerprint() not in _begun_from(folder):
         text = (
             f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
-            "difference between two models, and not what this training has cost"
+            "difference between two models, not what this training has cost"
         )
         on_event(Warned("probe", text))
 
@@ -434,7 +434,7 @@ def compare(
     if max_drop is not None and drop is None:
         raise AegisError(
             "--max-drop without --baseline",
-            "something to measure the drop against",
+            "a baseline to measure the drop against",
             "add --baseline embedded",
         )
     interval = None if before is None else _in_points(drop_interval(before, after))

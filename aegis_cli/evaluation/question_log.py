@@ -47,7 +47,7 @@ def newest(place: Path, found: Mapping[str, Sequence[Evaluation]], on_event: OnE
         if len(folders) > 1:
             raise AegisError(
                 f"scores of {task} in {len(folders)} folders below '{place}'",
-                "those of one model",
+                "the scores of one model",
                 f"give one of them, such as '{folders[0]}'",
             )
         last = max(own, key=lambda evaluation: evaluation.date)

@@ -125,14 +125,14 @@ def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) ->
     if ensemble is not None:
         raise AegisError(
             f"a delay of {delay} steps with the temporal ensemble {ensemble:g}",
-            "one of them",
-            "a delay is for a policy that executes several actions of each chunk",
+            "one of the two",
+            "leave the delay out: it is for policies that execute several actions of each chunk",
         )
     longest = min(replan, chunk - replan)
     if not 0 <= delay <= longest:
         raise AegisError(
             f"a delay of {delay} steps, with chunks of {chunk} actions, {replan} of them executed",
-            f"0 to {longest}: as many are left of a chunk, and no more are executed of the next",
+            f"0 to {longest}: at most as many as are left of a chunk and executed of the next",
             f"use --delay {longest}, or a policy of longer chunks (train.chunk)",
         )
 
@@ -152,8 +152,8 @@ def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
         libero = libero_table.spec(_LIBERO)
         likely = _LIBERO if own == _sizes(libero) else next(iter(sim.TASKS))
         raise AegisError(
-            "a policy trained on a dataset of no simulated task",
-            "a task whose positions and actions it knows",
+            "a policy trained on a dataset that is not of a simulated task",
+            "a task with the positions and actions that it was trained on",
             f"--task {likely}",
         )
     sizes = _sizes(sim.make(asked).spec)
@@ -181,7 +181,7 @@ def _check_rate(rate: float, task: str, on_event: OnEvent) -> None:
     own = spec.control_hz
     if not any(math.isclose(known, rate, rel_tol=1e-3) for known in (own, spec.said_hz or own)):
         text = (
-            f"'{task}' has {own:g} steps a second, and the policy was trained on {rate:g}: its "
-            "actions are meant for steps of another length"
+            f"'{task}' has {own:g} steps a second, but the policy was trained on {rate:g}: its "
+            "actions are meant for steps of a different length"
         )
         on_event(Warned("rollout", text))

@@ -119,7 +119,7 @@ def find(place: Path, on_event: OnEvent) -> Tasks:
     if len(models) > 1:
         raise AegisError(
             f"tables of {len(models)} models below '{place}'",
-            "those of one model",
+            "the tables of one model",
             f"give one of them, such as '{models[0]}'",
         )
     if not any(table.is_judged for table in found):
@@ -155,7 +155,7 @@ def _nothing_judged(place: Path, found: Sequence[_Table]) -> AegisError:
         )
     if found:
         names = ", ".join(sorted({table.name for table in found}))
-        return AegisError(f"predictions alone in '{place}', of {names}", "verdicts on them", _JUDGE)
+        return AegisError(f"only predictions in '{place}', of {names}", "verdicts on them", _JUDGE)
     return AegisError(f"no table with a row for each question in '{place}'", WRITTEN, _JUDGE)
 
 

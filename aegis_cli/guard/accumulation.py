@@ -110,7 +110,7 @@ def continues(total: Accumulation | None, groups: Groups) -> bool:
         refuse_partly_cleared(parameters)
     raise AegisError(
         "gradients that changed since the last guard.backward",
-        "what it left, or zero_grad() before the next step's first",
+        "the gradients that it left, or zero_grad() before the next step's first",
         "call optimizer.zero_grad() after each step; clip, unscale and add other losses' "
         "gradients after a step's last guard.backward, or add the losses: "
         "guard.backward(loss + other)",
@@ -127,8 +127,8 @@ def refuse_partly_cleared(parameters: Sequence[nn.Parameter]) -> None:
             f"gradients of which {len(parameters) - kept} were cleared since the last "
             f"guard.backward and {kept} were not",
             "all of them cleared, or none",
-            "model.zero_grad() clears those that the optimizer does not have, too; or freeze what "
-            "it does not have before the guard is made",
+            "call model.zero_grad(), which also clears what the optimizer does not have; or "
+            "freeze that before the guard is made",
         )
 
 

@@ -76,8 +76,8 @@ class AutomaticLoop:
             raise AegisError(
                 "a second forward pass under gradients before the backward pass of the first",
                 "one forward pass of the guarded model for each backward pass",
-                "torch.no_grad() around passes that nothing learns from; guard.discard() for a "
-                "batch that is skipped, or whose loss.backward() has failed; where a step needs "
+                "use torch.no_grad() around passes that nothing learns from; guard.discard() for a "
+                "batch that is skipped, or whose loss.backward() failed; where a step needs "
                 "several passes at once, call the guard in the loop: guard.watch around all of "
                 "them, and guard.backward",
             )

@@ -123,9 +123,10 @@ class DualBackward:
         """Refuse to add to gradients that were already used in a step: they would count twice."""
         if self._stepper.has_stepped:
             raise AegisError(
-                "gradients that were not cleared after the step that was made of them",
+                "gradients that were not cleared after their step",
                 "optimizer.zero_grad() after each step, or before the next one's first pass",
-                "call it; several guard.backward go before one step, and none between",
+                "call it; several guard.backward go before one step, none between the step and "
+                "zero_grad()",
             )
 
     def backward(self, loss: Tensor, seen: Pass, scale: float, skips: bool) -> None:
@@ -271,9 +272,9 @@ class DualBackward:
         groups = [[p for p in group if p.requires_grad] for group in self._groups]
         if not any(groups):
             raise AegisError(
-                "a model of which nothing learns any more that learned when the guard was made",
+                "a model in which nothing learns any more of what learned when the guard was made",
                 "parameters that the guard knows",
-                "freeze, and add adapters (peft.get_peft_model), before the guard is made",
+                "freeze parts and add adapters (peft.get_peft_model) before the guard is made",
             )
         return groups
 
@@ -282,7 +283,7 @@ class DualBackward:
             raise AegisError(
                 "gradient checkpointing with use_reentrant=True",
                 "use_reentrant=False",
-                "the other knows no second pass; Hugging Face: "
+                "use that form, which supports a second pass; Hugging Face: "
                 'gradient_checkpointing_kwargs={"use_reentrant": False}',
             )
         self._checkpointing_checked = True
@@ -300,8 +301,8 @@ def diverged(steps: int) -> Diverged:
     return Diverged(
         "a loss or gradient that is not finite",
         "finite numbers",
-        "lower the learning rate, or give guard.backward, or guard.automatic, the GradScaler; "
-        "optimizer.zero_grad() goes on without this batch",
+        "lower the learning rate, or pass the GradScaler to guard.backward or guard.automatic; "
+        "optimizer.zero_grad() skips this batch",
         steps,
     )
 
@@ -320,8 +321,8 @@ def check_pass(seen: Pass, widths: Sequence[int], compared: Sequence[str]) -> No
     if not any(hidden.requires_grad for hidden in seen.hidden):
         raise AegisError(
             "hidden states without a graph in every layer",
-            "layers that learn, or that something below them feeds",
-            "unfreeze a layer, or do without the guard: nothing it guards can move",
+            "layers that learn, or that read something that does",
+            "unfreeze a layer, or leave the guard out: nothing that it guards can change",
         )
     found = [hidden.shape[-1] for hidden in seen.hidden]
     if found != list(widths):
@@ -334,6 +335,6 @@ def check_pass(seen: Pass, widths: Sequence[int], compared: Sequence[str]) -> No
         if not torch.any(seen.mask & (seen.image if kind == "image" else ~seen.image)):
             raise AegisError(
                 f"a batch without a valid {kind} token",
-                "at least one, for they are compared",
+                "at least one to compare",
                 "check the masks",
             )

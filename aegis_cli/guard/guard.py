@@ -441,7 +441,7 @@ def _check_mask(mask: object) -> None:
         raise AegisError(
             f"a mask that is a {type(mask).__name__}",
             "a tensor [B, T]",
-            "torch.as_tensor(mask); of a batch, its mask alone: batch['attention_mask']",
+            "torch.as_tensor(mask); from a batch, only its mask: batch['attention_mask']",
         )
 
 
@@ -451,7 +451,7 @@ def _check_loss(loss: object) -> None:
         raise AegisError(
             f"a loss that is a {type(loss).__name__}",
             "a tensor of one number with its graph",
-            "of a Hugging Face model's output, output.loss; leave .item() out",
+            "with a Hugging Face model, give output.loss; leave .item() out",
         )
     if loss.numel() != 1 or not loss.requires_grad:
         raise AegisError(
@@ -469,7 +469,7 @@ def _check_optimizer(optimizer: object, constrained: bool) -> None:
         raise AegisError(
             f"guard.step of a {type(optimizer).__name__}",
             "an optimizer",
-            "guard.step(optimizer), and scheduler.step() after it as ever",
+            "guard.step(optimizer), and scheduler.step() after it as usual",
         )
 
 
@@ -527,7 +527,7 @@ def _owners(model: nn.Module, group: dist.ProcessGroup | None) -> Ranks:
         raise AegisError(
             "weights that are sharded over one process",
             "several processes, or whole weights",
-            "leave fully_shard out where there is one process",
+            "leave fully_shard out in a single process",
         )
     refuse_partly_sharded(model, found.count)
     return found

@@ -54,7 +54,7 @@ class LearningParameters:
             then, now = next((then, now) for then, now in moved if then != now)
             raise AegisError(
                 f"a model that was on {then} when the guard was made, and is on {now}",
-                "one and the same",
+                "the same device",
                 f"model.to('{now}') before Guard(...), also where a trainer would do it",
             )
         for (name, parameter), then in zip(self.named.items(), self._types, strict=True):
@@ -62,9 +62,9 @@ class LearningParameters:
                 raise AegisError(
                     f"'{name}', which was in {then} when the guard was made, and is in "
                     f"{parameter.dtype}",
-                    "one and the same: rounding to half precision is as large as an update",
-                    "leave the model as it was, with torch.autocast for fast products; of "
-                    "Lightning, precision='bf16-mixed'",
+                    "the same type: rounding to half precision is as large as an update",
+                    "leave the model as it was, with torch.autocast for fast products; in "
+                    "Lightning: precision='bf16-mixed'",
                 )
 
     def refuse_unreached(self) -> None:
@@ -119,7 +119,7 @@ class LearningParameters:
 
 def _others() -> AegisError:
     return AegisError(
-        "other trainable parameters than when the guard was made",
+        "different trainable parameters than when the guard was made",
         "the same",
         "freeze and unfreeze before Guard(...)",
     )

@@ -80,7 +80,7 @@ def _match_in(
         if at and len(at) != len(sites):
             raise AegisError(
                 f"{len(at)} parameters with the values of {few(sites)}",
-                f"{len(sites)}, by which they can be told",
+                f"{len(sites)}, to tell which is which",
                 "freeze them in the policy, and leave only their kind out of protect=: what "
                 "is left free can undo what the others hold",
             )
@@ -109,7 +109,7 @@ def _bias(
     raise AegisError(
         f"a parameter with the values of {site}.weight, and {len(at)} that may be its bias",
         "the bias after its weight, as a model has them",
-        "give the optimizer the parameters in the model's order, and of a map both or none",
+        "give the optimizer the parameters in the model's order, and both or neither of a map",
     )
 
 
@@ -126,8 +126,8 @@ def refuse_half_frozen(found: Mapping[str, Pair]) -> None:
             still = "bias" if weight.requires_grad else "weight"
             raise AegisError(
                 f"{site} of the base model in the policy, of which only the {still} is frozen",
-                "all or nothing",
-                "freeze both or none",
+                "both frozen, or neither",
+                "freeze both or neither",
             )
 
 
@@ -160,9 +160,9 @@ def refuse_strays(
             continue
         if any(torch.equal(on_cpu(p), bias) for p in free.get(bias.shape, ())):
             raise AegisError(
-                f"the bias of {site} of the base model among what learns, and not its weight",
-                "all or nothing",
-                "freeze both or none",
+                f"the bias of {site} of the base model among what learns, but not its weight",
+                "both frozen, or neither",
+                "freeze both or neither",
             )
 
 
@@ -191,7 +191,7 @@ def refuse_lost(
         if any(_near(parameter, value) for parameter in free.get(value.shape, ())):
             raise AegisError(
                 f"a parameter {list(value.shape)} near {name} of the base model, which learns, and "
-                "kfac holds linear maps and convolutions alone",
+                "kfac protects only linear maps and convolutions",
                 "normalisations and tables with the base model's values, which are frozen, or "
                 "frozen ones among the optimizer's parameters",
                 "freeze it; aegis_nullspace protects one that has not learned before",

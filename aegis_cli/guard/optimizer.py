@@ -80,7 +80,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._anchor, header = load_anchor(method, Path(anchor))
         if header.fingerprint != base.fingerprint():
             raise AegisError(
-                f"anchor '{anchor}' of other weights than those of the base model",
+                f"anchor '{anchor}', which was not measured on the base model's weights",
                 "the VLM that the anchor was measured on",
                 "name it as the base, as in aegis anchor --backbone",
             )
@@ -162,7 +162,7 @@ class ProtectedAdamW(torch.optim.AdamW):
         if getattr(self, "_stepper", None) is not None:
             raise AegisError(
                 "a group of parameters that is added after the first step",
-                "all of them before it: what is the VLM's among them could not be held",
+                "all groups before it: a later one could not be protected where it is the VLM's",
                 "make a new optimizer of all parameters, which continues with this one's state",
             )
         super().add_param_group(param_group)
@@ -175,8 +175,8 @@ class ProtectedAdamW(torch.optim.AdamW):
                 f"{len(thawed)} parameters of the base model that were frozen and learn again, "
                 f"first '{thawed[0]}'",
                 "what learned at the first step",
-                "let all maps that are to learn do so from the first step on; kfac holds nothing "
-                "but linear maps and convolutions, and normalisations and tables stay frozen",
+                "let every map that should learn do so from the first step on; kfac protects only "
+                "linear maps and convolutions, and normalisations and tables stay frozen",
             )
 
     def _ordered(self) -> list[Tensor]:
@@ -197,7 +197,7 @@ class ProtectedAdamW(torch.optim.AdamW):
             raise AegisError(
                 f"none of the {len(self._base)} maps of the base model is among what learns",
                 "a policy whose VLM learns, and still has the weights of the base model",
-                "let the VLM learn (of SmolVLA: --policy.train_expert_only=false), and name the "
+                "let the VLM learn (for SmolVLA: --policy.train_expert_only=false), and name the "
                 "VLM that it begins with as the base",
             )
         # In a resumed run they have learned; the check was made when training began.
@@ -248,7 +248,7 @@ class ProtectedAdamW(torch.optim.AdamW):
                     raise AegisError(
                         f"a parameter {shapes[0]} for {site} {shapes[1]} of the base model",
                         "the state of a training with this anchor and base model",
-                        "resume with those that the training began with",
+                        "resume with the ones the training began with",
                     )
         return {site: (weight, bias) for site, (weight, bias) in pairs.items()}  # type: ignore[misc]
 

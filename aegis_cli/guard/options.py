@@ -243,7 +243,7 @@ def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames
             f"the weights and adapters are not those that anchor '{path}' was measured on",
             f"{expected}, and adapters that change nothing yet, as a fresh LoRA",
             "make the guard before trained adapters are loaded, and let them begin at zero "
-            f"(neither pissa nor olora); or {fix}, the adapters in their place",
+            f"(neither pissa nor olora); or {fix}, with the adapters in place",
         )
     raise AegisError(
         f"the weights are not those that anchor '{path}' was measured on",
@@ -267,7 +267,7 @@ def _check_adapters(
         f"anchor '{path}' was measured without these adapters: {few(inside)}",
         "an anchor of the model with its adapters, since they are what learns",
         "put the adapters into the model, measure it with Guard.measure, and make the guard of "
-        'that very model; or use method="aegis", which takes an anchor of the model alone',
+        'the same model; or use method="aegis", which takes an anchor of the model alone',
     )
 
 
@@ -301,7 +301,7 @@ def _protected(
         raise AegisError(
             f"learning modules that cannot be protected: {_by_reason(unknown)}",
             "linear maps and convolutions" + ("" if dense else ", normalisations and embeddings"),
-            "freeze them: requires_grad_(False); or leave them alone free, by naming every "
+            "freeze them: requires_grad_(False); or leave only them free, by naming every "
             f"kind: protect={all_kinds}",
         )
     chosen = {site: kind for site, kind in kinds.items() if kind in protect}

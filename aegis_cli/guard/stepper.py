@@ -134,7 +134,7 @@ class GuardedStepper:
             if shared := self._learning.shared_with(other._learning):
                 raise AegisError(
                     f"two guards at work on {len(shared)} parameters, first '{shared[0]}'",
-                    "one for each parameter: a second one moves again what the first has held",
+                    "one for each parameter: a second one would move what the first has held",
                     "guard.remove() for one that is done; freeze what two guarded models share; or "
                     "measure one anchor on the questions of both",
                 )
@@ -333,8 +333,8 @@ class GuardedStepper:
             raise AegisError(
                 "two optimizers on guarded parameters, whose updates would be constrained twice",
                 "one, which may have groups with settings of their own",
-                "torch.optim.AdamW([{'params': ..., 'lr': ...}, ...]); an optimizer of parameters "
-                "that the guard does not know may be there besides",
+                "torch.optim.AdamW([{'params': ..., 'lr': ...}, ...]); parameters that "
+                "the guard does not know may have an optimizer of their own",
             )
         self._since.constrained = id(optimizer)
 
@@ -426,7 +426,7 @@ class _BufferWatch:
         more = f" and of {len(written) - 1} more modules" if written[1:] else ""
         warnings.warn(
             f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm "
-            "averages what it reads: answers change with them, and no method holds them; call "
+            "averages what it reads: answers change with them, and no method protects them; call "
             "module.eval() for each of these modules after model.train()",
             stacklevel=2,
         )

@@ -72,6 +72,6 @@ def _check_model(trained: nn.Module, guarded: nn.Module) -> None:
         raise AegisError(
             f"a Trainer of a {type(trained).__name__} that the guard does not know",
             "the guarded model, or one that it is a part of",
-            "give Trainer(model=...) the very model that the guard was made of; with model_init=, "
+            "give Trainer(model=...) the same model that the guard was made of; with model_init=, "
             "make the guard in it",
         )

@@ -116,7 +116,7 @@ def relative_fisher(
     if missing is not None:
         raise AegisError(
             f"no Fisher information of '{missing}' in the anchor",
-            "that of every parameter that learns",
+            "the Fisher information of every parameter that learns",
             "measure the anchor again with 'fisher' among its parts",
         )
     # In float64: millions of small squares are added up.

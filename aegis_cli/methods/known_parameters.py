@@ -50,15 +50,15 @@ class KnownParameters:
         unknown = [name for name, p in learning.items() if id(p) not in self._known]
         if unknown:
             raise AegisError(
-                f"{few(unknown)}: parameters that were put into the model later",
+                f"{few(unknown)}: parameters that were added to the model later",
                 "the parameters that it had at the start",
-                "add adapters (peft.get_peft_model) and wrap parts first, and make the guard, or "
-                "start the method, after it",
+                "add adapters (peft.get_peft_model) and wrap parts before you make the guard, or "
+                "start the method",
             )
         resized = [name for name, p in learning.items() if p.shape != self._known[id(p)][1]]
         if resized:
             raise AegisError(
-                f"{few(resized)}: parameters of another shape than at the start, as sharding "
+                f"{few(resized)}: parameters with a different shape than at the start, as sharding "
                 "leaves them",
                 _SHARDED,
                 "train without FSDP or ZeRO",
@@ -126,7 +126,7 @@ def refuse_partly_sharded(model: nn.Module, count: int) -> None:
         raise AegisError(
             f"{few(wrong)}: not sharded by FSDP2 by rows, over the {count} processes of "
             "process_group=",
-            "all that learns sharded, or nothing",
+            "everything that learns sharded, or nothing",
             "fully_shard(model) after its blocks, on a mesh of one dimension",
         )
 
@@ -163,9 +163,9 @@ def check_reached(parameters: Iterable[nn.Parameter]) -> None:
     if all(p.grad is None for p in parameters):
         raise AegisError(
             "a backward pass that left no gradient in any parameter of the model",
-            "a loss that the model has a part in",
-            "compute the loss with the very model that the method was started on, and detach "
-            "nothing on the way; of several passes over weights that FSDP2 has sharded, let each "
+            "a loss that depends on the model",
+            "compute the loss with the same model that the method was started on, and detach "
+            "nothing on the way; with several passes over weights that FSDP2 has sharded, let each "
             "sum its gradient: set_requires_gradient_sync(True)",
         )
 
@@ -185,5 +185,5 @@ def check_row(gram: Gram, groups: Sequence[str]) -> None:
         raise AegisError(
             f"an anchor gradient of zero in all {len(groups)} groups ({few(groups)})",
             "hidden states through which the anchor reaches the layers' parameters",
-            "let the layers learn, and call the very layers that the method was started on",
+            "let the layers learn, and call the same layers that the method was started on",
         )

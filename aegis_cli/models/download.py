@@ -55,7 +55,7 @@ def fetch(name: str) -> Path:
     if (folder / _EXPERT).is_file() and (folder / lerobot_folder.BACKBONE).is_dir():
         return folder
     fix = (
-        "check the name; where the policy lies in a folder of it: "
+        "check the name; if the policy is in a folder of the repository: "
         f"hf download {name} --include 'FOLDER/*' --local-dir POLICY; then give POLICY/FOLDER"
     )
     if model_folder.foreign_policy(folder) is not None:
@@ -91,6 +91,6 @@ def _snapshot(name: str, wanted: Sequence[str]) -> Path:
             f"{in_short(error)}",
             "the folder of a run, a checkpoint or an exported policy, or a hub id with a network "
             "(and, for a private policy, a token)",
-            f"check the path; or where there is a network: hf download {name} --local-dir POLICY; "
-            "then give POLICY",
+            f"check the path; or, on a machine with a network: hf download {name} --local-dir "
+            "POLICY; then give POLICY",
         ) from error

@@ -32,7 +32,7 @@ def check_actions(actions: Tensor) -> Tensor:
         raise AegisError(
             f"{int((~finite).sum())} of {actions.numel()} predicted numbers that are not finite",
             "actions of finite numbers",
-            "see whether the positions are in the units of the demonstrations; if they are, take "
+            "check that the positions are in the units of the demonstrations; if they are, use "
             "an earlier checkpoint",
         )
     return actions

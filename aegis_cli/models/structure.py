@@ -403,8 +403,8 @@ def frozen(model: nn.Module, site: str) -> bool:
         still = ", ".join(name for name, does in learns.items() if not does)
         raise AegisError(
             f"{site}, a {type(module).__name__}, of which only the {still} is frozen",
-            "all or nothing",
-            "freeze both or none",
+            "both frozen, or neither",
+            "freeze both or neither",
         )
     return not any(learns.values())
 

@@ -134,7 +134,7 @@ def _train_checks(train: Train) -> Iterator[Problem]:
     if train.relative_exclude is not None and not train.relative_actions:
         found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
         fix = "set it, or delete train.relative_exclude"
-        yield Problem(found, "it with train.relative_actions: true", fix)
+        yield Problem(found, "train.relative_actions: true beside it", fix)
     yield from _augment_checks(train)
 
 
@@ -155,7 +155,7 @@ def _extension_checks(recipe: Recipe) -> Iterator[Problem]:
         yield Problem(found, "rising numbers below train.steps", fix)
     if earlier and recipe.train.backbone_until < 1:  # a share of which plan's steps?
         found = f"train.extended_from with train.backbone_until: {recipe.train.backbone_until:g}"
-        yield Problem(found, "one of them", "delete train.extended_from")
+        yield Problem(found, "one of the two", "delete train.extended_from")
 
 
 def _source_checks(recipe: Recipe) -> Iterator[Problem]:
@@ -231,9 +231,9 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     for name in sorted(changed(recipe.rollout).keys() - read):
         found = f"rollout.{name}: {getattr(recipe.rollout, name)} with task {recipe.tasks[0]}"
         expected = (
-            "rollout.frames and rollout.replan alone: no simulator plays this task"
+            "only rollout.frames and rollout.replan: no simulator has this task"
             if own
-            else "no such key: a simulated task is played, and no recorded frame looked at"
+            else "no such key: a simulated task is rolled out, without recorded frames"
         )
         yield Problem(found, expected, f"delete rollout.{name}")
 
@@ -243,13 +243,13 @@ def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:
     if isinstance(demos.paths, tuple) and len(demos.paths) != tasks:
         yield Problem(
             f"demos.paths: {len(demos.paths)} with {tasks} tasks",
-            "one a task, in their order, or a text: a single one for all",
-            "correct demos.paths, or delete it and let them be recorded",
+            "one per task, in their order, or a text: a single one for all",
+            "correct demos.paths, or delete it to have them recorded",
         )
     if demos.only is not None and len(demos.only) != tasks:
         yield Problem(
             f"demos.only: {len(demos.only)} with {tasks} tasks",
-            "one a task, in their order",
+            "one per task, in their order",
             "correct demos.only, or delete it",
         )
     for name in ("only", "rename"):

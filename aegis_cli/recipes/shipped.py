@@ -60,7 +60,7 @@ def folder() -> Path:
             return place
     raise AegisError(
         f"no recipes in {_CHECKOUT} or {_INSTALLED}",
-        "those that come with Aegis",
+        "the recipes that come with Aegis",
         "install Aegis again, or give the path of a recipe file",
     )
 

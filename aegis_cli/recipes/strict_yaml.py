@@ -244,7 +244,7 @@ def _why(error: Exception) -> str:
         return "values nested too deeply"
     if isinstance(error, ValueError) and str(error):
         return str(error).splitlines()[0]
-    return "a value that is none of the kind that its tag says"
+    return "a value that is not of the kind that its tag says"
 
 
 def _size(node: yaml.Node, known: dict[int, int]) -> int:
@@ -288,7 +288,7 @@ def override(raw: dict[Any, Any], setting: str) -> list[Problem]:
         try:
             value, problems = parse(text, f"--set '{setting}'")
         except AegisError as error:
-            fix = f"of a text, put it in quotes: --set {dotted}={_quoted(text)}"
+            fix = f"if it is a text, put it in quotes: --set {dotted}={_quoted(text)}"
             return [Problem(error.found, "a value as in YAML", fix)]
     in_the_way = put(raw, dotted, plain(value))
     if in_the_way:

@@ -275,7 +275,7 @@ def _drawn_problems(raw: Mapping[str, Any]) -> list[Problem]:
     return [
         Problem(
             f"per_seed: demos with {where}",
-            "demonstrations that are recorded, to have others with every seed",
+            "recorded demonstrations, which differ with every seed",
             "take demos out of per_seed: the seeds still hold out other episodes",
         )
         for where in _given_demos(raw)

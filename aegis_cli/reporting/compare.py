@@ -135,12 +135,13 @@ def _warn_of_differences(
     """Warn of settings other than the method in which the runs differ."""
     if made.differs:
         text = f"the runs differ in {differences.said(made.differs)}"
-        on_event(Warned("compare", f"{text}: their figures tell more than their methods"))
+        on_event(Warned("compare", f"{text}: their figures compare more than their methods"))
     if len(made.question_sets) > 1:
-        text = f"VQA is of different questions: {', '.join(made.question_sets)}"
+        text = f"VQA was measured on different questions: {', '.join(made.question_sets)}"
         on_event(Warned("compare", f"{text}; aegis probe --vqa measures each run on one set"))
     if not made.same_open_loop:
-        text = f"open-loop errors are not of the same frames: {_other_frames(made, evaluated)}"
+        on = _other_frames(made, evaluated)
+        text = f"open-loop errors were measured on different frames: {on}"
         on_event(Warned("compare", f"{text}; aegis evaluate --episodes measures each on the same"))
 
 
@@ -183,7 +184,7 @@ def _warn_of_unfinished(found: Sequence[tuple[Path, InspectReport]], on_event: O
 def _what_goes_on(path: Path, report: InspectReport) -> str:
     """How to finish an unfinished run; "" if its training state is gone."""
     if "merge" in report.facts:
-        return " (merged before its training had ended: what that ends in can be merged again)"
+        return " (merged before its training had ended: the finished run can be merged again)"
     state = path / "checkpoints" / checkpoint.LAST / checkpoint.STATE
     return f" ({commands.aegis('train', path)} goes on)" if state.is_file() else ""
 
@@ -282,7 +283,7 @@ def _runs(path: Path, on_event: OnEvent) -> list[Path]:
     if not path.exists():
         raise AegisError(f"nothing is at '{path}'", expected, "check the path")
     raise AegisError(
-        f"'{path}' is no run of a policy",
+        f"'{path}' is not the run of a policy",
         expected,
         "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
         "--baseline MODEL",
@@ -300,11 +301,11 @@ def _runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
         try:
             runs += [saved.parent] * recipes.is_policy_run(saved.parent)
         except AegisError as error:  # a recipe that cannot be read
-            on_event(Warned("compare", f"left out is '{saved.parent}': {error.found}"))
+            on_event(Warned("compare", f"left out '{saved.parent}': {error.found}"))
     begun = [run for run in runs if not (run / "ledger.safetensors").is_file()]
     if begun:
         listed = ", ".join(str(run) for run in begun)
-        on_event(Warned("compare", f"left out, for they have no checkpoint yet: {listed}"))
+        on_event(Warned("compare", f"left out, because they have no checkpoint yet: {listed}"))
     return [run for run in runs if run not in begun]
 
 

@@ -176,7 +176,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         if not path.exists():
             raise AegisError(f"nothing is at '{path}'", expected, "check the path")
         fix = commands.aegis("report", example)
-        raise AegisError(f"'{path}' is no run, job or study", expected, fix)
+        raise AegisError(f"'{path}' is not a run, job or study", expected, fix)
     return run_document(path, videos=True)
 
 

@@ -127,7 +127,7 @@ class Reader:
 
     def _finite(self, what: str, found: np.ndarray) -> np.ndarray:
         if found.dtype.kind not in "biuf":
-            raise self._wrong(f"{what} of type {found.dtype}, which is no number's")
+            raise self._wrong(f"{what} of type {found.dtype}, which is not a number type")
         # For NaN a policy would return actions that are NaN.
         is_finite = np.isfinite(found)
         if not is_finite.all():
@@ -143,7 +143,7 @@ class Reader:
         try:
             return np.asarray(value)
         except ValueError as error:  # lists of several lengths
-            raise self._wrong(f"'{key}' is no array: {error}") from error
+            raise self._wrong(f"'{key}' is not an array: {error}") from error
 
     def _wrong(self, found: str) -> AegisError:
         """The error for a message that is no observation, with the expected form."""

@@ -58,7 +58,7 @@ class RealTime:
             raise AegisError(
                 f"a policy with the temporal ensemble {policy.ensemble:g}",
                 "one that executes several actions of each chunk",
-                "let its own select_action predict at every step, or train without it",
+                "use its own select_action, which predicts at every step, or train without it",
             )
         if execute is None:
             execute = max(1, min(policy.replan, policy.chunk // 2))
@@ -66,7 +66,7 @@ class RealTime:
             fix = f"RealTime(policy, execute={policy.chunk // 2})"
             raise AegisError(
                 f"{execute} of the {policy.chunk} actions of a chunk to execute",
-                "at least one, and fewer than a chunk has: with the others the robot goes on while "
+                "at least one, and fewer than a chunk has: the robot goes on with the others while "
                 "the next chunk is predicted",
                 fix if policy.chunk > 1 else "train with a longer train.chunk",
             )

@@ -115,7 +115,7 @@ async def listen(
         raise AegisError(
             f"cannot listen at {host}:{port}: {getattr(error, 'strerror', None) or error}",
             "an address of this machine with a free port",
-            "another --port; --port 0 takes a free one",
+            "choose another --port; --port 0 takes a free one",
         ) from error
     async with server:
         on_ready(_where(server, answering.reader))

@@ -120,7 +120,7 @@ def check_recordable(name: str) -> None:
     if of_datasets(name) is not None:
         raise AegisError(
             f"task '{name}' to be recorded",
-            "a task with an expert: LIBERO's demonstrations are people's",
+            "a task with an expert: LIBERO's demonstrations were recorded by people",
             "take a LeRobot dataset of them, such as HuggingFaceVLA/libero: aegis train --demos, "
             "demos.path in the recipe, or demos.paths of a stream",
         )

@@ -80,13 +80,13 @@ try:
 except ImportError as error:
     raise AegisError(
         f"LIBERO cannot be imported ({error})",
-        "LIBERO, as Hugging Face keeps it (hf-libero), for a task of its",
+        "LIBERO in Hugging Face's package (hf-libero), which its tasks need",
         "pip install 'aegis-vla[libero]'",
     ) from error
 except OSError as error:
     raise AegisError(
         f"LIBERO cannot be imported ({error})",
-        "a folder that it can keep its configuration in, by itself ~/.libero",
+        "a folder for its configuration, by default ~/.libero",
         "export LIBERO_CONFIG_PATH=FOLDER",
     ) from error
 
@@ -192,7 +192,7 @@ class LiberoTask:
         """
         raise AegisError(
             f"'{self.spec.name}' to be demonstrated",
-            "a task with an expert: LIBERO's demonstrations are people's",
+            "a task with an expert: LIBERO's demonstrations were recorded by people",
             "train on a LeRobot dataset of them",
         )
 
@@ -308,7 +308,7 @@ def _file(suite: str, number: int, kind: str, name: str) -> Path:
         raise AegisError(
             f"no file '{path}'",
             f"LIBERO's files where {folder}/config.yaml says that they are",
-            "delete that file: LIBERO writes it anew when it is next imported",
+            "delete that file: LIBERO writes it again when it is next imported",
         )
     return path
 

@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise AegisError(
         f"no package '{error.name}'",
-        "MetaWorld, for a task of its",
+        "MetaWorld, which its tasks need",
         "pip install 'aegis-vla[metaworld]'",
     ) from error
 

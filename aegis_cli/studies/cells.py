@@ -29,7 +29,7 @@ from aegis_cli.studies.tuning import Point, Rule
 CELLS = "cells.json"
 CLEARING = "clearing.json"  # names the measured cell whose run is just being removed
 _LISTEN_S = 0.2  # seconds between polls for the processes' events
-_FIX = "free some memory or use fewer --workers, then run the same command again: it goes on"
+_FIX = "free some memory or use fewer --workers, then run the same command again: it resumes"
 CellRecipe = Recipe | StreamRecipe | RobotStreamRecipe
 R = TypeVar("R", bound=CellRecipe)  # of all cells of one study
 Entry = TypeVar("Entry")
@@ -274,7 +274,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise AegisError(
             f"'{path}' holds no cells",
             "a mapping of digests to figures",
-            "delete it, or bring the file of a study",
+            "delete it, or bring back a study's own file",
         )
     return cells
 

@@ -162,7 +162,7 @@ def verdict(rows: Sequence[PolicyFigures]) -> str:
         return -math.inf if acts is None else acts  # an unmeasured method is never the best
 
     best = max(kept, key=ability)
-    of = ", each of the questions that it lost most of" if naive.others else ""
+    of = ", each on the question set where it lost most" if naive.others else ""
     return (
         f"{best.method} lost {max(_drops(best)):.1f} points of VQA where naive lost "
         f"{max(_drops(naive)):.1f}{of}, at {_at_what(best, naive)} (one seed)."
@@ -176,9 +176,9 @@ def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
     if all(asked.baseline_accuracy <= asked.majority_accuracy for asked in sets):
         before, common = 100 * naive.baseline_accuracy, 100 * naive.majority_accuracy
         return (
-            f"The VLM answered {before:.1f} % of the questions before training, where always the "
-            f"commonest answer has {common:.1f} %: these questions cannot show what was lost. See "
-            "anchor.ask and probe.ask."
+            f"The VLM answered {before:.1f} % of the questions correctly before training, where "
+            f"always the commonest answer has {common:.1f} %: these questions cannot show what was "
+            "lost. See anchor.ask and probe.ask."
         )
     lost = f"{max(_drops(naive)):.1f} points of VQA"
     if max(_drops(naive)) < _LEAST_DROP:
@@ -189,7 +189,7 @@ def _why_no_loss_is_told(naive: PolicyFigures) -> str | None:
     if low <= 0:
         return (
             f"naive lost {lost}, or none: its 95 % interval is {low:.1f} to {high:.1f}. So few "
-            "questions do not tell who kept VQA; raise probe.questions."
+            "questions cannot show which method kept VQA; raise probe.questions."
         )
     return None
 

@@ -144,8 +144,8 @@ class PolicyStudy:
             self._has_warned = True
             text = (
                 f"policies of {mixture.said(mixture.at(_path(others[0])))} cannot be rolled out "
-                f"here, so that tasks: [{', '.join(tasks)}] is but a name: without 'tasks' and "
-                "tuning.task, tables and folders have the demonstrations' name"
+                f"here, so tasks: [{', '.join(tasks)}] is only a name: without 'tasks' and "
+                "tuning.task, tables and folders are named after the demonstrations"
             )
             if set(tasks) == {Recipe.task}:  # the default, so cells without a task have equal keys
                 text += ", and what is finished stays finished"
@@ -312,7 +312,7 @@ def _no_episode_to_tune_on(recipe: Recipe, data: Path, judging: Sequence[int]) -
     return AegisError(
         f"no episode of '{data}' that tuning.seed {recipe.seed} holds out and none of the seeds "
         f"{', '.join(map(str, judging))} does",
-        "some to choose values by, on which no policy is judged",
+        "held-out episodes to choose values by, on which no policy is judged",
         fix,
     )
 
@@ -694,8 +694,8 @@ class PolicyRunner:
         # After `--overwrite` there is no record any more, and no warning is needed.
         if begun and begun != digest(key) and (out / "recipe.yaml").exists():
             changed = ", ".join(self.records.changed(begun_record, key))
-            other = f"another {changed}" if changed else "other settings or inputs"
-            on_event(Warned("train", f"'{out}' was trained with {other}: it is trained anew"))
+            other = f"a different {changed}" if changed else "other settings or inputs"
+            on_event(Warned("train", f"'{out}' was trained with {other}: training it again"))
         moved = run_folder.clear(out, ours=begun is not None)
         if moved is not None:
             on_event(Progress(f"train (moved {moved.name} aside)", 1, 1, "stage"))

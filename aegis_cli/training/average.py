@@ -46,7 +46,7 @@ class Average:
             raise AegisError(
                 f"train.ema_decay: {decay:g} with weights in half precision, '{narrow[0]}' first "
                 f"of {len(narrow)}",
-                "weights in float32, as an average moves by less than half precision can hold",
+                "weights in float32: an average moves by less than half precision can hold",
                 f"--set train.weights={BF16_MASTER} or float32; or --set train.ema_decay=null",
             )
         self.weights = {name: p.detach().clone() for name, p in self._parameters.items()}

@@ -279,7 +279,7 @@ def begun(folder: Path) -> bool:
         return True
     if found := whole(folder):
         raise AegisError(
-            f"{len(found)} checkpoints in '{link.parent}', and '{LAST}' leads to none of them",
+            f"{len(found)} checkpoints in '{link.parent}', but '{LAST}' points to none of them",
             f"a link '{LAST}' to the newest",
             f"ln -sfn {found[-1].name} '{link}', or start anew in another --out",
         )
@@ -295,7 +295,7 @@ def kept_state(run: Path) -> Path:
     state = last(run) / STATE
     if not state.is_file():
         raise AegisError(
-            f"no training state in '{run}', as in what aegis merge wrote",
+            f"no training state in '{run}', as in a run that aegis merge wrote",
             "a run that aegis train wrote",
             "continue the run that was merged, or begin another with what this one has learned: "
             f"--set 'backbone={run}' --set 'expert.start={run}'",
@@ -400,7 +400,7 @@ def check_task(meta: PolicyMeta, task: str | None) -> None:
     """Raise AegisError if the requested task is not the policy's own."""
     if task not in (None, meta["task"]):
         said = f"task '{task}' for a policy of '{meta['task'] or 'no simulated task'}'"
-        raise AegisError(said, "its own", "leave out the task")
+        raise AegisError(said, "the policy's own task", "leave out the task")
 
 
 def _executed_now(path: Path, meta: PolicyMeta) -> PolicyMeta:

@@ -458,7 +458,7 @@ def _pass_some(passing: Passing, frames: int) -> tuple[int, int]:
         loss = policy.flow_loss(batch, encoding, settings.flow_samples, generator, passing.detach)
     if not loss.isfinite():
         found = f"a loss of {loss.item():g} before the first step"
-        raise AegisError(found, "a finite one", "look at the demonstrations: aegis inspect")
+        raise AegisError(found, "a finite loss", "look at the demonstrations: aegis inspect")
     return encoding.mask.shape[1], sum(storage.nbytes() for storage in kept.values())
 
 

@@ -92,7 +92,7 @@ def learned(out: Path) -> str:
 def _or_go_on_from(out: Path, recipe: Trained) -> str:
     """How to train a policy further with other settings, such as another learning rate."""
     is_policy = isinstance(recipe, Recipe) and checkpoint.begun(out)
-    return f", there with what this run has learned by {learned(out)}" if is_policy else ""
+    return f", from what this run has learned: {learned(out)}" if is_policy else ""
 
 
 def goes_on(out: Path, recipe: Trained) -> bool:
@@ -219,8 +219,8 @@ def _check_own(out: Path) -> None:
     foreign = next((path for path in sorted(out.rglob("*")) if _is_foreign(path, out)), None)
     if foreign is not None:
         raise AegisError(
-            f"'{foreign}', which Aegis has not written, in a run to be overwritten",
-            "a run without files of somebody else",
+            f"'{foreign}', which Aegis did not write, in a run to be overwritten",
+            "a run with no files but its own",
             f"move it: mv '{foreign}' ELSEWHERE; or choose another --out",
         )
 
@@ -355,10 +355,10 @@ def _figures(path: Path, number: int, line: bytes, needed: Sequence[str]) -> dic
         ):
             raise ValueError(f"no object with {', '.join(needed) or 'keys'}")
         if wrong := [key for key, value in found.items() if not _is_figure(value)]:
-            raise ValueError(f"'{wrong[0]}' is no finite number")
+            raise ValueError(f"'{wrong[0]}' is not a finite number")
     except ValueError as error:
         said = f"{path} is damaged: line {number}: {error}"
-        raise AegisError(said, "one JSON object a line", "delete the damaged line") from error
+        raise AegisError(said, "one JSON object per line", "delete the damaged line") from error
     return found
 
 

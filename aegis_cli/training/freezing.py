@@ -212,7 +212,7 @@ def _unknown(backbone: Backbone, pattern: str, needed: str) -> AegisError:
     elif near := _near(needed, groups, list(below)):
         fix = f"did you mean '{near}'?"
     return AegisError(
-        f"{_KEY}: '{needed}'{of_range}, and no part of the backbone is called so",
+        f"{_KEY}: '{needed}'{of_range}, but no part of the backbone has that name",
         f"a group ({listed}), or the dotted name of a module or parameter in or below {own}",
         fix,
     )

@@ -102,9 +102,9 @@ def of(out: Path) -> Inputs | None:
     relative = _read(said[_RELATIVE]) if kept and _RELATIVE in said else kept
     if kept is None or relative is None or len(relative.demos) != len(kept.demos):
         raise AegisError(
-            f"'{path}' is damaged: no places of demonstrations and an anchor",
-            "what Aegis has written there",
-            "delete it, and say where they lie: aegis train RUN --demos PATH --anchor FILE",
+            f"'{path}' is damaged: no paths of demonstrations and an anchor",
+            "the file as Aegis wrote it",
+            "delete it, and give their paths: aegis train RUN --demos PATH --anchor FILE",
         )
     seen = dict(zip((*kept.demos, kept.anchor), (*relative.demos, relative.anchor), strict=True))
 

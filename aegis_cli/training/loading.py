@@ -160,7 +160,7 @@ def load_demonstrations(
         recorded = sim.of_datasets(recipe.task) is None
         raise AegisError(
             f"demonstrations of '{found.task}' for a recipe of '{recipe.task}'",
-            "one and the same task",
+            "the same task",
             f"--set task={found.task}"
             + (f", or record with: aegis demos {recipe.task}" if recorded else ""),
         )
@@ -213,7 +213,7 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
     if recipe.anchor.source == "demos" and len(mixture.each(paths)) > 1:
         raise AegisError(
             f"anchor.source: demos with demonstrations in {mixture.said(paths)}",
-            "one set, whose frames an anchor is measured on",
+            "one set, to measure the anchor on",
             "measure it on one of them with aegis anchor --demos, and train with aegis train "
             "--anchor; or set anchor.source to questions",
         )
@@ -223,9 +223,9 @@ def check_named(recipe: Recipe, on_event: OnEvent) -> None:
 def _refuse_keys_of_a_path(settings: Demos) -> None:
     """Refuse keys that choose from existing demonstrations if they are still to be recorded."""
     belonging = {
-        "camera": ("a LeRobot folder, to choose of", "set demos.path to it"),
+        "camera": ("a LeRobot folder, to choose from", "set demos.path to it"),
         "rename": ("demonstrations with names of their own", "set demos.path to them"),
-        "only": ("demonstrations, to choose of", "set demos.path to it"),
+        "only": ("demonstrations, to choose from", "set demos.path to it"),
         "weights": ("several sets of demonstrations", "set demos.path to a list of them"),
     }
     for name, (expected, fix) in belonging.items():
@@ -304,10 +304,9 @@ def _warn_of_no_instruction(
     learned = found.episode_of[found.read].unique()
     if bare := len(found.without_instruction):
         text = (
-            f"{bare} of the {len(learned)} episodes to learn from in {mixture.said(paths)} have no "
-            "instruction, but an empty text: a policy learns from them to act without being told "
-            "what to do. Write what they do as the dataset's tasks, or choose others with "
-            "demos.only"
+            f"{bare} of the {len(learned)} episodes to learn from in {mixture.said(paths)} have an "
+            "empty instruction: a policy learns from them to act without being told what to do. "
+            "Write what they do as the dataset's tasks, or choose others with demos.only"
         )
         on_event(Warned("train", text))
 
@@ -345,10 +344,9 @@ def warn_of_outliers(
     if told:
         text = (
             f"a few values far from all others make most of the spread in {mixture.said(paths)}: "
-            f"{', '.join(told)}. Beside them all that the joint does is nearly alike to the "
-            "policy, and its errors look small. If they are faults of the recording, and no motion "
-            "that is rare, leave these episodes out (demos.only), or scale by quantiles "
-            "(train.normalization)"
+            f"{', '.join(told)}. Next to them, all other values look nearly the same to the "
+            "policy, and its errors look small. If they are recording faults and not rare motions, "
+            "leave these episodes out (demos.only), or scale by quantiles (train.normalization)"
         )
         on_event(Warned("train", text))
 
@@ -395,7 +393,7 @@ def _warn_of_other_cameras(
     names = shlex.join(words)
     text = (
         f"the anchor '{path}' was measured on frames of {', '.join(own) or 'no camera by name'}, "
-        f"and the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "
+        f"but the training sees {', '.join(shown) or 'no camera by name'}: measure it with aegis "
         f"anchor --demos {shlex.quote(str(mixture.each(demos)[0]))} {names}".rstrip()
     )
     on_event(Warned("train", text))
@@ -485,7 +483,7 @@ def _warn_of_other_units(
     if known != normalization:
         text = (
             f"the expert of '{start}' was trained with train.normalization: {known}, and this "
-            f"training has {normalization}: what it predicts is on another scale here; --set "
+            f"training has {normalization}: its predictions are on a different scale here; --set "
             f"train.normalization={known}"
         )
         on_event(Warned("train", text))
@@ -493,7 +491,7 @@ def _warn_of_other_units(
     if before is not None and now is not None and before != now:
         text = (
             f"the expert of '{start}' was trained on {before:g} frames a second, and these "
-            f"demonstrations have {now:g}: its actions are meant for steps of another length"
+            f"demonstrations have {now:g}: its actions are meant for steps of a different length"
         )
         on_event(Warned("train", text))
 

@@ -74,7 +74,7 @@ def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
         raise AegisError(
             f"train.steps={settings.steps} for the run in '{out}', which has taken {done} of "
             f"{planned} steps",
-            "a run that has ended, to make longer",
+            "a finished run to extend",
             f"finish it first: the same command with --set train.steps={planned}",
         )
     if (out / folder.JOBS_REPORT).exists():
@@ -85,10 +85,10 @@ def _check_ended(out: Path, recipe: Recipe, on_event: OnEvent) -> None:
         )
     if settings.backbone_until < 1:
         raise AegisError(
-            f"train.steps={settings.steps} for '{out}', whose backbone stands still by now "
+            f"train.steps={settings.steps} for '{out}', whose backbone is frozen by now "
             f"(train.backbone_until: {settings.backbone_until:g})",
-            "a run whose backbone moves to its end",
-            "begin another run with it: --set backbone=… --set expert.start=…",
+            "a run whose backbone learns to its end",
+            "begin another run from it: --set backbone=… --set expert.start=…",
         )
     share = rate_factor(planned, settings)  # at the first step of the new plan
     rises = share > rate_factor(planned - 1, settings)  # a constant schedule's do not

@@ -63,7 +63,7 @@ def check(recipe: Recipe, method: Method, ranks: Ranks) -> None:
     if ranks.several and options.get("fraction", 1) < 1:
         raise AegisError(
             f"aegis.fraction: {options['fraction']:g} in {ranks.count} processes",
-            "the anchor gradient of the whole batch, of which each has its share",
+            "the anchor gradient of the whole batch, of which each process has its share",
             "--set aegis.fraction=1, and aegis.refresh for a cheaper step; or one process",
         )
 
@@ -78,7 +78,7 @@ def _check_sharding(settings: Train, method: Method) -> None:
     if not method.shards:
         raise AegisError(
             f"train.parallel: fsdp with method '{method.name}'",
-            "a method that works where a process has some rows of each weight",
+            "a method that works with weights sharded by rows",
             fix,
         )
     if settings.compile:

@@ -238,8 +238,8 @@ def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
     if begun not in (None, now):
         text = (
             f"'{run.out}' began with matrix products in {begun} ({machine.NAME}), and goes on in "
-            f"{now}, which train.precision: {run.recipe.train.precision} is on this machine: its "
-            "weights will be those of neither"
+            f"{now}, which is what train.precision: {run.recipe.train.precision} means on this "
+            "machine: its weights will match neither"
         )
         on_event(Warned("train", text))
 
@@ -680,8 +680,8 @@ def warn_of_written(backbone: Backbone, before: WrittenBuffers, on_event: OnEven
     more = f" and of {len(written) - 1} more modules" if written[1:] else ""
     text = (
         f"passes in training mode change buffers of '{written[0]}'{more}, as BatchNorm averages "
-        "what it reads: answers change with them, and no method holds them; train.freeze, of the "
-        "modules or of what they lie in, keeps batch normalisations as they are"
+        "what it reads: answers change with them, and no method protects them; train.freeze, of "
+        "the modules or of what they lie in, keeps batch normalisations as they are"
     )
     on_event(Warned("train", text))
 

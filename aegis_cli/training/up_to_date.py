@@ -44,11 +44,11 @@ def refuse_unfinished(folder: Path, command: str) -> None:
     if not (folder / SHARED).is_file():
         return
     runs = sorted(path.parent for path in folder.glob("*/recipe.yaml"))
-    fix = "call the same aegis run again, which goes on"
+    fix = "run the same aegis run again, which resumes the job"
     if runs:
         fix += f"; meanwhile one of its runs: {commands.aegis(command, *runs[:1])}"
     raise AegisError(
-        f"'{folder}' is what aegis run has not finished: no table of all methods is there yet",
+        f"the job in '{folder}' is not finished: it has no table of all methods yet",
         "a finished job, or a run",
         fix,
     )

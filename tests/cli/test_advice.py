@@ -80,14 +80,14 @@ def test_a_training_is_warned_of_its_anchor(
 
 
 def test_a_rate_that_never_falls_is_warned_of(said: Said) -> None:
-    for steps, warmup, warned in ((4, 3, ""), (4, 4, "end at 100 %"), (4, 100, "end at 4 %")):
+    for steps, warmup, warned in ((4, 3, ""), (4, 4, "rates at 100 %"), (4, 100, "rates at 4 %")):
         advice.of_settings(recipe("embedded", steps=steps, warmup=warmup))
         text = said()
         assert warned in text and text.count("warning: train.warmup") == bool(warned)
 
 
 def test_a_constant_rate_is_warned_of_where_it_is_never_reached(said: Said) -> None:
-    for warmup, warned in ((4, ""), (8, "end at 50 % of their peaks, where the rise ends. Set")):
+    for warmup, warned in ((4, ""), (8, "with the learning rates at 50 % of their peaks. Set")):
         advice.of_settings(recipe("embedded", steps=4, warmup=warmup, schedule="constant"))
         text = said()
         assert warned in text and text.count("warning: train.warmup") == bool(warned)

@@ -227,7 +227,7 @@ def test_an_image_of_too_many_pixels(
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"question": "What color is the cube?"}, ("'cube?'", "write 'cube'")),
+        ({"question": "What color is the cube?"}, ("'cube?'", "did you mean 'cube'?")),
         ({"question": "what breed is the dog"}, ("'breed'",)),
         ({"answers": ["mauve"]}, ("'mauve'",)),
         ({"question": "is there a " + "red " * 17}, ("tokens", "at most 20", "fewer words")),

@@ -327,7 +327,7 @@ def test_a_course_has_a_panel_for_each_figure_that_was_logged() -> None:
 
 
 def test_a_training_that_has_logged_nothing_has_no_course(tmp_path: Path) -> None:
-    with pytest.raises(AegisError, match="no figure in the metrics of naive in x"):
+    with pytest.raises(AegisError, match="no metrics logged yet by naive in x"):
         render.curves_plot([], ["scenes"], "naive in x", tmp_path / "x.png")
     assert [*tmp_path.iterdir()] == []
 

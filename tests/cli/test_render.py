@@ -599,7 +599,7 @@ def test_no_rollout_is_advised_of_a_robot_that_is_not_simulated(
 
 def test_a_run_that_has_gone_on_says_which_steps_were_measured() -> None:
     shown = text_of(render.inspect(InspectReport("run", "x", {"measured_before": [200, 220]})))
-    assert "what is measured is of steps 200, 220, and not of the last checkpoint" in shown
+    assert "measured at steps 200, 220, not at the last checkpoint" in shown
     assert "nothing is measured" not in shown and "measured before" not in shown
 
 
@@ -629,8 +629,8 @@ def test_layers_of_which_nothing_learned_are_named_as_train_freeze_takes_them() 
     frozen = tuple(f"layers.{i}" for i in (0, 1, 2, 4, 10, 11))
     told = {"layers": (rows,), "over_time": (Bin(1, 2, 0.1, (0.1,)),)}
     shown = text_of(render.inspect(InspectReport("ledger", "x", {}, frozen=frozen, **told)))
-    assert "nothing has learned of layers.0-2, layers.4, layers.10-11\n" in shown
-    assert "nothing has learned" not in text_of(
+    assert "nothing learned in layers.0-2, layers.4, layers.10-11\n" in shown
+    assert "nothing learned" not in text_of(
         render.inspect(InspectReport("ledger", "x", {}, **told))
     )
 

@@ -156,7 +156,7 @@ def test_the_table_of_a_job_has_the_open_loop_error_of_what_cannot_be_rolled_out
     assert shown["/table/rows/1/open_loop_error"] == "0.375"
     assert shown["/table/rows/0/hold_error"] == "0.250"
     assert "/table/rows/0/success_seen" not in shown
-    assert "Open-loop error" in page.said and "is no success" in page.said
+    assert "Open-loop error" in page.said and "is not a success rate" in page.said
     assert "open-loop error on held-out episodes" in page.said  # below the chart of all methods
     assert f"{table['rows'][0]['method']} has the least open-loop error: 0.125." in page.said
 
@@ -255,11 +255,11 @@ def test_an_anchor_that_no_training_read_is_what_the_drift_is_measured_against(
     naive, read = job / "naive", job / "aegis"
     page, document = reported(aegis, naive)
     assert document["anchor"] == {"measured_on": "a file given to aegis probe", "read": False}
-    assert "the drift is measured against it, no training read it" in page.said
+    assert "it measures the drift, and no training used it" in page.said
     train, asked, *_ = document["commands"]
     assert "--anchor" not in train and "--anchor" in asked
     page, document = reported(aegis, read)
-    assert document["anchor"]["read"] is True and "no training read it" not in page.said
+    assert document["anchor"]["read"] is True and "no training used it" not in page.said
     assert "--anchor" in document["commands"][0]
     files.save_json(naive / "train.json", {"method": "naive"})
     _, document = reported(aegis, naive)
@@ -367,7 +367,7 @@ def test_a_path_with_nothing_at_it_is_told_as_such(aegis, command: str, tmp_path
 def test_a_folder_with_nothing_to_report_is_refused(aegis, job: Path) -> None:
     said = refused(aegis("report", job.parent))
     assert f"aegis report {job}" in said
-    assert "no run, job or study" in said
+    assert "not a run, job or study" in said
 
 
 def test_a_job_that_is_not_finished_says_so(aegis, job: Path) -> None:
@@ -375,7 +375,7 @@ def test_a_job_that_is_not_finished_says_so(aegis, job: Path) -> None:
     (job / "stages.json").write_text("{}")
     for command in ("report", "compare", "inspect"):
         said = refused(aegis(command, job))
-        assert "has not finished" in said and "call the same aegis run again" in said
+        assert "is not finished" in said and "run the same aegis run again" in said
         assert f"aegis {command} {job / 'aegis'}" in said
 
 
@@ -383,7 +383,7 @@ def test_a_study_is_not_compared_as_a_job_that_is_not_finished(aegis, tmp_path: 
     for name in ("stages.json", "cells.json"):
         (tmp_path / name).write_text("{}")
     said = refused(aegis("compare", tmp_path))
-    assert "has not finished" not in said and "aegis inspect shows studies" in said
+    assert "is not finished" not in said and "aegis inspect shows studies" in said
 
 
 @pytest.mark.parametrize(
@@ -523,8 +523,8 @@ def test_page_and_table_say_what_of_the_bar_was_not_measured(aegis, tmp_path: Pa
     (name,) = (check.name for check in barred.checks if check.value is None)
     said = f"no variant passes the bar, for there is no figure of {name}."
     assert said in reported(aegis, tmp_path)[0].said
-    assert f"on reach nobody can pass the bar: no figure of {name}" in " ".join(_notes(study))
-    assert "nobody can pass" not in " ".join(_notes(found(("naive", "x"), 5)))
+    assert f"on reach no variant can pass the bar: no figure of {name}" in " ".join(_notes(study))
+    assert "no variant can pass" not in " ".join(_notes(found(("naive", "x"), 5)))
 
 
 def test_a_study_of_what_is_not_rolled_out_has_its_frontier_and_its_bar(
@@ -541,7 +541,7 @@ def test_a_study_of_what_is_not_rolled_out_has_its_frontier_and_its_bar(
     files.save_json(tmp_path / "table.json", study.to_json())
     page, document = reported(aegis, tmp_path)
     check_figures(page, document)
-    assert "open-loop error on held-out episodes" in page.said and "no success" in page.said
+    assert "open-loop error on held-out episodes" in page.said and "not a success rate" in page.said
     place = "/tasks/0/results/1/bar/checks/1/interval/1"
     # 0.02, failed by a limit of 0.02, would contradict itself.
     assert [text for path, _, text in page.figures if path.endswith(place)] == ["0.0204"]

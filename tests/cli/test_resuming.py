@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -194,7 +195,7 @@ def test_of_several_sets_the_one_that_has_moved_is_asked_for_beside_the_others(
     bad("train", "cut", says=says)
     says = "1 of --demos for the run in 'cut', which began with 2", "name all of them"
     bad("train", "cut", "--demos", moved, says=says)
-    says = "the sets of demonstrations in another order than the run in 'cut'"
+    says = "the sets of demonstrations in a different order than the run in 'cut'"
     bad("train", "cut", "--demos", moved, "--demos", demos, says=(says,))
     code, _, err = aegis("train", "cut", "--demos", demos, "--demos", moved)
     assert code == 0 and steps_of(run) == 3, err
@@ -210,7 +211,7 @@ def test_another_one_of_several_sets_is_refused_by_its_place(
         assert aegis(*made)[0] == 0
     cut(place, "naive", sets=("demos.safetensors", "new.safetensors"))
     given = "--demos", "demos.safetensors", "--demos", "other.safetensors"
-    bad("train", "cut", *given, says=("another set 2 of the demonstrations than the run",))
+    bad("train", "cut", *given, says=("a different set 2 of the demonstrations than the run",))
 
 
 def test_a_run_goes_on_with_its_backbone_at_another_place(
@@ -218,7 +219,7 @@ def test_a_run_goes_on_with_its_backbone_at_another_place(
 ) -> None:
     run = cut(place, "naive")
     make_tiny(seed=1).save(place / "other")
-    says = "another backbone than the run in 'cut' began with"
+    says = "a different backbone than the run in 'cut' began with"
     bad("train", "cut", "--set", "backbone=other", says=(says,))
     moved = "--set", "backbone=model.safetensors"
     code, _, err = aegis("train", "cut", *moved)
@@ -243,7 +244,9 @@ def test_a_command_that_a_message_names_is_one_for_a_shell(place: Path, bad: Bad
     cut(place).rename(place / "my run")
     again = training(out="my run")
     bad(*again, says=("continue it: aegis train 'my run', or",))
-    bad("train", "my run", "--out", "new", says=("aegis train 'my run/recipe.yaml' --out new",))
+    given = f"--demos {place}/demos.safetensors --anchor {place}/anchor.safetensors"
+    anew = f"aegis train 'my run/recipe.yaml' {given} --out new"
+    bad("train", "my run", "--out", "new", says=(anew,))
     says = "go on with its own: aegis train 'my run'; compare"
     learned = "--set 'backbone=my run' --set 'expert.start=my run'"
     bad("train", "my run", "--set", "seed=7", says=(says, learned))
@@ -253,7 +256,7 @@ def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -
     run = cut(place)
     code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
     assert code == 0, err
-    says = "another demos than the run", "the run began with"
+    says = "a different demos than the run", "the run began with"
     bad("train", run, "--demos", "new.safetensors", says=says)
 
 
@@ -262,9 +265,9 @@ def test_a_run_of_an_earlier_version_asks_for_what_it_does_not_know(
 ) -> None:
     run = cut(place)
     (run / inputs.NAME).unlink()
-    bad("train", "cut", says=("no place of its demonstrations", "aegis train cut --demos PATH"))
+    bad("train", "cut", says=("does not record its demonstrations", "aegis train cut --demos PATH"))
     at = "--demos", "demos.safetensors"
-    bad("train", "cut", *at, says=("no place of its anchor", "aegis train cut --anchor FILE"))
+    bad("train", "cut", *at, says=("does not record its anchor", "aegis train cut --anchor FILE"))
     code, _, err = aegis("train", "cut", *at, "--anchor", "anchor.safetensors")
     assert code == 0 and steps_of(run) == 3 and inputs.of(run) is not None, err
 
@@ -326,12 +329,15 @@ def test_a_dry_run_of_the_rest_writes_nothing(place: Path, aegis: Aegis) -> None
 # --- refused --------------------------------------------------------------------------------------
 
 
-def test_a_recipe_needs_a_folder_and_a_run_has_its_own(place: Path, bad: Bad) -> None:
+def test_a_recipe_needs_a_folder_and_a_run_has_its_own(place: Path, bad: Bad, aegis: Aegis) -> None:
     cut(place)
     says = "no --out", "aegis train small.yaml --out runs/NAME"
     bad("train", "small.yaml", "--demos", "demos.safetensors", says=says)
-    says = "--out new with the run 'cut'", "aegis train cut/recipe.yaml --out new"
-    bad("train", "cut", "--out", "new", says=says)
+    given = f"--demos {place}/demos.safetensors --anchor {place}/anchor.safetensors"
+    anew = f"aegis train cut/recipe.yaml {given} --out new"
+    bad("train", "cut", "--out", "new", says=("--out new with the run 'cut'", anew))
+    code, _, err = aegis(*shlex.split(anew)[1:], "--dry-run")
+    assert code == 0, err
 
 
 def test_a_run_that_is_not_there_is_missed_before_its_out(place: Path, bad: Bad) -> None:

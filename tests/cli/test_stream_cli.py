@@ -175,7 +175,7 @@ def test_runs_that_are_not_what_was_asked_for(
     bad("inspect", "run", "--plot", "x.txt", says=(".png",))
     bad("inspect", "run", "--plot", "nowhere/x.png", says=("nowhere",))
     kept = (place / "run" / "stream.json").read_text()
-    for damage, says in (("{", "not JSON"), ("{}", "damaged"), (None, "not learned to its end")):
+    for damage, says in (("{", "not JSON"), ("{}", "damaged"), (None, "is not finished")):
         (place / "run" / "stream.json").unlink()
         if damage is not None:
             (place / "run" / "stream.json").write_text(damage)

@@ -265,4 +265,4 @@ def test_a_set_that_a_shell_would_split_is_quoted(
     monkeypatch.setattr(results, "recipe_of", lambda run: of_run)
     assert question_sets.chosen(str(tmp_path), None, None, False, None).vqa == "one.jsonl"
     said = " ".join(capsys.readouterr().err.split())
-    assert "asked are the questions of 'one.jsonl'" in said and "--vqa 'my set.jsonl'" in said
+    assert "asking the questions of 'one.jsonl'" in said and "--vqa 'my set.jsonl'" in said

@@ -119,7 +119,7 @@ def test_a_weight_of_another_size_is_found_by_its_digest(tmp_path: Path) -> None
     data[-1] ^= 0x40
     path.write_bytes(data)
     assert safetensors.torch.load_file(path)["w"][-1] > 1e36
-    with pytest.raises(AegisError, match="its content is not that of its digest"):
+    with pytest.raises(AegisError, match="its content does not match its digest"):
         artifacts.load(path)
 
 

@@ -173,7 +173,11 @@ def test_a_stage_that_saves_first_says_so() -> None:
     with pytest.raises(KeyboardInterrupt), saved_first("train", said.append):
         send(signal.SIGINT)
     (event,) = said
-    assert isinstance(event, Warned) and event.stage == "train" and "saved first" in event.text
+    assert (
+        isinstance(event, Warned)
+        and event.stage == "train"
+        and "the current step first" in event.text
+    )
 
 
 def test_somebody_elses_listener_for_signals_is_kept() -> None:

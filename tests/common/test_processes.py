@@ -45,7 +45,7 @@ def test_a_process_that_dies_is_one_error() -> None:
     with (
         pytest.raises(
             AegisError,
-            match="a counting process died.*\n.*2 processes that live.*\nfix: add memory",
+            match="a counting process died.*\n.*2 running processes.*\nfix: add memory",
         ),
         mapped(os._exit, [1] * 10, 2, "a counting process", "add memory") as results,
     ):

@@ -188,9 +188,9 @@ def test_other_demonstrations_neither_continue_nor_probe_a_run(real: Make, tmp_p
     train.run(recipe, tmp_path / "run")
     shutil.rmtree(own[1])
     robot(own[1], "open-drawer", scale=2.0)
-    with pytest.raises(AegisError, match="another demos of open-drawer"):
+    with pytest.raises(AegisError, match="a different demos of open-drawer"):
         train.run(recipe, tmp_path / "cut", resume=True)
-    with pytest.raises(AegisError, match="other demos of open-drawer than the run"):
+    with pytest.raises(AegisError, match="different demos of open-drawer than the run"):
         probe.run(tmp_path / "run")
     shutil.rmtree(own[1])
     with pytest.raises(AegisError, match="open-drawer"):
@@ -298,9 +298,13 @@ def test_train_inspect_probe_and_report(
         (("--set", "tasks=[reach, point]"), ("rollout.frames: 9 with task reach", "delete")),
         (
             ("--set", "rollout.episodes=3"),
-            ("rollout.episodes: 3 with task pick", "no simulator plays", "delete rollout.episodes"),
+            (
+                "rollout.episodes: 3 with task pick",
+                "no simulator has this task",
+                "delete rollout.episodes",
+            ),
         ),
-        (("--set", "rollout.split=validation"), ("rollout.split", "no simulator plays")),
+        (("--set", "rollout.split=validation"), ("rollout.split", "no simulator has this task")),
         (
             ("--set", "demos.paths=picked"),
             ("'picked' for 'pick' and other tasks", "demos.only, such as [0-49, 50-99]"),

@@ -247,7 +247,7 @@ def test_no_experts_stand_beside_what_is_frozen(method: str, make: Make, tmp_pat
         ("isolated-lora", "layers.1", "which trains none of it anyway"),
         ("igsp", "layers.0", "nothing of the backbone is left to learn"),
         ("sequential", "*", "nothing of the backbone is left to learn"),
-        ("sequential", "vision", "'vision', and no part of the backbone is called so"),
+        ("sequential", "vision", "'vision', but no part of the backbone has that name"),
     ],
 )
 def test_to_freeze_what_would_not_learn_or_everything_is_refused_before_anything_is_recorded(
@@ -442,9 +442,9 @@ def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
     assert probe.run(tmp_path / "done").largest_difference == 0
     before = contents(tmp_path / "done")
     write_jsonl(tmp_path / "asked", 41)
-    with pytest.raises(AegisError, match="other questions than the run"):
+    with pytest.raises(AegisError, match="different questions than the run"):
         probe.run(tmp_path / "done")
-    with pytest.raises(AegisError, match="another vqa/set.jsonl than the run"):
+    with pytest.raises(AegisError, match="a different vqa/set.jsonl than the run"):
         train.run(asking, tmp_path / "cut", resume=True)
     assert contents(tmp_path / "done") == before
 
@@ -462,9 +462,9 @@ def test_a_question_file_that_is_gone_is_named(make: Make, tmp_path: Path) -> No
         train.run(asking, tmp_path / "cut", on_event=partial(stop, "stream", 1))
     (asked / "train-00001-of-00002.parquet").unlink()
     gone = "vqa/train-00001-of-00002.parquet"
-    with pytest.raises(AegisError, match=f"other questions than the run .*: {gone}"):
+    with pytest.raises(AegisError, match=f"different questions than the run .*: {gone}"):
         probe.run(tmp_path / "done")
-    with pytest.raises(AegisError, match=f"another {gone} than the run"):
+    with pytest.raises(AegisError, match=f"a different {gone} than the run"):
         train.run(asking, tmp_path / "cut", resume=True)
 
 
@@ -603,7 +603,7 @@ def assert_learned_and_tried(cut: Path, whole: Path) -> None:
     for name, count in (("tasks", 1), ("success", 1), ("vqa", 2)):
         assert so_far[name] == all_of_it[name][:count] and len(all_of_it[name]) == count + 1
     assert so_far["scores"]["last"] == all_of_it["success"][0][0]
-    with pytest.raises(AegisError, match="not learned to its end"):
+    with pytest.raises(AegisError, match="is not finished"):
         inspection.run(cut)
 
 
@@ -636,7 +636,7 @@ def test_a_state_of_another_recipe_is_refused(make: Make, tmp_path: Path) -> Non
     with pytest.raises(KeyboardInterrupt):
         train.run(make("igsp"), out, on_event=partial(stop, ONE, 3))
     began_with(out, sha256_value(recipes.training_part(make("igsp", lr=2e-2))))
-    with pytest.raises(AegisError, match="another recipe than the run"):
+    with pytest.raises(AegisError, match="a different recipe than the run"):
         train.run(make("igsp"), out, resume=True)
 
 
@@ -662,7 +662,7 @@ def test_other_demonstrations_do_not_continue_a_run(make: Make, tmp_path: Path) 
     demos.run("reach", 5, 1, tmp_path / "other.safetensors", workers=1)
     point = make().demos.paths[1]
     other = make(demos=RobotDemos(paths=(str(tmp_path / "other.safetensors"), point)))
-    with pytest.raises(AegisError, match="another demos of reach"):
+    with pytest.raises(AegisError, match="a different demos of reach"):
         train.run(other, tmp_path / "run", resume=True)
 
 
@@ -671,7 +671,7 @@ def test_other_demonstrations_are_not_those_of_a_finished_run(make: Make, tmp_pa
     train.run(recorded, tmp_path / "run")
     before = contents(tmp_path / "run")
     other = dataclasses.replace(recorded, demos=RobotDemos(episodes=4))
-    with pytest.raises(AegisError, match="(?s)other demonstrations than.*episodes 3"):
+    with pytest.raises(AegisError, match="(?s)different demonstrations than.*episodes 3"):
         train.run(other, tmp_path / "run", resume=True)
     assert train.run(recorded, tmp_path / "run", resume=True).success
     assert contents(tmp_path / "run") == before
@@ -725,7 +725,7 @@ def test_train_inspect_probe_and_rollout(
         path.write_bytes(kept)
     (place / "run" / "stream.json").unlink()
     for command in (("inspect", "run"), ("probe", "run"), ("rollout", "run", "--task", "reach")):
-        bad(*command, says=("not learned to its end",))
+        bad(*command, says=("is not finished",))
 
 
 @pytest.mark.parametrize(

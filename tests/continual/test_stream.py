@@ -433,7 +433,7 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
     if (method, other) == ("sequential", "encoder"):  # it ends with an encoder of its own
         assert probe.run(out).largest_difference == 0
     else:
-        with pytest.raises(AegisError, match=f"another {other} than the run") as caught:
+        with pytest.raises(AegisError, match=f"a different {other} than the run") as caught:
             probe.run(out)
         assert caught.value.fix
     assert contents(out) == before
@@ -444,7 +444,7 @@ def test_a_probe_of_another_trained_encoder_is_one_error(done: Done, tmp_path: P
     shutil.copytree(done("sequential")[1], out)
     TinyDual(seed=5).save(out / "encoder")
     before = contents(out)
-    with pytest.raises(AegisError, match="another trained encoder than the run"):
+    with pytest.raises(AegisError, match="a different trained encoder than the run"):
         probe.run(out)
     assert contents(out) == before
 
@@ -602,7 +602,7 @@ def test_a_state_of_another_encoder_is_refused(
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(images.backbones, "load_dual", lambda name: TinyDual(seed=5))
-    refused("another encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
+    refused("a different encoder", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
 def test_a_state_of_other_images_is_refused(
@@ -611,7 +611,7 @@ def test_a_state_of_other_images_is_refused(
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
     monkeypatch.setattr(images.streams, "edition", lambda name: ["newer"])
-    refused("another image set", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
+    refused("a different image set", recipe=recipe("igsp"), out=tmp_path / "run", resume=True)
 
 
 def test_classes_that_the_text_tower_cannot_read_are_refused_before_anything_is_written(
@@ -666,5 +666,5 @@ def test_a_training_that_diverges_says_where_and_which_rates_it_read(
 def test_an_unfinished_run_is_not_probed(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe("igsp"), tmp_path / "run", on_event=partial(stop, ONE, 7))
-    with pytest.raises(AegisError, match="not learned to its end"):
+    with pytest.raises(AegisError, match="is not finished"):
         probe.run(tmp_path / "run")

@@ -252,7 +252,7 @@ def test_weights_are_shares_of_the_frames(
 
 def test_a_weight_of_less_than_a_frame_is_refused(demos_file: Path) -> None:
     made = of_sizes(demonstrations.load(demos_file, 0.3, 0), (4, 6))
-    with pytest.raises(AegisError, match="none of an epoch's 10 frames is of 'set 6'"):
+    with pytest.raises(AegisError, match="leave 'set 6' none of an epoch's 10 frames"):
         mixture.drawn(made, (100, 1))
 
 

@@ -58,7 +58,7 @@ def test_nameless_actions_belong_to_positions_by_their_order() -> None:
         ((), ("x", "y"), (), "not all of which have names"),
         (("x", "y"), (), (), "not all of which have names"),
         (("x", "dy"), ("x", "y"), (), "no position is named dy"),
-        (("x", "y"), ("x", "y"), ("hand",), "'hand', which no action's name has"),
+        (("x", "y"), ("x", "y"), ("hand",), "'hand', which is in no action's name"),
         (("x", "x"), ("x", "y"), (), "several actions or positions named 'x'"),
         (("x", "y"), ("x", "x"), ("y",), "several actions or positions named 'x'"),
     ],

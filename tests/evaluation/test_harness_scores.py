@@ -158,9 +158,9 @@ def test_a_task_of_which_nothing_is_compared_is_told_and_listed(two: tuple[Path,
     events = list[Any]()
     report = harness_scores.run(*two, max_drop=50.0, on_event=events.append)
     assert report.left_out == ["mmmu_val"]
-    why = "mmmu_acc is left out: not one number a question"
+    why = "mmmu_acc is left out: not one number per question"
     assert report.why_left_out == {"mmmu_val": why}
-    assert "mmmu_val: nothing of it is compared, and --max-drop does not judge" in heard(events)
+    assert "mmmu_val: not compared, and --max-drop does not judge" in heard(events)
 
 
 @pytest.mark.parametrize("key", ("score", "is_correct", "correct"))
@@ -176,10 +176,10 @@ def test_what_a_task_notes_of_each_question_is_its_score(tmp_path: Path, key: st
 @pytest.mark.parametrize(
     ("values", "why"),
     [
-        ([{"answer": "A"}, {"answer": "B"}], "not one number a question"),
-        ([float("nan"), 1.0], "not one number a question"),
-        ([10**400, 1.0], "not one number a question"),
-        ([0.0, 7.0], "from 0 to 7, which are no shares"),
+        ([{"answer": "A"}, {"answer": "B"}], "not one number per question"),
+        ([float("nan"), 1.0], "not one number per question"),
+        ([10**400, 1.0], "not one number per question"),
+        ([0.0, 7.0], "from 0 to 7, which are not shares"),
     ],
 )
 def test_what_is_no_share_is_left_out_by_name(tmp_path: Path, values: Any, why: str) -> None:
@@ -219,7 +219,7 @@ def test_a_line_whose_list_of_metrics_is_damaged_is_no_defect(tmp_path: Path, na
     if named == 5:  # then the line's own keys tell
         assert len(harness_scores.run(tmp_path / "a", tmp_path / "b").scores) == 1
     else:
-        assert "no score of one question" in refused(tmp_path / "a", tmp_path / "b")
+        assert "no question with a score in both" in refused(tmp_path / "a", tmp_path / "b")
 
 
 def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, Path]) -> None:
@@ -244,7 +244,7 @@ def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
     assert harness_scores.run(before, after, max_drop=50).passed
     lmms(before, "pope", rows_of({"pope_accuracy": [1.0]}))
     assert harness_scores.run(before, after).left_out == ["docvqa", "pope"]
-    with pytest.raises(AegisError, match="no scores in '.*after' of pope, of which '.*before'"):
+    with pytest.raises(AegisError, match="no scores in '.*after' of pope, which '.*before' has"):
         harness_scores.run(before, after, max_drop=50)
 
 
@@ -272,7 +272,7 @@ def test_what_holds_no_scores_of_two_models_is_refused(
     assert "check the path" in refused(tmp_path / "none", two[1])
     assert "before and after" in refused(two[0], two[0])
     lmms(tmp_path / "other", "pope", rows_of({"pope_accuracy": [1.0]}))
-    assert "no score of one question in common" in refused(two[0], tmp_path / "other")
+    assert "no question with a score in both" in refused(two[0], tmp_path / "other")
     assert "in 2 folders" in refused(tmp_path, two[1])
 
 
@@ -303,7 +303,7 @@ def test_the_gate_ends_the_command(two: tuple[Path, Path]) -> None:
     unsure = ask("--max-drop", "15", "--gate", "upper", "--json")
     assert unsure.exit_code == 1 and json.loads(unsure.stdout)["passed"] is False
     assert "by the upper end of the drop's interval" in unsure.stderr
-    assert "10 questions tell the drop" in unsure.stderr
+    assert "10 questions measure the drop" in unsure.stderr
 
 
 def test_a_large_drop_is_told_from_a_small_one(tmp_path: Path) -> None:
@@ -325,7 +325,9 @@ def test_a_file_without_a_line_is_named(two: tuple[Path, Path]) -> None:
 
 def test_a_file_of_another_name_is_not_told_to_have_no_samples(two: tuple[Path, Path]) -> None:
     path = next(two[0].rglob("*.jsonl")).rename(two[0] / "before.jsonl")
-    with pytest.raises(AegisError, match=r"before\.jsonl', whose name .*\n.*_samples_TASK\.jsonl"):
+    with pytest.raises(
+        AegisError, match=r"before\.jsonl', which is not named .*\n.*_samples_TASK\.jsonl"
+    ):
         harness_scores.run(path, two[1])
 
 

@@ -324,7 +324,7 @@ def test_a_gate_of_two_questions_is_warned_of(taught: Path) -> None:
     seen: list[Event] = []
     probe.run(str(taught), "scenes", 2, str(taught), None, 1.0, on_event=seen.append)
     said = [event.text for event in seen if isinstance(event, Warned)]
-    assert any("2 questions tell the drop to ±65.76 points" in text for text in said)
+    assert any("2 questions measure the drop to ±65.76 points" in text for text in said)
 
 
 def test_a_gain_passes_any_gate() -> None:

@@ -339,11 +339,11 @@ def test_what_is_not_noted_of_each_question_is_left_out_with_the_reason(
     report = harness_scores.run(*two, max_drop=50, on_event=events.append)
     assert report.left_out == ["LLaVABench", "OCRBench", "POPE"]
     assert report.why_left_out == {
-        "LLaVABench": "score, openai_result is left out: from 4 to 9, which are no shares",
-        "OCRBench": "what each of its questions got is not noted",
+        "LLaVABench": "score, openai_result is left out: from 4 to 9, which are not shares",
+        "OCRBench": "no per-question scores were written",
         "POPE": f"only '{two[1]}' has scores",
     }
-    assert "OCRBench: nothing of it is compared, and --max-drop does not judge it" in heard(events)
+    assert "OCRBench: not compared, and --max-drop does not judge it" in heard(events)
 
 
 def test_a_benchmarks_own_score_is_no_verdict(two: tuple[Path, Path]) -> None:
@@ -437,7 +437,7 @@ def test_a_verdict_that_is_no_number_leaves_its_metric_out(
     for model in two:
         evaluation(model, "Odd", judged([1, cell]))
     report = harness_scores.run(*two)
-    assert report.why_left_out == {"Odd": f"hit, {JUDGED} is left out: not one number a question"}
+    assert report.why_left_out == {"Odd": f"hit, {JUDGED} is left out: not one number per question"}
 
 
 @pytest.mark.parametrize("cell", ("[]", "[0.5, x]", "[[1], [0]]x", "__import__('os')"))
@@ -508,11 +508,11 @@ def no_json(path: Path) -> None:
         (no_index, "a row without an index in"),
         (no_row, "no row in"),
         (a_cell_less, "row 11 of"),
-        (no_text, "is no table, or is damaged"),
+        (no_text, "is not a table, or is damaged"),
         (pointer, "is a Git LFS pointer"),
-        (garbage, "is no table, or is damaged"),
-        (cut, "is no table, or is damaged"),
-        (no_workbook, "is no table, or is damaged"),
+        (garbage, "is not a table, or is damaged"),
+        (cut, "is not a table, or is damaged"),
+        (no_workbook, "is not a table, or is damaged"),
         (no_json, "is not JSON"),
     ],
 )
@@ -553,10 +553,10 @@ def test_what_is_not_of_one_model_and_one_harness_is_refused(
     assert "tables of 2 models below" in refused(tmp_path, two[1])
     lmms(tmp_path / "lmms", "MMStar", [1.0] * 10)
     mixed = refused(tmp_path / "lmms", two[1])
-    assert "what lmms-eval or lm-evaluation-harness wrote" in mixed
-    assert "what VLMEvalKit wrote" in mixed
+    assert "output of lmms-eval or lm-evaluation-harness" in mixed
+    assert "and of VLMEvalKit in" in mixed
     lmms(two[0], "MMStar", [1.0] * 10)
-    assert "lm-evaluation-harness and VLMEvalKit wrote, in" in refused(*two)
+    assert "lm-evaluation-harness and VLMEvalKit in" in refused(*two)
 
 
 def test_a_folder_that_was_renamed_is_refused(two: tuple[Path, Path], tmp_path: Path) -> None:
@@ -598,7 +598,7 @@ def test_empty_rows_and_long_cells_are_taken(tmp_path: Path, suffix: str) -> Non
 
 def test_what_is_not_judged_is_refused(two: tuple[Path, Path]) -> None:
     table_of(two[1]).unlink()
-    assert "predictions alone in" in refused(*two)
+    assert "only predictions in" in refused(*two)
     predictions = next(two[1].rglob("tuned_MMStar.tsv"))
     assert "without a column of verdicts" in refused(two[0], predictions)
     write(predictions, [{"split": "none", "Overall": 0.5}])

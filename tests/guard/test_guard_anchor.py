@@ -606,7 +606,7 @@ def test_a_table_that_was_resized_later_is_refused(anchor: Path) -> None:
         model = make()
         guard = Guard(model, anchor, **options)
         resized(model)
-        with pytest.raises(AegisError, match="text.words.weight.*put into the model later"):
+        with pytest.raises(AegisError, match="text.words.weight.*added to the model later"):
             guard.backward(model(*batch(0)).square().mean())
 
 

@@ -445,7 +445,7 @@ def test_weights_stay_where_a_method_cannot_start(
 
 
 def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path) -> None:
-    with pytest.raises(AegisError, match="of other weights than those of the base model"):
+    with pytest.raises(AegisError, match="was not measured on the base model's weights"):
         make(Foreign(tiny_folder), "kfac", anchor, make_tiny(7))
 
 

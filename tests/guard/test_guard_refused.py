@@ -388,7 +388,7 @@ def test_gradients_that_are_never_cleared(is_automatic: bool, anchor: Path) -> N
 
     go_back(0)
     optimizer.step()
-    refused(lambda: go_back(1), "not cleared after the step", "optimizer.zero_grad()")
+    refused(lambda: go_back(1), "not cleared after their step", "optimizer.zero_grad()")
     guard.discard()
     optimizer.zero_grad()
     go_back(2)
@@ -435,7 +435,7 @@ def test_a_step_past_the_guard_is_refused_before_it_moves_anything(
     guard.step(optimizer)
     assert not torch.equal(vector(model), before)
     model.text.norm.requires_grad_(False)
-    refused(lambda: guard.step(optimizer), "other trainable parameters")
+    refused(lambda: guard.step(optimizer), "different trainable parameters")
     guard.remove()
     refused(guard.settle, "removed")
     optimizer.step()

@@ -89,9 +89,9 @@ def flatten(model: Vlm) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (replace, ("text.norm.weight", "put into the model later")),
-        (add, ("text.layers.1.adapter.weight", "put into the model later")),
-        (flatten, ("text.norm.weight", "another shape")),
+        (replace, ("text.norm.weight", "added to the model later")),
+        (add, ("text.layers.1.adapter.weight", "added to the model later")),
+        (flatten, ("text.norm.weight", "a different shape")),
     ],
 )
 def test_parameters_that_are_not_those_of_the_start(
@@ -119,7 +119,7 @@ def test_what_learns_only_later_is_refused(method: str, anchors: dict[str, Path]
     path = anchors[method]
     guard = Guard(model, path, method=method, **{**METHODS[method], **own.get(method, {})})
     model.vision.requires_grad_(True)
-    refused(lambda: watched(guard, model), "other trainable parameters")
+    refused(lambda: watched(guard, model), "different trainable parameters")
     guard.remove()
     automatic = Guard(make(), path, method=method, **METHODS[method]).automatic(mask="mask")
     other = automatic._model

@@ -94,7 +94,7 @@ def test_a_lora_put_on_after_the_guard_is_refused(method: str, anchors: dict[str
     model = make()
     guard = Guard(model, anchors[method], method=method, **options[method])
     wrapped = with_lora(model)
-    with pytest.raises(AegisError, match="lora_A.*put into the model later") as caught:
+    with pytest.raises(AegisError, match="lora_A.*added to the model later") as caught:
         guarded_steps(wrapped, guard, steps=1)
     assert "get_peft_model" in caught.value.fix
 

@@ -344,7 +344,7 @@ def test_words_for_folders(dataset: Path, tmp_path: Path) -> None:
         (lambda task: (task / folders.CLASSES).write_text("{"), "not JSON"),
         (
             lambda task: (task / folders.CLASSES).write_text('{"zebra": 3}'),
-            "something else than words",
+            "values that are not words",
         ),
         (lambda task: (task / folders.CLASSES).write_text('{"wolf": "wolf"}'), "wolf"),
         (

@@ -252,7 +252,7 @@ def test_an_export_that_another_process_has_written_meanwhile_stays(
         (tmp_path / "x" / "theirs").touch()
 
     monkeypatch.setattr(lerobot_folder, "write", slow)
-    with pytest.raises(AegisError, match="another process has written meanwhile"):
+    with pytest.raises(AegisError, match="another process wrote in the meantime"):
         export.run(run_folder, tmp_path / "x")
     assert [path.name for path in tmp_path.rglob("*")] == ["x", "theirs"]
 

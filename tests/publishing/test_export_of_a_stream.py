@@ -108,7 +108,7 @@ def test_what_weighs_several_experts_is_refused_before_anything_is_loaded(
     run, out = tmp_path / "run", tmp_path / "policy"
     train.run(dataclasses.replace(recipe, igsp=kept), run)
     monkeypatch.setattr(robots, "load_to_act", lambda *given: pytest.fail("loaded"))
-    says = ("'open-drawer'", "weighs several experts at", "aegis serve", "isolated-lora")
+    says = ("'open-drawer'", "mixes several experts at", "aegis serve", "isolated-lora")
     bad("export", run, "--task", "open-drawer", "--out", out, says=says)
     assert not out.exists()
 

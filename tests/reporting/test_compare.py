@@ -50,7 +50,7 @@ def test_a_folder_stands_for_the_runs_in_it(job: Path, tmp_path: Path) -> None:
     assert [row.run for row in found.rows] == [str(folder / "a"), str(folder / "b")]
     warned = [event.text for event in events if isinstance(event, Warned)]
     assert [text for text in warned if "have no checkpoint" in text] == [
-        f"left out, for they have no checkpoint yet: {begun}"
+        f"left out, because they have no checkpoint yet: {begun}"
     ]
     assert [text for text in warned if "damaged" in text] == warned[:1] and len(warned) == 2
 
@@ -161,7 +161,7 @@ def test_open_loop_errors_on_the_same_episodes_are_compared(
     assert [row.open_loop_error for row in found.rows] == [0.25, 1.25] and found.same_open_loop
     assert {row.open_loop_on for row in found.rows} == {"2 chosen episodes of datasets/arm"}
     _, out, err = aegis("compare", "naive", "aegis")
-    assert "*0.250" in out and "1.250" in out and "same frames" not in err
+    assert "*0.250" in out and "1.250" in out and "different frames" not in err
     assert out.rstrip().endswith("open-loop error: on 2 chosen episodes of datasets/arm")
 
 
@@ -184,7 +184,7 @@ def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
     assert not compare.run([job]).same_open_loop
     _, out, err = aegis("compare", "naive", "aegis")
     assert "0.250" in out and "*0.250" not in out and "!0.500" not in out
-    assert "not of the same frames: naive, 1 held-out episode of datasets/arm (" in err
+    assert "measured on different frames: naive, 1 held-out episode of datasets/arm (" in err
     assert f"{told}; aegis evaluate" in err
 
 
@@ -291,6 +291,6 @@ def test_marks_are_explained_where_there_are_some(
 
 
 def test_what_is_no_run_is_refused(aegis, job: Path, tmp_path: Path) -> None:
-    assert "is no run" in refused(aegis("compare", job, tmp_path))
+    assert "is not the run of a policy" in refused(aegis("compare", job, tmp_path))
     with pytest.raises(AegisError):
         compare.run([tmp_path / "missing"])

@@ -113,7 +113,7 @@ def test_a_study_that_named_a_task_goes_on_where_it_was(
     events: list[Event] = []
     study.run(named, tmp_path / "runs", events.append)
     told = [e.text for e in events if isinstance(e, Warned) and e.stage == "study"]
-    assert len(told) == 1 and "so that tasks: [reach] is but a name" in told[0]
+    assert len(told) == 1 and "so tasks: [reach] is only a name" in told[0]
     assert (tmp_path / "runs" / "small" / "reach" / "naive" / "0").is_dir()
     later = study_cells.load(studies.write(tmp_path, keys))
     plan = list(study.planned(later, tmp_path / "runs"))

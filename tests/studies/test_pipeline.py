@@ -486,9 +486,9 @@ def test_other_demonstrations_rerun_all_but_the_anchor(
     events: list[Any] = []
     pipeline.run(replace(small, demos=replace(small.demos, seed=1)), root, events.append)
     assert calls == PER_METHOD | {"demos": 1}
-    told = {e.stage: e.text for e in events if isinstance(e, Warned) and "anew" in e.text}
+    told = {e.stage: e.text for e in events if isinstance(e, Warned) and "again" in e.text}
     assert told.keys() == {f"{method}/train" for method in METHODS}
-    said = f"'{root / 'small/naive'}' was trained with another demos: it is trained anew"
+    said = f"'{root / 'small/naive'}' was trained with a different demos: training it again"
     assert told["naive/train"] == said
 
 
@@ -769,7 +769,7 @@ def test_the_verdict_on_questions_that_the_vlm_could_not_answer_is_no_verdict_on
         for row in figured(naive=(0, 0.95), kfac=(0, 0.9))
     ]
     said = pipeline.verdict(rows)
-    assert said.startswith("The VLM answered 0.0 % of the questions before training")
+    assert said.startswith("The VLM answered 0.0 % of the questions correctly before training")
     assert "30.0 %" in said and "probe.ask" in said
 
 

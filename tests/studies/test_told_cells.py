@@ -68,4 +68,4 @@ def test_cells_need_the_recipe_of_their_study(aegis: Any, tmp_path: Path) -> Non
     (tmp_path / "mine.yaml").write_bytes((RECIPES / "ablations.yaml").read_bytes())
     assert aegis("inspect", tmp_path / "mine.cells.json", "--json")[0] == 0
     (tmp_path / "cells.json").write_bytes(entries)
-    assert "does not say of which study" in refused(aegis("inspect", tmp_path / "cells.json"))
+    assert "does not name its study" in refused(aegis("inspect", tmp_path / "cells.json"))

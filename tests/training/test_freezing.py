@@ -251,12 +251,12 @@ def test_a_pattern_may_name_parameters() -> None:
 @pytest.mark.parametrize(
     ("freeze", "found", "fix"),
     [
-        ("vision_model", "'vision_model', and no part", "did you mean 'model.vision_model'?"),
-        ("vlm.model.vision_model", "and no part", "did you mean 'model.vision_model'?"),
-        ("visoin", "'visoin', and no part", "did you mean 'vision'?"),
-        ("layers.0-7", r"'layers.7' (of layers.0-7), and no part", "let the range end"),
-        ("zzz*", "'zzz*', and no part", "--set train.freeze=vision"),
-        (("vision", "nothing.at.all"), "'nothing.at.all', and no part", "--set train.freeze="),
+        ("vision_model", "'vision_model', but no part", "did you mean 'model.vision_model'?"),
+        ("vlm.model.vision_model", "but no part", "did you mean 'model.vision_model'?"),
+        ("visoin", "'visoin', but no part", "did you mean 'vision'?"),
+        ("layers.0-7", r"'layers.7' (of layers.0-7), but no part", "let the range end"),
+        ("zzz*", "'zzz*', but no part", "--set train.freeze=vision"),
+        (("vision", "nothing.at.all"), "'nothing.at.all', but no part", "--set train.freeze="),
     ],
 )
 def test_a_name_that_no_part_has_is_refused_with_those_that_there_are(

@@ -112,7 +112,7 @@ def stands_still(recipe: Recipe, start: Start, out: Path) -> Recipe:
         (shorter, f"train.steps: {STEPS} there, {STEPS - 1} here"),
         (of_a_job, "belongs to a job"),
         (otherwise_too, "backbone_lr"),
-        (stands_still, "stands still"),
+        (stands_still, "is frozen by now"),
     ],
 )
 def test_what_is_not_made_longer(
@@ -200,7 +200,7 @@ def test_a_job_looks_for_the_expert_before_it_records_anything(
     ("known", "told"),
     [
         ({}, []),
-        ({"normalization": "quantiles"}, ["on another scale here; --set train.normalization="]),
+        ({"normalization": "quantiles"}, ["on a different scale here; --set train.normalization="]),
         ({"fps": 30.0}, ["trained on 30 frames a second, and these demonstrations have 10"]),
     ],
 )

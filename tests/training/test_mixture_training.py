@@ -153,7 +153,7 @@ def test_a_run_is_not_resumed_on_other_sets(
     recipe: Recipe, start: Start, sets: tuple[Path, Path], run: Path, demos_file: Path
 ) -> None:
     chosen = mixed(recipe, sets, weights=(2.0, 1.0))
-    with pytest.raises(AegisError, match="another set 2 of the demonstrations than"):
+    with pytest.raises(AegisError, match="a different set 2 of the demonstrations than"):
         start("naive", run, recipe=chosen, demos=(sets[0], demos_file), resume=True)
 
 

@@ -284,7 +284,7 @@ def test_nothing_is_overwritten_where_something_is_wrong(
     run = tmp_path / "run"
     start("naive", run)
     (run / "thesis.tex").write_text("years of work")
-    assert "thesis.tex" in refused("not written", start, "naive", run, overwrite=True).fix
+    assert "thesis.tex" in refused("did not write", start, "naive", run, overwrite=True).fix
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("years of work")
     refused("not a run", start, "naive", tmp_path / "other", overwrite=True)
@@ -316,7 +316,7 @@ def test_nothing_is_overwritten_that_the_new_run_is_made_from(
 def test_somebodys_artifact_in_a_run_is_not_removed_with_it(start: Start, tmp_path: Path) -> None:
     start("naive", tmp_path)
     shutil.copy(tmp_path / "ledger.safetensors", tmp_path / "anchor.safetensors")
-    refused("not written", start, "naive", tmp_path, overwrite=True)
+    refused("did not write", start, "naive", tmp_path, overwrite=True)
     assert (tmp_path / "anchor.safetensors").is_file()
 
 
@@ -395,7 +395,7 @@ def test_a_run_goes_on_with_its_own_demonstrations_only(
 ) -> None:
     record("reach", 2, 1, tmp_path / "other.safetensors", workers=1)
     refused(
-        "another demos",
+        "a different demos",
         start,
         "naive",
         naive_run,
@@ -412,7 +412,13 @@ def test_a_run_goes_on_with_its_own_backbone_only(
     start("naive", tmp_path / "run", recipe=ours, anchor=None)
     make_tiny(1).save(tmp_path / "vlm")
     refused(
-        "another backbone", start, "naive", tmp_path / "run", recipe=ours, anchor=None, resume=True
+        "a different backbone",
+        start,
+        "naive",
+        tmp_path / "run",
+        recipe=ours,
+        anchor=None,
+        resume=True,
     )
 
 
@@ -434,7 +440,7 @@ def test_a_run_goes_on_with_its_own_questions_only(
         )
     asked.write_text(asked.read_text().replace('"red"', '"green"'))
     refused(
-        "another vqa/set.jsonl",
+        "a different vqa/set.jsonl",
         start,
         method,
         tmp_path / "run",

@@ -56,4 +56,4 @@ def test_a_replaced_parameter_is_named(run: assemble.TrainingRun) -> None:
     name, found = next(iter(layer.named_parameters()))
     owner, _, last = name.rpartition(".")
     setattr(layer.get_submodule(owner), last, nn.Parameter(found.detach().clone()))
-    refused_unmoved(run, f"layers.0.{name}.*put into the model later")
+    refused_unmoved(run, f"layers.0.{name}.*added to the model later")

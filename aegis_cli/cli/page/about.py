@@ -36,7 +36,7 @@ def _film(video: At, folder: Path, page: Path) -> Markup:
     if video["size_bytes"].value > _EMBEDDED_BYTES:
         place = Path(os.path.relpath(folder / name, page)).as_posix()
         link = element("a", place, href=quote(place))
-        return note(link, " is too large to be part of this page, which only links it.")
+        return note(link, " is too large to embed in this page, so it is only linked.")
     encoded = base64.b64encode((folder / name).read_bytes()).decode()
     source = f"data:{kind};base64,{encoded}"
     if kind.startswith("video"):

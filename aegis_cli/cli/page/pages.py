@@ -107,7 +107,7 @@ def _anchor(runs: Sequence[At]) -> str | None:
     told = next((anchor for anchor in used if anchor["read"].value), used[0])
     if told["read"].value:
         return str(told["measured_on"])
-    return f"{told['measured_on']}; the drift is measured against it, no training read it"
+    return f"{told['measured_on']}; it measures the drift, and no training used it"
 
 
 def _trained(run: At, anchor: str | None) -> Markup:
@@ -210,14 +210,15 @@ def _verdict(compared: At) -> Child:
         return compared["verdict"]
     rows = sorted(compared["rows"], key=lambda row: row["drop_points"].value)
     before = compared["baseline_accuracy"]
-    said: list[Child] = ["Before, it answered ", share(before), " % of the questions. "]
+    said: list[Child] = ["Before, it answered ", share(before), " % of the questions correctly. "]
     if len(rows) == 1:
         lost = decimal(rows[0]["drop_points"])
-        return join(*said, rows[0]["method"], " lost ", lost, " percentage points of them.")
+        return join(*said, rows[0]["method"], " lost ", lost, " percentage points.")
     least, most = rows[0], rows[-1]
-    said += ["Least was lost by ", element("strong", least["method"]), " ("]
-    said += [decimal(least["drop_points"]), " points), most by "]
-    said += [element("strong", most["method"]), " (", decimal(most["drop_points"]), " points). "]
+    said += [element("strong", least["method"]), " lost the least ("]
+    said += [decimal(least["drop_points"]), " points), "]
+    said += [element("strong", most["method"]), " the most ("]
+    said += [decimal(most["drop_points"]), " points). "]
     return join(*said, *_most_successful(rows))
 
 
@@ -290,7 +291,7 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
     if hold is not None:
         parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
     if _acting(rows) == _OPEN:
-        parts.append(note("An open-loop error is no success, and does not tell it."))
+        parts.append(note("An open-loop error is not a success rate, nor a measure of one."))
     spots = _spots(rows, own)
     if spots:
         errs = _acting(rows) == _OPEN

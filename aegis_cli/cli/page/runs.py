@@ -169,10 +169,10 @@ def open_loops(runs: Sequence[At]) -> Markup | None:
     return section(
         "Open-loop error",
         note(
-            "Predicted against recorded actions, of which nothing is executed: squared error over "
-            "the variance in training, mean over the dimensions of the actions. The training's "
-            "mean action has 1. Hold is the current position, repeated. Under each error, its 95 % "
-            "interval (Student's t) over episodes."
+            "Predicted against recorded actions; nothing is executed. Squared error over the "
+            "variance in training, mean over the dimensions of the actions: always predicting the "
+            "training's mean action scores 1. Hold repeats the current position. Under each error, "
+            "its 95 % interval (Student's t) over episodes."
         ),
         table(("Run", "Episodes", "Frames", "Relative error", "Hold's"), rows, left=2),
         *(_by_instruction(run, result["figures"]) for run in runs for result in run["open_loops"]),
@@ -216,7 +216,7 @@ def families(runs: Sequence[At]) -> Iterator[Markup]:
         yield section(
             title,
             note(
-                "Accuracy in percent with its 95 % interval. The fuller the colour, the more was "
+                "Accuracy in percent with its 95 % interval. A fuller colour means that more was "
                 "kept of what the backbone knew before."
             ),
             table(header, rows),
@@ -283,7 +283,7 @@ def wrong_answers(runs: Sequence[At]) -> Markup | None:
         return None
     return section(
         "Wrong answers",
-        note("The first wrong answers of each family of questions, with what was right."),
+        note("The first wrong answers of each family of questions, with the right answer."),
         *parts,
     )
 

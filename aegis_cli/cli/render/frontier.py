@@ -49,7 +49,7 @@ def frontier_plot(report: Any, path: Path) -> None:
     """
     if not has_frontier(report):
         found = "no variant with both VQA accuracy and a figure of how well it acts"
-        raise AegisError(found, "a study some of whose trainings were measured", "leave out --plot")
+        raise AegisError(found, "a study with at least one measured training", "leave out --plot")
     save_figure(lambda: _figure(report), path)
 
 

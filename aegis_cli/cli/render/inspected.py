@@ -57,10 +57,10 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
             )
         )
         if report.frozen:
-            parts.append(Text(f"nothing has learned of {_as_ranges(report.frozen)}\n"))
+            parts.append(Text(f"nothing learned in {_as_ranges(report.frozen)}\n"))
         parts.append(_over_time(report.over_time))
     elif report.kind in ("run", "checkpoint", "ledger"):
-        found = "no anchor gradient was taken in any step: no energy of the gradient is shed"
+        found = "no step took an anchor gradient, so no gradient energy was shed"
         parts.append(Text(found))
     return Group(*parts)
 
@@ -97,7 +97,7 @@ def questions(report: Any) -> RenderableType:
     parts.append(plain_table(("Commonest answer", "Questions", "Of all %"), rows))
     if report.problems:
         first = "\n".join(f"- {problem}" for problem in report.problems)
-        parts.append(Text(f"what is bad first, and --skip-bad leaves out:\n{first}\n"))
+        parts.append(Text(f"the first bad ones, which --skip-bad leaves out:\n{first}\n"))
     return Group(*parts)
 
 
@@ -155,7 +155,7 @@ def _not_measured(facts: Mapping[str, Any]) -> Text:
         does = "aegis probe and aegis evaluate do that"
     if before:  # the run has trained further since
         steps = f"step{'s' * (len(before) > 1)} {', '.join(map(str, before))}"
-        of = f"what is measured is of {steps}, and not of the last checkpoint"
+        of = f"measured at {steps}, not at the last checkpoint"
         return Text(f"{of}: measure again ({does})\n")
     return Text(f"nothing is measured yet: {does}")
 

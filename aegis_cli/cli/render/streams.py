@@ -15,7 +15,7 @@ from rich.text import Text
 
 from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
 
-_UNIT = "squared and over the variance of the training's actions"
+_UNIT = "squared, over the variance of the training's actions"
 
 
 def stream(report: Any) -> RenderableType:
@@ -89,7 +89,7 @@ def _errors(report: Any) -> list[RenderableType]:
     return [
         plain_table(header, rows),
         plain_table(named, figures, left=0),
-        Text(f"Errors are at held-out frames, {_UNIT}: 1 is that of always predicting their mean"),
+        Text(f"Errors are at held-out frames, {_UNIT}: always predicting their mean scores 1"),
     ]
 
 
@@ -136,7 +136,7 @@ def _published(report: Any) -> list[RenderableType]:
         (method, *(f"{value:.1f}" for value in figures))
         for method, figures in report.published.items()
     ]
-    title = "As their papers print them, on the whole data sets; not run here; see task inferred"
+    title = "As published, on the whole data sets, not run here; compare with task inferred"
     return [plain_table(("Published", "Transfer %", "Average %", "Last %"), rows, title=title)]
 
 

@@ -105,9 +105,9 @@ def _acting(results: Sequence[Any]) -> tuple[str, ...]:
 
 
 OPEN_LOOP = (
-    "nothing could be rolled out: the open-loop error is no success, and does not tell it; it is\n"
-    "  the squared error of the actions on held-out episodes over their variance in training, 1\n"
-    "  for always the mean action; no policy's is the lesser of 1 and that of holding the position"
+    "nothing could be rolled out: the open-loop error is not a success rate, nor a measure of it.\n"
+    "  It is the squared error of actions on held-out episodes over their variance in training:\n"
+    "  the mean action has 1; no policy's error is the lesser of 1 and that of holding the position"
 )
 
 
@@ -324,7 +324,7 @@ def _notes(report: Any) -> list[str]:
             barred = [r.bar for r in task.results if r.bar]
             unknown = unmeasured([{c.name: c.value for c in bar.checks} for bar in barred])
             if unknown:
-                notes.append(f"on {task.task} nobody can pass the bar: no figure of {unknown}")
+                notes.append(f"on {task.task} no variant can pass the bar: no figure of {unknown}")
     if any(r.open_loop_error is not None for r in results):
         notes.append(OPEN_LOOP)
     if any(r.against for r in results):

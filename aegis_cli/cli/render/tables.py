@@ -27,8 +27,8 @@ from aegis_cli.cli.render.layout import (
 _SHARE_INTERVALS = ("interval", "soft_interval")
 _OPEN_LOOP_INSTEAD = (
     "nothing could be rolled out. The open-loop error is the squared error of the actions on "
-    "held-out episodes over their variance in training: 1 is that of always the mean action. It is "
-    "no success, and does not tell it. aegis inspect of a run has its interval"
+    "held-out episodes over their variance in training: always predicting the mean action scores "
+    "1. It is not a success rate, nor a measure of one. aegis inspect RUN shows its interval"
 )
 # Fields with a share in [0, 1], shown in percent; `_is_share` finds some more by their names.
 _SHARES = {
@@ -108,7 +108,7 @@ def serving(report: Any) -> RenderableType:
     prompt = "text" if said["default_prompt"] is None else f"text, or '{said['default_prompt']}'"
     sent = {**images, said["state"]: f"[{said['positions']}]", said["prompt"]: prompt}
     parts = {"url": report.url, "health": report.health, "task": said["task"]}
-    got = f"[{said['chunk']}, {said['actions']}], of which {said['replan']} are meant to be done"
+    got = f"[{said['chunk']}, {said['actions']}], {said['replan']} of which are to be executed"
     table = plain_table(("An observation's key", "Value"), list(sent.items()), left=2)
     return Group(pairs(parts), table, pairs({"answer": f"'actions': {got}"}), Text("Ctrl-C ends"))
 

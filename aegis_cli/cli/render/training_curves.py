@@ -96,9 +96,9 @@ def curves_plot(
     there = [curve for curve in curves(sets) if points(lines, curve.name, 1.0)]
     if not there:
         raise AegisError(
-            f"no figure in the metrics of {title}",
-            "a run that has written its first line",
-            "leave out --plot, or let it train on",
+            f"no metrics logged yet by {title}",
+            "a run that has logged its first step",
+            "leave out --plot, or let the run train on",
         )
     save_figure(lambda: _drawn(lines, there, title), path)
 

@@ -219,7 +219,7 @@ def load(folder: Path, rename: Renaming = ()) -> Dataset:
         raise AegisError(
             f"no episode in '{folder}': its recording ended before one was saved",
             "at least one",
-            "record it anew",
+            "record it again",
         )
     tasks, episodes = reader.read_tasks(folder), reader.read_episodes(folder, info)
     found = Dataset(folder, info, tasks, episodes, rename)

@@ -53,7 +53,7 @@ def meta(name: str) -> Path:
         raise AegisError(
             f"the dataset '{name}' of the hub has no {layout.INFO}",
             f"a LeRobot dataset of {layout.READ} at the top of its repository",
-            f"where it lies in a folder of it: hf download --repo-type dataset {name} "
+            f"if it is in a folder of that repository: hf download --repo-type dataset {name} "
             "--include 'FOLDER/*' --local-dir DATASET; then give DATASET/FOLDER",
         )
     return folder
@@ -114,6 +114,6 @@ def _snapshot(name: str, wanted: tuple[str, ...]) -> Path:
             f"{in_short(error)}",
             "a file of aegis demos, a LeRobot dataset, or a hub id with a network (and, for a "
             "private dataset, a token)",
-            f"check the path; or where there is a network: hf download --repo-type dataset {name} "
-            "--local-dir FOLDER; then give FOLDER",
+            f"check the path; or, on a machine with a network: hf download --repo-type dataset "
+            f"{name} --local-dir FOLDER; then give FOLDER",
         ) from error

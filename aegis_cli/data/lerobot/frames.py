@@ -192,9 +192,9 @@ def have_room(
         return True
     text = (
         f"the frames of '{source.dataset.folder}' stay in its videos, and each is decoded when a "
-        f"batch has it: all of them would take {needed / 1e9:,.1f} of the {free / 1e9:,.1f} GB "
-        f"that are free for '{folder}'. data_s tells what a step waits for them; --set "
-        "demos.cache=true decodes them before all the same"
+        f"batch needs it: all of them would take {needed / 1e9:,.1f} of the {free / 1e9:,.1f} GB "
+        f"that are free for '{folder}'. data_s is how long a step waits for them; --set "
+        "demos.cache=true decodes them in advance all the same"
     )
     on_event(Warned("demos", text))
     return False
@@ -321,11 +321,11 @@ def _check_within_clip(
     if past:
         whose = "1 frame" if past == 1 else f"{past} frames"
         raise AegisError(
-            f"{whose} of episode {number} in '{source.dataset.folder}' whose timestamps are past "
-            f"the end of its video of '{layout.short(camera)}', where no picture is of it",
-            "timestamps that begin at 0 and have no gap that the video has not",
-            f"mend that episode's timestamps, or leave it out: --only (demos.only; of aegis "
-            f"evaluate --episodes) without {number}",
+            f"{whose} of episode {number} in '{source.dataset.folder}' with timestamps past "
+            f"the end of its video of '{layout.short(camera)}'",
+            "timestamps that begin at 0 and have no gap that the video lacks",
+            f"correct that episode's timestamps, or choose episodes without {number} (demos.only, "
+            "--only of aegis anchor, or --episodes of aegis evaluate)",
         )
 
 

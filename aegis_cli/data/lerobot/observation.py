@@ -131,7 +131,7 @@ def picture(name: str, given: Any) -> np.ndarray:
         raise AegisError(
             f"'{name}' of shape {found.shape} and type {found.dtype}{span}",
             "[H, W, 3] uint8, or [3, H, W] floats from 0 to 1",
-            "give it as the camera or LeRobot's processor does, without normalizing it",
+            "give it as the camera or LeRobot's processor gives it, without normalizing it",
         )
     return np.ascontiguousarray((found * 255).round().astype(np.uint8).transpose(1, 2, 0))
 
@@ -157,8 +157,8 @@ def _array(given: Any) -> np.ndarray:
     try:
         return np.asarray(given)
     except ValueError as error:  # lists of several lengths
-        found = f"a value of an observation that is no array: {error}"
-        raise AegisError(found, "an array or a tensor", "give what the robot gives") from error
+        found = f"a value of an observation that is not an array: {error}"
+        raise AegisError(found, "an array or a tensor", "give what the robot returns") from error
 
 
 def _unbatched(given: np.ndarray, dimensions: int) -> np.ndarray:
@@ -192,7 +192,7 @@ def _check_frames(
             raise AegisError(
                 f"'{name}' is {type(given).__name__}{shape}",
                 "a picture: an array or a tensor [H, W, 3]",
-                "see whether the camera has given a frame; of a Pillow image, np.asarray(image)",
+                "check that the camera delivered a frame; for a Pillow image: np.asarray(image)",
             )
 
 
@@ -201,7 +201,7 @@ def _number(name: str, value: Any) -> float:
         return float(_array(value).item())
     except (TypeError, ValueError) as error:
         raise AegisError(
-            f"'{name}' is {type(value).__name__}", "a number", "give what the robot gives"
+            f"'{name}' is {type(value).__name__}", "a number", "give what the robot returns"
         ) from error
 
 

@@ -28,7 +28,7 @@ def from_bytes(data: bytes | None, where: str) -> np.ndarray:
     """
     if not data:
         fix = "embed the images in the parquet files"
-        raise AegisError(f"no bytes in {where}", "those of an image file in every row", fix)
+        raise AegisError(f"no bytes in {where}", "the bytes of an image file in every row", fix)
     try:
         return decoded(data)
     except ValueError as error:

@@ -94,7 +94,7 @@ def _not_finite(
     count = sum(len(places) for _, places in bad)
     where = f"row {int(_rows_of(file)[places[0]])} of '{file.path}'"
     sound = [number for number in source.episodes if number not in episodes]
-    alone = f"take episodes {as_text(sound)} alone" if sound else "take other episodes"
+    alone = f"take only episodes {as_text(sound)}" if sound else "take other episodes"
     return AegisError(
         f"'{feature}' of '{source.dataset.folder}' has NaN or infinite values in {count} rows of "
         f"episodes {as_text(sorted(episodes))}, the first in {where}",
@@ -170,7 +170,7 @@ def _check_rate(source: Source, steps: np.ndarray) -> None:
             f"{1000 / fps:.4g} ms, since {layout.INFO} says fps {fps:g}",
             f"set fps in {folder / layout.INFO} to the rate at which the robot was controlled"
             + (f", here {1 / step:.4g}" if step > 0 else "")
-            + ", or mend the timestamps",
+            + ", or correct the timestamps",
         )
 
 

@@ -44,8 +44,8 @@ def read_episodes(folder: Path, info: Info) -> tuple[EpisodeIndex, ...]:
     if not paths:
         raise AegisError(
             f"no parquet file in '{where}'",
-            "a row per episode there, which LeRobot writes where a recording ends",
-            f"{layout.AGAIN}; record anew what was broken off",
+            "a row per episode there, which LeRobot writes when a recording ends",
+            f"{layout.AGAIN}; if the recording broke off, record it again",
         )
     rows: list[dict[str, Any]] = []
     for path in paths:

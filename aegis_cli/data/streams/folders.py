@@ -186,7 +186,7 @@ def _list(part: Path, classes: Sequence[str]) -> Listing:
     folders = _visible_folders(part)
     if unknown := [name for name in folders if name not in classes]:
         raise AegisError(
-            f"'{part}' has the classes {unknown[:3]}, which train has not",
+            f"'{part}' has the classes {unknown[:3]}, which train lacks",
             "train's classes",
             "move the folders, or name them alike",
         )
@@ -287,9 +287,9 @@ def _words(folder: Path, classes: Sequence[str]) -> tuple[str, ...]:
         words = list(named.values()) if isinstance(named, dict) else [None]
         if not all(isinstance(word, str) and word for word in words):
             raise AegisError(
-                f"'{path}' with something else than words", '{"folder": "words", …}', "correct it"
+                f"'{path}' with values that are not words", '{"folder": "words", …}', "correct it"
             )
         if unknown := sorted(set(named) - set(classes)):
-            found = f"'{path}' names {unknown[:3]}, which are no folders of train"
+            found = f"'{path}' names {unknown[:3]}, which are not folders of train"
             raise AegisError(found, "names of class folders", "correct it")
     return tuple(named.get(name, name.replace("_", " ")) for name in classes)

@@ -25,8 +25,8 @@ def need_freetype() -> None:
 
     if not features.check("freetype2"):
         raise AegisError(
-            "a pillow without FreeType, which draws the stream's pictures",
-            "pillow >= 10.1 as its wheels have it",
+            "a pillow without FreeType, which the stream's pictures are drawn with",
+            "pillow >= 10.1 with FreeType, as in its wheels",
             "pip install --force-reinstall pillow",
         )
 

@@ -57,7 +57,7 @@ def _missing(name: str, error: Exception) -> AegisError:
         f"no question set '{name}', and no data set of that name from the Hugging Face hub: "
         f"{in_short(error)}",
         "a local set, or a hub id with a network (and, for a gated data set, a token)",
-        "check the path; or where there is a network: hf download --repo-type dataset "
+        "check the path; or, on a machine with a network: hf download --repo-type dataset "
         f"{name} --local-dir FOLDER; then give FOLDER",
     )
 

@@ -68,7 +68,7 @@ def _folder_of_split(path: Path, split: str | None) -> Path:
     folders = {saved.parent.name: saved.parent for saved in path.glob(f"*/{_SAVED}")}
     if not folders:
         raise AegisError(
-            f"no split in '{path}', which is to hold some",
+            f"no split in '{path}', which should hold some",
             "the folder of one split",
             "download it again",
         )
@@ -126,8 +126,8 @@ def _chosen(where: str, names: Sequence[str], split: str | None) -> str:
 
 def _no_split(where: str | Path, split: str, splits: Sequence[str]) -> AegisError:
     if not splits:
-        found = f"'{where}' is one split without a name, and no '{split}'"
-        return AegisError(found, "a split's name where there are several", f"--vqa '{where}'")
+        found = f"no split '{split}' in '{where}', which is a single split without a name"
+        return AegisError(found, "a split's name only where there are several", f"--vqa '{where}'")
     found = f"no split '{split}' in '{where}'"
     return AegisError(found, f"one of {', '.join(splits)}", f"--vqa '{where}#{splits[-1]}'")
 

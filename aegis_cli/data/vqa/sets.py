@@ -167,9 +167,9 @@ class Listed:
             (one, other), *_ = found
             text = (
                 f"{len(found)} of the {len(chosen)} images of '{self.name}' that are asked about "
-                f"are also among those for anchors, training or tuning, byte for byte under "
+                f"are also among those for anchors, training or tuning, byte for byte, under "
                 f"another name: '{one.key}' is '{other.key}'. An anchor or a training on the same "
-                "set knows them; let all questions about a picture name one file"
+                "set has seen them. Name the same file in all questions about a picture"
             )
             on_event(Warned("questions", text))
 
@@ -210,7 +210,7 @@ class Listed:
             fix += ", or run without --skip-bad to see what is wrong"
         return AegisError(
             found,
-            "one or more; a hash of its name gives an image to anchors (4 of 10), studies "
+            "one or more; a hash of its name assigns an image to anchors (4 of 10), studies "
             "(1 of 10) or probes (5 of 10)",
             fix,
         )
@@ -321,8 +321,8 @@ def _reader(path: Path, split: str | None) -> Reader:
     """The reader for the path's format."""
     if split is not None and not saved.is_dataset(path):
         raise AegisError(
-            f"the split '{split}' of '{path}', which is no Hugging Face data set",
-            "a set without splits by its path alone",
+            f"the split '{split}' of '{path}', which is not a Hugging Face data set",
+            "the path alone, for a set without splits",
             f"--vqa '{path}'",
         )
     pairs = sorted(path.glob(f"*{official.SUFFIX}")) if path.is_dir() else []

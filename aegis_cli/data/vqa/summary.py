@@ -206,7 +206,7 @@ def _read(name: str) -> sets.Listed:
             known += ", and a repository with meta/info.json at its top for a LeRobot dataset"
         raise AegisError(error.found, error.expected, f"{error.fix}; {known}") from error
     if not isinstance(found, sets.Listed):
-        raise AegisError(f"'{name}', which is rendered", "questions of files", "aegis probe MODEL")
+        raise AegisError(f"'{name}', which is rendered", "questions in files", "aegis probe MODEL")
     return found
 
 

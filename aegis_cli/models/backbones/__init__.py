@@ -110,7 +110,7 @@ def load(name: str) -> Backbone:
     if layers is not None:
         raise AegisError(
             f"'#{layers}' after the embedded VLM '{path}'",
-            "layers of a Hugging Face model alone",
+            "layers after a Hugging Face model only",
             "leave it out",
         )
     if model_folder.is_policy(path.parent):
@@ -197,7 +197,7 @@ def _no_backbone(name: str) -> AegisError:
     if hub.is_id(name) and not _has_transformers():
         fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
     elif hub.is_id(name) and not name.startswith(_LOCAL):
-        fix += f"; of a model on the hub: hf download {name} --local-dir MODEL"
+        fix += f"; for a model on the hub: hf download {name} --local-dir MODEL"
     return AegisError(found, expected, fix)
 
 

@@ -76,7 +76,7 @@ class CLIPEncoder(DualEncoder):
         if tokens["input_ids"].shape[1] > self._longest:
             longest = max(texts, key=lambda text: len(self._tokenizer(text)["input_ids"]))
             found = f"a text of more than {self._longest} tokens: '{longest[:60]}…'"
-            raise AegisError(found, "a shorter one", "shorten the class or the template")
+            raise AegisError(found, "a shorter text", "shorten the class or the template")
         found = self.clip.get_text_features(
             input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
         )

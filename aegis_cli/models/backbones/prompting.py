@@ -267,7 +267,7 @@ def _unfit(why: str) -> AegisError:
     return AegisError(
         f"an image or a text that the processor refuses: {why}",
         "images and texts that this model takes",
-        "leave out that question, such as by --skip-bad, or the model's own markers in its text",
+        "leave out that question, e.g. by --skip-bad, or the model's own markers in its text",
     )
 
 

@@ -44,7 +44,7 @@ class Tokenizer:
             known = len(self.vocabulary) - len(SPECIAL)
             fix = "rephrase with words such as: " + ", ".join(self.vocabulary[3:11])
             if close:
-                fix = f"write '{close[0]}'?"
+                fix = f"did you mean '{close[0]}'?"
             raise AegisError(
                 f"the word '{unknown[0]}' in '{text}'",
                 f"words among the {known} that the embedded model knows",

@@ -122,10 +122,10 @@ def test_a_missing_meta_file(
 def test_a_recording_that_was_broken_off(command: tuple[str, ...], bad: Bad, folder: Path) -> None:
     """LeRobot writes the rows of episodes last: a recording that is killed has none."""
     (folder / EPISODES).unlink()
-    bad(*command, says=("which LeRobot writes where a recording ends", "record anew"))
+    bad(*command, says=("which LeRobot writes when a recording ends", "record it again"))
     (folder / "meta/tasks.parquet").unlink()
     edit_info(folder, lambda info: info.update(total_episodes=0, total_frames=0))
-    bad(*command, says=("no episode in 'd'", "ended before one was saved", "record it anew"))
+    bad(*command, says=("no episode in 'd'", "ended before one was saved", "record it again"))
 
 
 def rename_camera(name: str) -> Callable[[dict[str, Any]], None]:
@@ -339,8 +339,8 @@ def test_all_episodes_with_numbers_that_are_none_are_named_and_the_others_can_be
             return replaced(table, "action", pa.array(rows, kind))
 
         edit_table(data_files(folder)[number], spoil)
-    said = bad(*FROM_FOLDER, says=("2 rows of episodes 2,5,", "take episodes 0-1,3-4,6 alone"))
-    (alone,) = re.findall("take episodes (.*) alone", said)
+    said = bad(*FROM_FOLDER, says=("2 rows of episodes 2,5,", "take only episodes 0-1,3-4,6"))
+    (alone,) = re.findall(r"take only episodes (\S+) \(", said)
     found = demonstrations.load(folder, 0.3, 0, selection=Selection(only=alone))
     assert set(found.episode_of[found.read].tolist()) == {0, 1, 3, 4, 6}
     bad(*FROM_FOLDER, "--set", "demos.only=2,5", says=("of episodes 2,5", "take other episodes"))
@@ -372,7 +372,7 @@ def test_times_that_stand_still(bad: Bad, folder: Path) -> None:
     edit_table(
         folder / IMAGE, lambda t: replaced(t, "timestamp", pa.array(np.zeros(len(t), np.float32)))
     )
-    bad(*FROM_FOLDER, says=("0 ms apart", "fps 10", "mend the timestamps"))
+    bad(*FROM_FOLDER, says=("0 ms apart", "fps 10", "correct the timestamps"))
 
 
 @pytest.mark.parametrize(

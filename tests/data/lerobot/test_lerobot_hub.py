@@ -93,7 +93,7 @@ def test_what_can_only_be_a_path_is_never_asked_of_the_hub(
     (place / "data").mkdir()
     says = [f"no file or folder '{name}'", "id on the hub", "check the path"]
     if name == "data/x":
-        says.append("the hub is not asked for 'data/x', because a folder 'data' is here")
+        says.append("'data/x' was not looked up on the hub, because a folder 'data' is here")
     bad(*training(demos=name), says=tuple(says))
     given = ("--set", "methods=[naive]", "--set", f"demos.path={name}")
     bad("run", "small.yaml", *given, says=tuple(says))

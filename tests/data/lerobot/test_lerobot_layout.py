@@ -346,7 +346,7 @@ def test_a_folder_that_another_process_has_written_meanwhile_stays(tmp_path: Pat
         yield from episodes(2)
         save(tmp_path / "d", episodes(1))
 
-    with pytest.raises(AegisError, match="another process has written meanwhile"):
+    with pytest.raises(AegisError, match="another process wrote in the meantime"):
         save(tmp_path / "d", slow())
     assert list(tmp_path.iterdir()) == [tmp_path / "d"]
     assert len(dataset.load(tmp_path / "d").episodes) == 1

@@ -524,7 +524,7 @@ def test_a_changed_dataset_is_not_trained_on_further(
 ) -> None:
     start("naive", tmp_path / "run", demos=reach_folder)
     record.run("reach", 8, 1, tmp_path / "other", workers=1, form="lerobot")
-    with pytest.raises(AegisError, match="another demos than the run"):
+    with pytest.raises(AegisError, match="a different demos than the run"):
         start("naive", tmp_path / "run", demos=tmp_path / "other", resume=True)
 
 

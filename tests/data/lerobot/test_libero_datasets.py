@@ -168,7 +168,7 @@ def test_one_that_knows_no_task_is_told_of_one_that_may_fit(
 ) -> None:
     shape = SimpleNamespace(proprio=sizes[0], actions=sizes[1])
     policy = cast(Policy, SimpleNamespace(expert=SimpleNamespace(shape=shape)))
-    with pytest.raises(AegisError, match="dataset of no simulated task") as caught:
+    with pytest.raises(AegisError, match="dataset that is not of a simulated task") as caught:
         rollout._task(policy, None, None)
     assert caught.value.fix == f"--task {task}"
 

@@ -155,7 +155,7 @@ def test_a_policy_without_names_wants_the_state(given: dict[str, Any], told: str
         (TOP / 255, r"shape \(6, 8, 3\) and type float64"),
         (torch.stack([tensor(TOP)] * 2), r"shape \(2, 3, 6, 8\)"),
         (np.zeros((3, 0, 8), np.float32)[:, :0, :, None], r"shape \(3, 0, 8, 1\)"),
-        ([[1], [1, 2]], "no array"),
+        ([[1], [1, 2]], "not an array"),
     ],
 )
 def test_other_floats_than_lerobots_are_no_picture(given: Any, told: str) -> None:

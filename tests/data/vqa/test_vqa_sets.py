@@ -263,9 +263,13 @@ def test_parquet_files_tell_their_split_by_their_names(
     ("form", "split", "says"),
     [
         ("saved", "none", "no split 'none' in '.*set'"),
-        ("alone", "train", "'.*set' is one split without a name, and no 'train'"),
+        ("alone", "train", "no split 'train' in '.*set', which is a single split without a name"),
         ("parquet", "val", "no split 'val' in '.*set'"),
-        ("jsonl", "train", "the split 'train' of '.*set.jsonl', which is no Hugging Face data set"),
+        (
+            "jsonl",
+            "train",
+            "the split 'train' of '.*set.jsonl', which is not a Hugging Face data set",
+        ),
     ],
 )
 def test_a_split_that_is_not_there(

@@ -61,7 +61,7 @@ def test_images_are_decoded_where_that_is_asked(tmp_path: Path) -> None:
     found = summary.of_set(str(path), images=True, on_event=events.append)
     assert (found.questions, found.images, found.bad) == (14, 7, 2)
     (told,) = found.problems  # once for both questions about it
-    assert "3.png' cannot be read as an image (of no raster format" in told
+    assert "3.png' cannot be read as an image (not in a known raster format" in told
     done = [event for event in events if isinstance(event, Progress)]
     assert (done[-1].done, done[-1].total) == (8, 8)
 

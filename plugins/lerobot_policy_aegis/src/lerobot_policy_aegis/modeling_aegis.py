@@ -375,7 +375,7 @@ class AegisPolicy(PreTrainedPolicy):
         keys = [_key(name, given) for name in named]
         if set(keys) != set(given):
             raise AegisError(
-                f"pictures {', '.join(given)}", ", ".join(keys), "name them as training did"
+                f"pictures {', '.join(given)}", ", ".join(keys), "use the names of training"
             )
         return keys
 
@@ -398,7 +398,7 @@ class AegisPolicy(PreTrainedPolicy):
             raise AegisError(
                 f"an {OBS_STATE} that is not finite: {found.tolist()}",
                 "finite numbers",
-                "see what the robot's sensors say",
+                "check the robot's sensors",
             )
         return found.float()
 
@@ -442,7 +442,7 @@ def _check_picture(name: str, found: Tensor) -> None:
         raise AegisError(
             f"a picture {name} with {bad:,} values that are not finite",
             "numbers from 0 to 1",
-            "see whether the camera has given a frame",
+            "check that the camera delivered a frame",
         )
 
 
