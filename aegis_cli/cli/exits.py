@@ -33,7 +33,7 @@ from aegis_cli.recipes.decoding import below
 # What a command that goes on needs beside its own words; `run` skips what is up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
 _KEEPS = {  # what others do not measure again, where the cache can be written
-    "anchor": "what is measured so far is kept",
+    "anchor": "all but the last of what is measured so far is kept",
     "evaluate": "predictions so far are kept",
     "merge": "the strengths so far are kept",
     "probe": "answers so far are kept",
