@@ -1,7 +1,7 @@
 """The whole campaign: `python tests/campaign --mutations 10000 --kills 200`.
 
-Cases are numbered, and each case's result is a line of --state; cases with a line are not tried
-again, so a campaign can be stopped and continued.
+Cases are numbered, and what became of each is a line of --state; those that are there are not tried
+again, so that a campaign goes on where it was stopped.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ class CrossAttention(torch.nn.Module):
 def test_a_layer_without_one_attention_over_the_text(
     parts: tuple[torch.nn.Module, ...], says: str
 ) -> None:
-    """This is in an unknown, hybrid family."""
+    """The family is unknown, for example a hybrid one."""
     layers = [torch.nn.Sequential(SelfAttention()), torch.nn.Sequential(*parts)]
     check = backbones.model_folder.check_attention
     with pytest.raises(AegisError, match="layer 1, a Sequential") as caught:

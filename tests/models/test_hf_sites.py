@@ -139,7 +139,7 @@ def test_answers_keep_their_scores_under_any_protected_update(
 ) -> None:
     """With the anchor's own inputs nothing changes, although every parameter is moved at random.
 
-    Without protection the outputs change.
+    Sites that are left unprotected change the outputs.
     """
     backbone = hf_backbone(name).double()
     sites, said = backbone.sites(), scores(backbone)

@@ -1,4 +1,4 @@
-"""A Hugging Face backbone is exported in the dtype in which it was loaded, or as requested."""
+"""A Hugging Face backbone is exported in its source's dtype, or in the one requested."""
 
 from __future__ import annotations
 

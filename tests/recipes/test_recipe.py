@@ -581,7 +581,6 @@ def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> Non
     """A digest does not use today's defaults, but those that an option had when it was added.
 
     Measurements under the old default do not count for the new one, and need not be repeated.
-
     """
 
     @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(not OTHERS, reason="this torch takes no device o
 ANCHOR, RECIPE = "anchor.safetensors", "recipe.yaml"
 STEPS = 2
 PARTS = "moments,inputs,curvature,fisher"
-# Whether parameters without a task gradient move depends on a weight that must be read: one wait.
+# Whether parameters without a task gradient move depends on a weight: one wait per step to read it.
 WAITS = {"aegis": {"methods/backward.py:combine_gradients": STEPS}}
 # It decides by a sign, which rounding of a gradient may flip.
 TURNS = "maps"

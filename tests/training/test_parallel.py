@@ -143,7 +143,7 @@ def shared_runs(
     for way in ("ddp", "fsdp"):
         job = make("naive", out / f"averaging-{way}", parallel=way, **SHORT)
         two[way, "averaging"] = Averaging(**vars(replace(job, anchor=None)))
-    # The others notice the loss, and one of them may be reported first.
+    # The others notice that it is gone, and one of them may be reported first.
     gone = (multiprocessing.ProcessExitedException, multiprocessing.ProcessRaisedException)
     with pytest.raises(gone):
         run_together(3, [*three.values(), replace(begun, killed_after=SAVED + 1)])

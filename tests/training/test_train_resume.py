@@ -156,7 +156,7 @@ def test_a_run_on_demonstrations_that_have_grown_says_so_and_how_another_begins_
 
 
 def warned_of_learned_episodes(recipe: Recipe, data: Path, out: Path) -> bool:
-    """Whether a training warns that it holds out episodes of its earlier training."""
+    """Whether a training warns that its policy may have learned from held-out episodes."""
     told: list[Event] = []
     train.run(recipe, "naive", data, None, out, on_event=told.append)
     texts = [event.text for event in told if isinstance(event, Warned)]
